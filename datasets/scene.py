@@ -1,0 +1,107 @@
+"""A scene as every loader returns it: posed training and test images in one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.errors import DataError
+
+__all__ = ["Scene", "Views"]
+
+
+@dataclass(frozen=True)
+class Views:
+    """V posed images of one size.
+
+    Convention:
+        Kornia's: world-to-camera extrinsics `(V, 4, 4)` with OpenCV axes (x right, y down, z forward), integer pixel
+        centres (a centred image has cx = (W - 1) / 2). Float32.
+
+    Args:
+        cameras: the V cameras; height and width of each equal the images'.
+        images: RGB in [0, 1], `(V, 3, H, W)`.
+        names: file names, unique, in the order of the images.
+        masks: `(V, 1, H, W)` in [0, 1], or None.
+
+    Raises:
+        ValueError: counts, shapes or sizes do not fit.
+    """
+
+    cameras: PinholeCamera
+    images: Tensor
+    names: tuple[str, ...]
+    masks: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        if self.images.ndim != 4 or self.images.shape[:2] != (count, 3):
+            raise ValueError(f"images: expected shape ({count}, 3, H, W), got {tuple(self.images.shape)}")
+        if self.cameras.batch_size != count:
+            raise ValueError(f"cameras: expected {count} as names, got {self.cameras.batch_size}")
+        height, width = self.images.shape[-2:]
+        if not bool(((self.cameras.height == height) & (self.cameras.width == width)).all()):
+            raise ValueError(f"cameras: expected height {height} and width {width} as images, got others")
+        if self.masks is not None and tuple(self.masks.shape) != (count, 1, height, width):
+            raise ValueError(f"masks: expected shape ({count}, 1, {height}, {width}), got {tuple(self.masks.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def camera(self, index: int | list[int]) -> PinholeCamera:
+        """The cameras at the given positions (Kornia's class cannot be indexed)."""
+        rows = torch.tensor([index] if isinstance(index, int) else index)
+        return PinholeCamera(
+            self.cameras.intrinsics[rows],
+            self.cameras.extrinsics[rows],
+            self.cameras.height[rows],
+            self.cameras.width[rows],
+        )
+
+    def select(self, indices: list[int]) -> Views:
+        """The views at the given positions, in that order."""
+        rows = torch.tensor(indices, dtype=torch.int64)
+        return Views(
+            cameras=self.camera(list(indices)),
+            images=self.images[rows],
+            names=tuple(self.names[i] for i in indices),
+            masks=None if self.masks is None else self.masks[rows],
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Training and test views in one world frame, with what the layout itself says about first points.
+
+    Args:
+        train: the views to fit. Nothing of a fit may depend on `test`.
+        test: the views that are held out.
+        points: `(P, 3)` float32, P may be 0.
+        point_colors: `(P, 3)` in [0, 1].
+        init_kind: where `points` come from: "none", "random" or "model-points".
+        offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
+        background: `(3,)`, the colour behind the scene, in [0, 1].
+        root: the folder the scene was read from.
+    """
+
+    train: Views
+    test: Views
+    points: Tensor
+    point_colors: Tensor
+    init_kind: str
+    offset: Tensor
+    background: Tensor
+    root: Path
+
+    def __post_init__(self) -> None:
+        if len(self.train) == 0:
+            raise DataError(self.root, "train", "expected at least one training view, got none")
+        if self.points.shape != self.point_colors.shape or self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(
+                f"points, point_colors: expected two of shape (P, 3), got {tuple(self.points.shape)} "
+                f"and {tuple(self.point_colors.shape)}"
+            )

@@ -1,0 +1,31 @@
+"""The two errors of kgs that are not a wrong argument: a bad file, and a training run that left the numbers."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+__all__ = ["DataError", "TrainingDiverged"]
+
+
+class DataError(Exception):
+    """A file or folder does not hold what it should.
+
+    Args:
+        path: the file or folder at fault.
+        field: the part of it that is wrong (a key, a property, a line), or "" for the file as a whole.
+        reason: what was expected and what came.
+    """
+
+    def __init__(self, path: str | PathLike[str], field: str, reason: str) -> None:
+        super().__init__(path, field, reason)
+        self.path = path
+        self.field = field
+        self.reason = reason
+
+    def __str__(self) -> str:
+        where = f"{self.path}: {self.field}" if self.field else f"{self.path}"
+        return f"{where}: {self.reason}"
+
+
+class TrainingDiverged(RuntimeError):
+    """A loss, gradient or parameter is no longer finite; raised before it can reach the optimiser's state."""

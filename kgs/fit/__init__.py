@@ -1,0 +1,1 @@
+"""The application: turns a scene into a splat."""
