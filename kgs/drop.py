@@ -105,6 +105,7 @@ class DropGaussian(nn.Module):
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
         self.seed = seed
         self._progress: float | None = None
+        self._warned = False
         self._generator: torch.Generator | None = None
 
     @property
@@ -129,13 +130,13 @@ class DropGaussian(nn.Module):
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
         if not self.training:
             return opacities
-        if self._progress is None and self.schedule is not constant:
+        if self._progress is None and not self._warned and self.schedule is not constant:
+            self._warned = True
             warnings.warn(
                 f"DropGaussian: progress was never set, so the schedule has no effect and the rate is {self.rate:g} "
                 "throughout; set `drop.progress = step / total_steps` in the loop, or schedule='constant'",
                 stacklevel=2,
             )
-            self._progress = 1.0
         generator = None if self.seed is None else self._own_generator(opacities.device)
         return drop_gaussian(opacities, self.rate, True, generator)
 

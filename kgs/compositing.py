@@ -1,0 +1,222 @@
+r"""Front-to-back compositing of binned Gaussians, with an analytic backward pass.
+
+For the layers k = 1, 2, ... of a pixel, nearest first (Kerbl et al. 2023, eq. 3)
+
+    alpha_k = min(0.99, o_k exp(-q_k / 2)),   T_1 = 1,   T_{k+1} = T_k (1 - alpha_k),
+    C = sum_k w_k c_k + T_end background,   w_k = T_k alpha_k
+
+with alpha below `alpha_threshold` taken as 0, and T below `transmittance_stop` taken as 0 from then on. Both rules act
+on each pixel and layer alone, so the image does not depend on tiles or chunks.
+
+How it is computed. K consecutive entries of a tile are a chunk; the same chunk of many tiles is a step. In coordinates
+relative to the tile's centre the exponent is a quadratic polynomial of the pixel, so a step is one matrix product of
+six coefficients an entry with six monomials a pixel, an exponential, a scan over K, and one product with the colours.
+Only T at the beginning of each step is kept. The backward pass visits the steps from back to front, recomputes their
+alphas, and carries U_k = sum_{j >= k} w_j (c_j . g) + T_end g_T, the light behind, which is a reverse cumulative sum:
+
+    dL/d ln alpha_k = w_k (c_k . g - U_{k+1} / T_{k+1})
+
+No difference of large numbers and no division by 1 - alpha. What a Gaussian gets from a tile are the six moments of
+that quantity over the pixels, again one matrix product; they are shifted to its centre and summed over its tiles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
+
+from .chunks import ALPHA_MAX, Band, Rules
+from .covariance import variances, whitening
+from .tiles import TileSpans, tile_spans
+from .types import ProjectedGaussians
+
+__all__ = ["ALPHA_MAX", "Composited", "composite"]
+
+_BYTES_PER_ENTRY = 160  # lists, sorting, saved transmittance and gradients, for 8 x 8 tiles
+
+
+@dataclass(frozen=True)
+class Composited:
+    """The sums over layers, before background and normalisation.
+
+    Args:
+        features: sum of w times features, `(C, F, H, W)`.
+        transmittance: T behind the last layer, `(C, 1, H, W)`.
+        median_depth: `(C, 1, H, W)` without gradient, or None.
+    """
+
+    features: Tensor
+    transmittance: Tensor
+    median_depth: Tensor | None
+
+
+def composite(
+    projected: ProjectedGaussians,
+    features: Tensor,
+    *,
+    tile_size: int = 8,
+    alpha_threshold: float = 1 / 255,
+    transmittance_stop: float = 1e-4,
+    median_depth: bool = False,
+    max_bytes: int = 2**30,
+    chunk_size: int | None = None,
+) -> Composited:
+    """Composite features of projected Gaussians over all pixels of all cameras.
+
+    Differentiable once with respect to `features` and `projected.means2d`, `factors` and `opacities`.
+
+    Args:
+        projected: M visible pairs (camera, Gaussian).
+        features: what to accumulate, `(M, F)`: colours, depths, anything.
+        tile_size: side of the square tiles in pixels; changes the speed, not the image.
+        alpha_threshold: alphas below are skipped, in [0, 1); the error is at most the number of layers times it.
+        transmittance_stop: T below counts as 0, in [0, 1); the error is at most it.
+        median_depth: also find the depth at which T falls below one half.
+        max_bytes: bound for the working memory; beyond it the image is done in bands, and the backward pass
+            recomputes each band.
+        chunk_size: entries of a tile processed at once; None chooses by the length of the lists.
+
+    Raises:
+        ValueError: an option is out of range, or one row of tiles alone exceeds `max_bytes`.
+    """
+    _check_options(tile_size, alpha_threshold, transmittance_stop, chunk_size)
+    inputs = (projected.means2d, projected.factors, projected.opacities, features)
+    keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+    rules = Rules(alpha_threshold, transmittance_stop, median_depth, chunk_size)
+    with torch.no_grad():
+        spans = tile_spans(projected, tile_size, alpha_threshold)
+    bands = spans.bands(max(1, max_bytes // _BYTES_PER_ENTRY))
+    sums, transmittance, median = _Composite.apply(*inputs, projected, spans, bands, rules, keep)
+    return Composited(sums, transmittance, median if median_depth else None)
+
+
+class _Composite(torch.autograd.Function):
+    """All cameras at once; in bands of tile rows where the lists of all would exceed the byte budget.
+
+    One band is kept for the backward pass, several are made again there.
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: FunctionCtx,
+        means2d: Tensor,
+        factors: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        projected: ProjectedGaussians,
+        spans: TileSpans,
+        bands: list[tuple[int, int]],
+        rules: Rules,
+        keep: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        table = F.pad(_table(means2d, factors, opacities, projected.eps2d).index_select(1, spans.ids), (0, 1))
+        table[0, -1] = -torch.inf
+        colors = F.pad(features.index_select(0, spans.ids), (0, 0, 0, 1))
+        depths = F.pad(projected.depths.detach().index_select(0, spans.ids), (0, 1)) if rules.median_depth else None
+
+        def make_band(rows: tuple[int, int]) -> Band:
+            return Band(table, colors, depths, spans.bin(*rows), rules)
+
+        outputs, kept = [], None
+        for rows in bands:
+            band = make_band(rows)
+            outputs.append(band.forward(keep))
+            if keep and len(bands) == 1:
+                kept = band
+        sums, transmittance, median = (torch.cat(parts) for parts in zip(*outputs, strict=True))
+        ctx.save_for_backward(factors, opacities, transmittance)
+        ctx.projected, ctx.spans, ctx.bands, ctx.kept, ctx.make_band = projected, spans, bands, kept, make_band
+        images = tuple(_to_images(x, projected, spans) for x in (sums, transmittance, median))
+        ctx.mark_non_differentiable(images[2])
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # type: ignore[override]
+        ctx: FunctionCtx, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        factors, opacities, transmittance = ctx.saved_tensors
+        spans, columns = ctx.spans, ctx.spans.grid[1]
+        grads = _to_tiles(grad_sums, spans)
+        behind = _to_tiles(grad_transmittance, spans).mul_(transmittance)
+        total: Tensor | float = 0.0
+        for begin, end in ctx.bands:
+            band = ctx.kept
+            if band is None:
+                band = ctx.make_band((begin, end))
+                band.forward(keep=True)
+            tiles = slice(begin * columns, end * columns)
+            total = total + band.backward(grads[tiles], behind[tiles])
+        ids = spans.ids
+        found = _to_inputs(total, factors.index_select(0, ids), opacities.index_select(0, ids), ctx.projected.eps2d)
+        rows = factors.shape[0]
+        return (
+            *(
+                value.new_zeros(rows, *value.shape[1:]).index_copy_(0, ids, value) if needed else None
+                for value, needed in zip(found, ctx.needs_input_grad, strict=False)
+            ),
+            *[None] * 5,
+        )
+
+
+def _table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
+    """What a step needs of each Gaussian, `(10, M)`: see `Band`."""
+    ax, ay, bx, by = whitening(*variances(factors, eps2d))
+    x, y = means2d.unbind(1)
+    return torch.stack(
+        [
+            opacities.log(),
+            x,
+            y,
+            -0.5 * (ax * ax + bx * bx),
+            -(ax * ay + bx * by),
+            -0.5 * (ay * ay + by * by),
+            ax,
+            ay,
+            bx,
+            by,
+        ]
+    )
+
+
+def _to_inputs(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, ...]:
+    """From moments s of dL/d ln alpha to gradients of means2d, factors, opacities and features.
+
+    With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 Q M.
+    """
+    xx, xy, yy, det = variances(factors, eps2d)
+    q = torch.stack([yy, -xy, -xy, xx], 1).div_(det[:, None]).view(-1, 2, 2)
+    s0, s1, s2 = rows[:, 0], rows[:, 1:3], rows[:, [3, 4, 4, 5]].view(-1, 2, 2)
+    d_means = (q @ s1[:, :, None])[:, :, 0]
+    return d_means, q @ s2 @ q @ factors, s0 / opacities, rows[:, 6:]
+
+
+def _to_images(tiles: Tensor, projected: ProjectedGaussians, spans: TileSpans) -> Tensor:
+    """`(C * rows * columns, F, P)` to `(C, F, H, W)`."""
+    size, (rows, columns) = spans.tile_size, spans.grid
+    height, width = projected.image_size
+    images = tiles.view(projected.num_cameras, rows, columns, -1, size, size).permute(0, 3, 1, 4, 2, 5)
+    return images.reshape(projected.num_cameras, -1, rows * size, columns * size)[:, :, :height, :width].contiguous()
+
+
+def _to_tiles(images: Tensor, spans: TileSpans) -> Tensor:
+    """The inverse of `_to_images`; pixels beyond the image are 0."""
+    size, (rows, columns) = spans.tile_size, spans.grid
+    cameras, channels, height, width = images.shape
+    images = F.pad(images, (0, columns * size - width, 0, rows * size - height))
+    tiles = images.view(cameras, channels, rows, size, columns, size).permute(0, 2, 4, 1, 3, 5)
+    return tiles.reshape(cameras * rows * columns, channels, size * size)
+
+
+def _check_options(tile_size: int, alpha_threshold: float, transmittance_stop: float, chunk_size: int | None) -> None:
+    if tile_size < 1:
+        raise ValueError(f"tile_size: expected at least 1, got {tile_size}")
+    if chunk_size is not None and chunk_size < 1:
+        raise ValueError(f"chunk_size: expected at least 1 or None, got {chunk_size}")
+    for name, value in (("alpha_threshold", alpha_threshold), ("transmittance_stop", transmittance_stop)):
+        if not 0.0 <= value < 1.0:
+            raise ValueError(f"{name}: expected a number in [0, 1), got {value}")

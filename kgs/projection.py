@@ -1,0 +1,187 @@
+"""First-order projection of 3D Gaussians into the image, for every camera that Kornia can describe.
+
+Source: Zwicker et al. 2001 (the affine approximation at the centre), Kerbl et al. 2023.
+
+Whatever cannot be seen is left out before anything is divided: behind the near plane, not finite, beside the image.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .covariance import footprint_factors, variances
+from .harmonics import evaluate_harmonics
+from .lenses import Lens, image_size, lenses
+from .types import Cameras, Gaussians, ProjectedGaussians
+
+__all__ = ["cut_squared", "project"]
+
+
+def project(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+    alpha_threshold: float = 1 / 255,
+    colors: bool = True,
+) -> ProjectedGaussians:
+    """Project Gaussians into every camera of a batch.
+
+    Differentiable with respect to all Gaussian parameters, extrinsics and intrinsics (the harmonics' view direction
+    included).
+
+    Convention:
+        World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
+        near_plane: only centres with z > near_plane in the camera frame are kept; > 0 in world units for perspective
+            cameras.
+        eps2d: variance in px^2 added to the diagonal of each footprint, >= 0.
+        alpha_threshold: alphas below it are not drawn; with 0 every Gaussian in front of the camera is listed.
+        colors: whether colours are wanted.
+
+    Returns:
+        The visible pairs (camera, Gaussian): those whose 3-sigma circle or whose own cut touches the image.
+
+    Raises:
+        TypeError: cameras of another kind, dtype or device.
+        ValueError: cameras of different image sizes, or opacities `(C, N)` for another number of cameras.
+    """
+    size = image_size(cameras)
+    views = lenses(cameras)
+    means = gaussians.means
+    extrinsics = cameras.extrinsics
+    if extrinsics.dtype != means.dtype or extrinsics.device != means.device:
+        raise TypeError(
+            f"cameras: expected {means.dtype} on {means.device} as the Gaussians, "
+            f"got {extrinsics.dtype} on {extrinsics.device}"
+        )
+    if gaussians.opacities.ndim == 2 and gaussians.opacities.shape[0] != len(views):
+        raise ValueError(
+            f"opacities: expected shape ({len(gaussians)},) or ({len(views)}, {len(gaussians)}) for {len(views)} "
+            f"cameras, got {tuple(gaussians.opacities.shape)}"
+        )
+    finite = _finite(gaussians)
+    parts = [
+        _project_one(gaussians, c, lens, size, finite, near_plane, eps2d, alpha_threshold, colors)
+        for c, lens in enumerate(views)
+    ]
+    fields = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
+    ids, means2d, factors, depths, radii, opacities, rgb = fields
+    counts = torch.tensor([part[0].shape[0] for part in parts], device=means.device)
+    return ProjectedGaussians(
+        camera_ids=torch.repeat_interleave(torch.arange(len(parts), device=means.device), counts),
+        gaussian_ids=ids,
+        means2d=means2d,
+        factors=factors,
+        depths=depths,
+        radii=radii,
+        opacities=opacities,
+        colors=rgb,
+        image_size=size,
+        num_cameras=len(parts),
+        num_gaussians=len(gaussians),
+        num_nonfinite=(~finite).sum(),
+        eps2d=eps2d,
+    )
+
+
+def cut_squared(opacities: Tensor, alpha_threshold: float) -> Tensor:
+    """Squared Mahalanobis distance 2 ln(o / threshold) at which alpha falls to the threshold; <= 0: never reached.
+
+    Widened by a few float32 roundings, so that what lies outside is certainly below the threshold: each pixel is then
+    decided by its own alpha alone, and no image depends on the shape of tiles.
+    """
+    if alpha_threshold == 0:
+        return torch.where(opacities > 0, torch.inf, -torch.inf).to(opacities.dtype)
+    return 2.0 * torch.log(opacities.clamp_min(0.0) / alpha_threshold) + 1e-3
+
+
+def _project_one(
+    gaussians: Gaussians,
+    c: int,
+    lens: Lens,
+    size: tuple[int, int],
+    finite: Tensor,
+    near_plane: float,
+    eps2d: float,
+    alpha_threshold: float,
+    colors: bool,
+) -> tuple[Tensor, ...]:
+    rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
+    with torch.no_grad():
+        front = (gaussians.means @ rotation[2] + translation[2] > near_plane) & finite
+        ids = front.nonzero()[:, 0]
+    means = _rows(gaussians.means, ids)
+    points = torch.addmm(translation, means, rotation.T)
+    means2d = lens.project(means, points)
+    rows = lens.jacobian(points) @ rotation
+    factors = footprint_factors(rows, _rows(gaussians.quats, ids), _rows(gaussians.scales, ids))
+    all_opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
+    opacities = _rows(all_opacities, ids)
+    with torch.no_grad():
+        seen, radii = _touches_image(means2d, factors, opacities, size, eps2d, alpha_threshold)
+        kept = seen.nonzero()[:, 0]
+        ids = _rows(ids, kept)
+        radii = _rows(radii, kept)
+    if colors:
+        rgb = _rows(gaussians.colors, ids)
+        if rgb.ndim == 3:
+            rgb = evaluate_harmonics(rgb, _directions(_rows(means, kept), lens))
+    else:
+        rgb = means.new_zeros(ids.shape[0], 0)
+    return (
+        ids,
+        _rows(means2d, kept),
+        _rows(factors, kept),
+        _rows(points[:, 2], kept),
+        radii,
+        _rows(opacities, kept),
+        rgb,
+    )
+
+
+def _touches_image(
+    means2d: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    size: tuple[int, int],
+    eps2d: float,
+    alpha_threshold: float,
+) -> tuple[Tensor, Tensor]:
+    """Which footprints reach the image, by the opacity-free radius or by their own cut; and that radius."""
+    xx, xy, yy, det = variances(factors, eps2d)
+    largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+    radii = torch.ceil(3.0 * largest.sqrt())
+    cut = cut_squared(opacities, alpha_threshold).clamp_min(0.0)
+    x, y = means2d.unbind(1)
+    reach_x, reach_y = torch.maximum(radii, (cut * xx).sqrt()), torch.maximum(radii, (cut * yy).sqrt())
+    height, width = size
+    seen = (x + reach_x > -0.5) & (x - reach_x < width - 0.5) & (y + reach_y > -0.5) & (y - reach_y < height - 0.5)
+    return seen & (det > 0), radii
+
+
+def _directions(means: Tensor, lens: Lens) -> Tensor:
+    """Unit vectors from the camera to the Gaussians, world axes."""
+    rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
+    if lens.parallel:
+        return rotation[2].expand_as(means)
+    offsets = means + rotation.T @ translation
+    return offsets / offsets.norm(dim=1, keepdim=True)
+
+
+def _finite(gaussians: Gaussians) -> Tensor:
+    """Which Gaussians have only finite parameters, `(N,)`."""
+    finite = torch.isfinite(gaussians.opacities.detach()).reshape(-1, len(gaussians)).all(0)
+    for value in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors):
+        finite = finite & torch.isfinite(value.detach()).flatten(1).all(1)
+    return finite
+
+
+def _rows(values: Tensor, ids: Tensor) -> Tensor:
+    """Rows of a tensor; the tensor itself where all rows, in order, are wanted."""
+    return values if ids.shape[0] == values.shape[0] else values.index_select(0, ids)

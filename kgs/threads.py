@@ -1,0 +1,75 @@
+"""Runs independent pieces of CPU work on plain Python threads, each with one intra-op thread.
+
+Torch releases the GIL inside its operators, and an operator on an L2-sized buffer is too short to be worth an OpenMP
+barrier: whole chunks side by side gain 1.7x on two cores where intra-op threads gain 1.2x. Every piece is computed
+by one thread, whatever the number of threads, so results do not depend on it.
+
+`torch.set_num_threads` acts on the calling thread; only the default for threads born later is shared, and it is put
+back at once, so nothing changes for the rest of the process.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+__all__ = ["run_all"]
+
+Item = TypeVar("Item")
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], None]], device: torch.device) -> None:
+    """Call a worker on every item, on as many threads as torch has; items are taken in order, the longest first best.
+
+    Args:
+        items: the pieces of work.
+        make_worker: called once a thread; returns the function that does one piece (a place for its buffers).
+        device: where the work runs; on anything but a CPU one thread does it all.
+    """
+    queue = deque(items)
+    threads = min(torch.get_num_threads(), len(queue)) if device.type == "cpu" else 1
+
+    def drain() -> None:
+        with torch.no_grad():
+            worker = make_worker()
+            while True:
+                try:
+                    item = queue.popleft()
+                except IndexError:
+                    return
+                worker(item)
+
+    if threads <= 1:
+        drain()
+        return
+    for future in [_pool(threads).submit(drain) for _ in range(threads)]:
+        future.result()
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    if threads not in _pools:
+        before = torch.get_num_threads()
+        started = threading.Barrier(threads + 1)
+
+        def start() -> None:
+            torch.set_num_threads(1)
+            started.wait()
+
+        pool = ThreadPoolExecutor(threads, thread_name_prefix="kgs", initializer=start)
+        for _ in range(threads):
+            pool.submit(lambda: None)
+        started.wait()
+        torch.set_num_threads(before)
+        _pools[threads] = pool
+    return _pools[threads]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pools.clear)

@@ -1,0 +1,164 @@
+"""Which Gaussians can reach which tile, front to back.
+
+A Gaussian reaches a pixel where alpha = o exp(-q/2) is at least the threshold: inside the ellipse q <= 2 ln(o/th).
+For each row of tiles the columns that the ellipse touches are closed form, because an ellipse is convex: its rightmost
+point within a horizontal band lies at its own rightmost point if that is in the band, else on the band's nearer edge.
+Every tile of the span is touched, every other is not; no tile has to be tested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .covariance import variances
+from .projection import cut_squared
+from .types import ProjectedGaussians, TileBins
+
+__all__ = ["TileSpans", "bin_to_tiles", "tile_spans"]
+
+
+def bin_to_tiles(projected: ProjectedGaussians, tile_size: int = 8, alpha_threshold: float = 1 / 255) -> TileBins:
+    """Depth-sorted lists of Gaussians for all tiles of all cameras.
+
+    Args:
+        projected: what `project` returned.
+        tile_size: side of the square tiles in pixels.
+        alpha_threshold: alphas below it do not count; with 0 every Gaussian is in every tile of its camera.
+
+    Returns:
+        The lists; equal depths keep the order of `projected`. A Gaussian of opacity 0 is in none.
+    """
+    spans = tile_spans(projected, tile_size, alpha_threshold)
+    return spans.bin(0, spans.entries_per_row.shape[0])
+
+
+@dataclass(frozen=True)
+class TileSpans:
+    """For each Gaussian and each row of tiles the first tile and how many.
+
+    Rows of tiles are numbered through all cameras; memory is proportional to Gaussians times the rows they touch.
+
+    Args:
+        tile_size: side of a tile in pixels.
+        grid: (rows, columns) of tiles of one image.
+        ids: `(n,)`, rows of the `ProjectedGaussians` that touch a tile, in depth order.
+        ranks: `(S,)` int32, position in `ids`, ascending.
+        rows: `(S,)` int32, row of tiles.
+        first: `(S,)` int32, first column.
+        counts: `(S,)` int32, columns, may be 0.
+        entries_per_row: `(R,)` int64, sum of `counts` for each row of tiles.
+    """
+
+    tile_size: int
+    grid: tuple[int, int]
+    ids: Tensor
+    ranks: Tensor
+    rows: Tensor
+    first: Tensor
+    counts: Tensor
+    entries_per_row: Tensor
+
+    def bands(self, max_entries: int) -> list[tuple[int, int]]:
+        """Consecutive ranges of rows with at most `max_entries` entries each.
+
+        Raises:
+            ValueError: one row of tiles alone has more.
+        """
+        bands, begin, total = [], 0, 0
+        for row, entries in enumerate(self.entries_per_row.tolist()):
+            if entries > max_entries:
+                raise ValueError(
+                    f"max_bytes: one row of tiles needs {entries} entries, the budget allows {max_entries}; "
+                    "raise max_bytes, or render fewer or smaller Gaussians"
+                )
+            if total + entries > max_entries:
+                bands.append((begin, row))
+                begin, total = row, 0
+            total += entries
+        bands.append((begin, self.entries_per_row.shape[0]))
+        return bands
+
+    def bin(self, begin: int, end: int) -> TileBins:
+        """The lists of the tiles in rows `begin` to `end` (exclusive)."""
+        ranks, rows, first, counts = self.ranks, self.rows, self.first, self.counts
+        if (begin, end) != (0, self.entries_per_row.shape[0]):
+            inside = ((rows >= begin) & (rows < end)).nonzero()[:, 0]
+            ranks, rows, first, counts = (x.index_select(0, inside) for x in (ranks, rows, first, counts))
+        columns = self.grid[1]
+        num_tiles = (end - begin) * columns
+        num_entries = int(counts.sum(dtype=torch.int64))
+        # in the order of the Gaussians: entry e of a span is tile (row, first + e)
+        start = torch.cumsum(counts, 0, dtype=torch.int32) - counts
+        span = torch.repeat_interleave(_arange(counts), counts, output_size=num_entries)
+        tiles = _arange(span) + ((rows - begin) * columns + first - start).index_select(0, span)
+        ranks = ranks.index_select(0, span)
+        keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
+        by_gaussian = torch.empty_like(order).scatter_(0, order, torch.arange(num_entries, device=order.device))
+        per_gaussian = torch.bincount(ranks, minlength=self.ids.shape[0])
+        per_tile = torch.bincount(keys, minlength=num_tiles)
+        return TileBins(
+            tile_size=self.tile_size,
+            grid=self.grid,
+            first_tile=begin * columns,
+            offsets=torch.cat([per_tile.new_zeros(1), torch.cumsum(per_tile, 0)]),
+            entries=ranks.index_select(0, order),
+            ids=self.ids,
+            by_gaussian=by_gaussian,
+            gaussian_offsets=torch.cumsum(per_gaussian, 0) - per_gaussian,
+        )
+
+
+@torch.no_grad()
+def tile_spans(projected: ProjectedGaussians, tile_size: int, alpha_threshold: float) -> TileSpans:
+    """The exact span of every Gaussian in every row of tiles; see the head of this file."""
+    height, width = projected.image_size
+    grid = (-(-height // tile_size), -(-width // tile_size))
+    cut = cut_squared(projected.opacities, alpha_threshold)
+    xx, xy, yy, det = variances(projected.factors, projected.eps2d)
+    reach = (cut.clamp_min(0.0) * yy).sqrt()
+    y = projected.means2d[:, 1]
+    top = torch.ceil(y - reach).clamp(0, height)
+    bottom = torch.floor(y + reach).clamp(-1, height - 1)
+    ids = ((cut > 0) & (bottom >= top)).nonzero()[:, 0]
+    depths = projected.depths.index_select(0, ids)
+    ids = ids.index_select(0, torch.sort(depths, stable=True).indices)
+
+    # a column of numbers a Gaussian, gathered once for each row of tiles that it touches
+    first_row = (top.index_select(0, ids) / tile_size).floor().int()
+    num_rows = (bottom.index_select(0, ids) / tile_size).floor().int() - first_row + 1
+    num_spans = int(num_rows.sum(dtype=torch.int64))
+    ranks = torch.repeat_interleave(_arange(num_rows), num_rows, output_size=num_spans)
+    start = torch.cumsum(num_rows, 0, dtype=torch.int32) - num_rows
+    rows = _arange(ranks) + (first_row - start).index_select(0, ranks)
+    table = torch.stack(
+        [projected.means2d[:, 0], y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()]
+    ).index_select(1, ids)
+    table = torch.where(table.isfinite(), table, torch.inf)
+    x, y, reach, cut, slope, across, inverse_yy, rightmost = (column.index_select(0, ranks) for column in table)
+    low = rows * float(tile_size) - y
+    high = torch.minimum(low + (tile_size - 1), reach)
+    low = torch.maximum(low, -reach)
+    everywhere = torch.isinf(cut)
+
+    def edge(sign: int) -> Tensor:
+        dy = torch.minimum(torch.maximum(sign * rightmost, low), high)
+        half = ((cut - dy * dy * inverse_yy).clamp_min_(0.0) * across).sqrt_()
+        return x + slope * dy + sign * half
+
+    left = torch.where(everywhere, -torch.inf, edge(-1))
+    right = torch.where(everywhere, torch.inf, edge(1))
+    left = torch.ceil(left).clamp_(0, width)
+    right = torch.floor(right).clamp_(-1, width - 1)
+    first = (left / tile_size).floor().int()
+    counts = ((right / tile_size).floor().int() - first + 1).mul_(right >= left)
+    rows += projected.camera_ids.index_select(0, ids).int().mul_(grid[0]).index_select(0, ranks)
+    entries_per_row = torch.zeros(projected.num_cameras * grid[0], dtype=torch.int64, device=rows.device)
+    entries_per_row.index_add_(0, rows, counts.long())
+    return TileSpans(tile_size, grid, ids, ranks, rows, first, counts, entries_per_row)
+
+
+def _arange(like: Tensor) -> Tensor:
+    return torch.arange(like.shape[0], dtype=torch.int32, device=like.device)
