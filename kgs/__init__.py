@@ -1,8 +1,11 @@
 """Differentiable 3D Gaussian splatting for sparse views, in PyTorch and Kornia, with DropGaussian as a layer."""
 
 from .compositing import composite
+from .densify import Densifier, DensifyReport, camera_extent
 from .drop import DropGaussian, drop_gaussian
 from .errors import DataError, TrainingDiverged
+from .model import GaussianModel
+from .ply import load_ply, save_ply
 from .projection import project
 from .renderer import GaussianRenderer
 from .tiles import bin_to_tiles
@@ -16,6 +19,12 @@ __all__ = [
     "bin_to_tiles",
     "composite",
     "Gaussians",
+    "GaussianModel",
+    "Densifier",
+    "DensifyReport",
+    "camera_extent",
+    "save_ply",
+    "load_ply",
     "PosedCamera",
     "ProjectedGaussians",
     "TileBins",

@@ -29,12 +29,12 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
-from .chunks import ALPHA_MAX, Band, Rules
+from .chunks import Band, Rules
 from .covariance import variances, whitening
 from .tiles import TileSpans, tile_spans
 from .types import ProjectedGaussians
 
-__all__ = ["ALPHA_MAX", "Composited", "composite"]
+__all__ = ["Composited", "composite"]
 
 _BYTES_PER_ENTRY = 160  # lists, sorting, saved transmittance and gradients, for 8 x 8 tiles
 

@@ -158,6 +158,7 @@ class DropGaussian(nn.Module):
         self._own_generator(torch.device(device)).set_state(state)
 
     def extra_repr(self) -> str:
+        """What `print` shows."""
         name = getattr(self.schedule, "__name__", repr(self.schedule))
         progress = "1.0 (never set)" if self._progress is None else f"{self._progress:g}"
         seed = "" if self.seed is None else f", seed={self.seed}"

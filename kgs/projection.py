@@ -176,9 +176,13 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
 
 def _finite(gaussians: Gaussians) -> Tensor:
     """Which Gaussians have only finite parameters, `(N,)`."""
-    finite = torch.isfinite(gaussians.opacities.detach()).reshape(-1, len(gaussians)).all(0)
-    for value in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors):
-        finite = finite & torch.isfinite(value.detach()).flatten(1).all(1)
+    n = len(gaussians)
+    values = [gaussians.opacities.detach().reshape(-1, n).T]
+    values += [x.detach().flatten(1) for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors)]
+    # a finite sum has finite terms; the slower exact test is needed only where a sum is not finite
+    finite = torch.isfinite(torch.stack([x.sum(1) for x in values]).sum(0))
+    if not bool(finite.all()):
+        finite = torch.stack([torch.isfinite(x).all(1) for x in values]).all(0)
     return finite
 
 

@@ -129,6 +129,7 @@ class GaussianRenderer(nn.Module):
         )
 
     def extra_repr(self) -> str:
+        """What `print` shows."""
         return (
             f"tile_size={self.tile_size}, near_plane={self.near_plane:g}, eps2d={self.eps2d:g}, "
             f"alpha_threshold={self.alpha_threshold:g}, transmittance_stop={self.transmittance_stop:g}"

@@ -110,7 +110,8 @@ class PosedCamera:
         params = self.model.params
         if params.ndim == 2 and params.shape[0] not in (1, self.extrinsics.shape[0]):
             raise ValueError(
-                f"model: expected params of 1 or {self.extrinsics.shape[0]} cameras as extrinsics, got {params.shape[0]}"
+                f"model: expected params of 1 or {self.extrinsics.shape[0]} cameras as extrinsics, "
+                f"got {params.shape[0]}"
             )
 
 

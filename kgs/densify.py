@@ -1,0 +1,272 @@
+"""Adaptive density control: clone, split and prune Gaussians while they are being fitted, and reset opacities.
+
+Source: B. Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023, section 5.2, with the numbers of the DropGaussian
+recipe (threshold 5e-4, pruning by opacity alone).
+
+This is the only place where the number of Gaussians changes, and with it the optimiser's state.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import Tensor, nn
+
+from .model import GaussianModel
+from .types import ProjectedGaussians
+
+__all__ = ["DensifyReport", "Densifier", "camera_extent"]
+
+CHILDREN = 2
+SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
+
+
+@dataclass(frozen=True)
+class DensifyReport:
+    """What one densification did.
+
+    Args:
+        cloned: Gaussians that were copied.
+        split: Gaussians that were replaced by two smaller ones.
+        pruned: Gaussians that were removed because they are transparent.
+        total: Gaussians there are now: those before + cloned + split - pruned.
+        capped: Gaussians over the threshold that were left alone because of `max_gaussians`.
+    """
+
+    cloned: int
+    split: int
+    pruned: int
+    total: int
+    capped: int
+
+
+class Densifier:
+    """Adds Gaussians where the image wants them and removes transparent ones, together with their Adam state.
+
+    The statistic is the norm of the loss gradient with respect to the projected centre in normalised device
+    coordinates (pixels over half the width and half the height), averaged over the times a Gaussian was seen since the
+    last `step`. A Gaussian that `DropGaussian` switched off is seen with gradient 0, as in the method's release.
+
+    Convention:
+        The loss is a mean over cameras: the gradients of a call with C cameras are multiplied by C, so that the
+        threshold means the same for any C.
+
+    Args:
+        model: the Gaussians.
+        optimizer: any optimiser that holds each of the model's parameters; other parameters are left alone.
+        extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
+        grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
+        percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
+        prune_opacity: Gaussians below this opacity are removed, in [0, 1].
+        max_gaussians: no densification goes beyond this count; the largest gradients come first. None: no limit.
+        generator: the stream for the children's places; None makes one of its own, seeded with 0.
+
+    Raises:
+        ValueError: a number is out of range, or the optimizer does not hold the model's parameters.
+
+    Example:
+        >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
+        >>> densifier = Densifier(model, torch.optim.Adam(model.parameters()), extent=1.0)
+        >>> densifier.step()
+        DensifyReport(cloned=0, split=0, pruned=0, total=20, capped=0)
+    """
+
+    def __init__(
+        self,
+        model: GaussianModel,
+        optimizer: torch.optim.Optimizer,
+        extent: float,
+        *,
+        grad_threshold: float = 5e-4,
+        percent_dense: float = 0.01,
+        prune_opacity: float = 0.005,
+        max_gaussians: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        for name, number in (("extent", extent), ("percent_dense", percent_dense)):
+            if not 0.0 < number < math.inf:
+                raise ValueError(f"{name}: expected a finite number > 0, got {number}")
+        if not grad_threshold >= 0.0:
+            raise ValueError(f"grad_threshold: expected a number >= 0, got {grad_threshold}")
+        if not 0.0 <= prune_opacity <= 1.0:
+            raise ValueError(f"prune_opacity: expected a number in [0, 1], got {prune_opacity}")
+        if max_gaussians is not None and max_gaussians < 1:
+            raise ValueError(f"max_gaussians: expected an integer >= 1 or None, got {max_gaussians}")
+        held = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
+        for name, parameter in model.named_parameters():
+            if id(parameter) not in held:
+                raise ValueError(f"optimizer: expected it to hold all of the model's parameters, got none for {name}")
+        self.model = model
+        self.optimizer = optimizer
+        self.extent = float(extent)
+        self.grad_threshold = grad_threshold
+        self.percent_dense = percent_dense
+        self.prune_opacity = prune_opacity
+        self.max_gaussians = max_gaussians
+        self.generator = torch.Generator().manual_seed(0) if generator is None else generator
+        self._reset_statistics()
+
+    @torch.no_grad()
+    def observe(self, projected: ProjectedGaussians) -> None:
+        """Take the gradients of one render into account; call it after `backward`.
+
+        Args:
+            projected: what the renderer returned; every listed pair counts as seen.
+
+        Raises:
+            ValueError: `projected.means2d` has no gradient, or the number of Gaussians is another.
+        """
+        if projected.num_gaussians != len(self.model):
+            raise ValueError(
+                f"projected: expected a render of the model's {len(self.model)} Gaussians, "
+                f"got one of {projected.num_gaussians}"
+            )
+        if len(projected) == 0:
+            return
+        gradient = projected.means2d.grad
+        if gradient is None:
+            raise ValueError(
+                "projected: expected means2d.grad, got None; render with gradients on and call observe after backward"
+            )
+        height, width = projected.image_size
+        norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
+        ids = projected.gaussian_ids
+        self._gradient_sums.index_add_(0, ids, norms)
+        self._counts.index_add_(0, ids, torch.ones_like(ids))
+
+    @torch.no_grad()
+    def step(self) -> DensifyReport:
+        """Clone, split and prune by what was observed since the last step, and start observing anew.
+
+        New Gaussians have zero Adam moments, the others keep theirs bit for bit. The parameters become new objects in
+        the model and the optimizer alike, without `.grad`: call it between `optimizer.step` and the next render.
+        """
+        model = self.model
+        before = len(model)
+        average = self._gradient_sums / self._counts.clamp(min=1)
+        opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # NaN stays, for the trainer to find
+        hot, capped = self._choose((average >= self.grad_threshold) & opaque, average, int(opaque.sum()))
+        large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
+        cloned = (hot & ~large).nonzero().squeeze(1)
+        split = (hot & large).nonzero().squeeze(1)
+        kept = (opaque & ~(hot & large)).nonzero().squeeze(1)
+
+        born = torch.cat([cloned, split.repeat(CHILDREN)])
+        new = {name: parameter.index_select(0, born) for name, parameter in model.named_parameters()}
+        children = slice(len(cloned), None)
+        new["means"][children] += self._sample_offsets(split.repeat(CHILDREN))
+        new["log_scales"][children] -= math.log(SHRINK)
+        for name, parameter in list(model.named_parameters()):
+            self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
+        self._reset_statistics()
+        pruned = before - len(kept) - len(split)
+        return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
+
+    @torch.no_grad()
+    def reset_opacity(self, ceiling: float = 0.01) -> None:
+        """Lower all opacities to at most `ceiling`, in (0, 1), and zero their Adam moments (not the step count).
+
+        Raises:
+            ValueError: `ceiling` is not in (0, 1).
+        """
+        if not 0.0 < ceiling < 1.0:
+            raise ValueError(f"ceiling: expected a number in (0, 1), got {ceiling}")
+        lowered = self.model.opacity_logits.clamp(max=math.log(ceiling / (1.0 - ceiling)))
+        self._replace("opacity_logits", lowered, kept=torch.empty(0, dtype=torch.int64, device=lowered.device))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The statistics and the generator's state, for a checkpoint."""
+        return {
+            "gradient_sums": self._gradient_sums.clone(),
+            "counts": self._counts.clone(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `state_dict` returned; the model must hold as many Gaussians as it did then.
+
+        Raises:
+            ValueError: an entry is missing, or the number of Gaussians is another.
+        """
+        missing = {"gradient_sums", "counts", "generator"} - state.keys()
+        if missing:
+            raise ValueError(f"state: expected gradient_sums, counts and generator, got none for {sorted(missing)}")
+        for name in ("gradient_sums", "counts"):
+            if state[name].shape != (len(self.model),):
+                raise ValueError(f"{name}: expected shape ({len(self.model)},), got {tuple(state[name].shape)}")
+        self._gradient_sums.copy_(state["gradient_sums"])
+        self._counts.copy_(state["counts"])
+        self.generator.set_state(state["generator"].cpu())
+
+    def _choose(self, hot: Tensor, average: Tensor, remaining: int) -> tuple[Tensor, int]:
+        """Leave of `hot` no more than may be added (each one adds 1), the largest first; and how many were left out."""
+        wanted = int(hot.sum())
+        room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - remaining)
+        if wanted <= room:
+            return hot, 0
+        order = torch.where(hot, average, -1.0).sort(descending=True, stable=True).indices
+        chosen = torch.zeros_like(hot)
+        chosen[order[:room]] = True
+        return chosen, wanted - room
+
+    def _sample_offsets(self, ids: Tensor) -> Tensor:
+        """Draw, for each id, a place relative to the centre from that Gaussian's own distribution."""
+        means = self.model.means
+        noise = torch.randn((len(ids), 3), generator=self.generator, device=self.generator.device, dtype=means.dtype)
+        # a scale may overflow where its logarithm does not; the place has to stay finite
+        scales = self.model.log_scales.index_select(0, ids).exp().clamp(max=math.sqrt(torch.finfo(means.dtype).max))
+        rotations = quaternion_to_rotation_matrix(self.model.quats.index_select(0, ids))
+        return torch.einsum("nij,nj->ni", rotations, scales * noise.to(means.device))
+
+    def _replace(self, name: str, value: Tensor, kept: Tensor) -> None:
+        """Put `value` in the place of a parameter, in the model, the param group and the optimizer's state.
+
+        State that has the parameter's shape (Adam's moments) begins with the old rows `kept` and goes on with zeros.
+
+        A new Parameter rather than new data in the old one: an old graph that is still alive would hold the latter to
+        its old shape in the next backward.
+        """
+        old = self.model.get_parameter(name)
+        new = nn.Parameter(value, requires_grad=old.requires_grad)
+        for group in self.optimizer.param_groups:
+            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+        if old in self.optimizer.state:
+            state = self.optimizer.state.pop(old)
+            for key, entry in state.items():
+                if isinstance(entry, Tensor) and entry.shape == old.shape:
+                    state[key] = entry.new_zeros(value.shape)
+                    state[key][: len(kept)] = entry.index_select(0, kept)
+            self.optimizer.state[new] = state
+        setattr(self.model, name, new)
+
+    def _reset_statistics(self) -> None:
+        means = self.model.means
+        self._gradient_sums = means.new_zeros(len(means))
+        self._counts = torch.zeros(len(means), dtype=torch.int64, device=means.device)
+
+
+def camera_extent(extrinsics: Tensor) -> float:
+    """Size of a camera rig: 1.1 times the largest distance of a camera's centre to the mean of the centres.
+
+    Source: the normalisation of NeRF++ (Zhang et al., 2020) as 3D Gaussian Splatting uses it; over training cameras.
+
+    Convention:
+        World-to-camera matrices [R | t] with a rotation R: the centre is -R^T t.
+
+    Args:
+        extrinsics: `(C, 4, 4)`, C >= 1.
+
+    Returns:
+        The extent in world units; 0 for a single camera.
+
+    Raises:
+        ValueError: `extrinsics` has another shape.
+    """
+    if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
+        raise ValueError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
+    poses = extrinsics.detach().double()
+    centres = -(poses[:, :3, :3].mT @ poses[:, :3, 3:]).squeeze(-1)
+    return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
