@@ -54,7 +54,7 @@ class Views:
 
     def camera(self, index: int | list[int]) -> PinholeCamera:
         """The cameras at the given positions (Kornia's class cannot be indexed)."""
-        rows = torch.tensor([index] if isinstance(index, int) else index)
+        rows = torch.tensor([index] if isinstance(index, int) else index, dtype=torch.int64)
         return PinholeCamera(
             self.cameras.intrinsics[rows],
             self.cameras.extrinsics[rows],

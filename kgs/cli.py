@@ -122,7 +122,7 @@ def fit(
         "background": background,
         "points": "model-points" if init == "model-points" else "none",
     }
-    lpips = _load_lpips(lpips_weights)
+    lpips = _load_lpips(lpips_weights, device)
     loaded = _load(request)
     height, width = loaded.train.images.shape[-2:]
     print(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
@@ -176,7 +176,7 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     from .fit.run import CHECKPOINT, measure
     from .fit.trainer import Trainer
 
-    lpips = _load_lpips(lpips_weights)
+    lpips = _load_lpips(lpips_weights, device)
     settings = read_json(out / "config.json")
     try:
         scene, config = _load(settings["request"]), FitConfig.from_dict(settings["fit"] | {"device": device})
@@ -206,12 +206,12 @@ def _load(request: dict[str, Any]) -> Any:
     )
 
 
-def _load_lpips(folder: Path | None) -> Any:
+def _load_lpips(folder: Path | None, device: str) -> Any:
     if folder is None:
         return None
     from .fit.lpips import Lpips
 
-    return Lpips.load(folder)
+    return Lpips.load(folder).to(device)
 
 
 def _print_metrics(metrics: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import FunctionCtx
 
 from .chunks import Band, Rules
 from .covariance import variances, whitening
@@ -135,10 +135,13 @@ class _Composite(torch.autograd.Function):
         return images
 
     @staticmethod
-    @once_differentiable
     def backward(  # type: ignore[override]
         ctx: FunctionCtx, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor
     ) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "composite: expected backward without create_graph, the renderer has no second derivative"
+            )
         factors, opacities, transmittance = ctx.saved_tensors
         spans, columns = ctx.spans, ctx.spans.grid[1]
         grads = _to_tiles(grad_sums, spans)

@@ -1,0 +1,165 @@
+"""Every number of a fit, as frozen dataclasses.
+
+Source: the official release of "DropGaussian" (CVPR 2025) for the recipe, which is that of Kerbl et al. 2023 with
+another densification threshold and without pruning by size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+__all__ = ["FitConfig", "Recipe", "Timetable", "timetable"]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The recipe for `steps` = 10 000; a shorter fit scales the counts and keeps the rates.
+
+    Args:
+        steps: iterations, counted from 1; one training view each.
+        lr_means: learning rate of the centres at the start, times the extent of the training cameras.
+        lr_means_final: the same at the end, reached log-linearly.
+        lr_sh_dc: of the colour without direction.
+        lr_sh_rest: of the higher harmonics.
+        lr_opacity: of the opacity logits.
+        lr_scales: of the logarithms of the scales.
+        lr_quats: of the quaternions.
+        adam_eps: Adam's epsilon; torch's default would stall the small gradients.
+        sh_interval: every so many steps one more degree of the harmonics is switched on.
+        dssim_weight: loss = L1 + dssim_weight (1 - SSIM).
+        densify_from: no densification up to this step.
+        densify_interval: steps between two densifications.
+        grad_threshold: mean gradient in normalised device coordinates from which a Gaussian is densified.
+        percent_dense: largest scale, relative to the extent, up to which it is cloned rather than split.
+        prune_opacity: Gaussians below are removed.
+        reset_interval: steps between two resets of all opacities.
+        reset_opacity: what they are lowered to.
+        reset_recovery: a reset is left out where fewer steps than this follow before the next one or the end.
+        near_plane: times the 1st percentile of the first points' depths.
+    """
+
+    steps: int = 10_000
+    lr_means: float = 1.6e-4
+    lr_means_final: float = 1.6e-6
+    lr_sh_dc: float = 2.5e-3
+    lr_sh_rest: float = 1.25e-4
+    lr_opacity: float = 0.05
+    lr_scales: float = 0.005
+    lr_quats: float = 0.001
+    adam_eps: float = 1e-15
+    sh_interval: int = 1000
+    dssim_weight: float = 0.2
+    densify_from: int = 500
+    densify_interval: int = 100
+    grad_threshold: float = 5e-4
+    percent_dense: float = 0.01
+    prune_opacity: float = 0.005
+    reset_interval: int = 3000
+    reset_opacity: float = 0.01
+    reset_recovery: int = 1000
+    near_plane: float = 0.05
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """What one fit is asked to do.
+
+    Args:
+        steps: iterations; other numbers than the recipe's 10 000 scale its counts, see :func:`timetable`.
+        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
+        drop_schedule: "linear" (the paper's) or "constant".
+        sh_degree: degree of the harmonics, 0 to 3.
+        seed: views, splits, masks and random points are drawn from streams that derive from it.
+        init: first points: "sift", "random", "model-points" (positions refined with test views), "file", or "auto",
+            which is "sift" except where the layout itself prescribes random points (Blender).
+        init_file: point cloud for "file".
+        max_gaussians: densification stops there; None: 10 a step, and at least 4 times the first points.
+        evaluations: how often the curve is measured, the last time at the end.
+        device: "cpu", "cuda", ...
+        recipe: all the other numbers.
+    """
+
+    steps: int = 2000
+    drop: float = 0.2
+    drop_schedule: str = "linear"
+    sh_degree: int = 3
+    seed: int = 0
+    init: str = "auto"
+    init_file: Path | None = None
+    max_gaussians: int | None = None
+    evaluations: int = 8
+    device: str = "cpu"
+    recipe: Recipe = field(default_factory=Recipe)
+
+    def __post_init__(self) -> None:
+        for name, low in (("steps", 1), ("evaluations", 1)):
+            if getattr(self, name) < low:
+                raise ValueError(f"{name}: expected at least {low}, got {getattr(self, name)}")
+        if not 0.0 <= self.drop < 1.0:
+            raise ValueError(f"drop: expected a rate in [0, 1), got {self.drop}")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The numbers as plain values, for JSON and checkpoints."""
+        values = asdict(self)
+        values["init_file"] = None if self.init_file is None else str(self.init_file)
+        return values
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> FitConfig:
+        """The inverse of `to_dict`.
+
+        Raises:
+            ValueError: an entry is unknown or out of range.
+        """
+        try:
+            init_file = values.get("init_file")
+            return cls(
+                **{
+                    **values,
+                    "init_file": None if init_file is None else Path(init_file),
+                    "recipe": Recipe(**values.get("recipe", {})),
+                }
+            )
+        except TypeError as error:
+            raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
+
+
+@dataclass(frozen=True)
+class Timetable:
+    """The iterations at which things happen in a fit of a given length.
+
+    Args:
+        sh: before these steps one more degree of harmonics is switched on.
+        densify: after these steps Gaussians are cloned, split and pruned.
+        reset: after these steps all opacities are lowered.
+        evaluate: after these steps the curve is measured (before a densification).
+    """
+
+    sh: tuple[int, ...]
+    densify: tuple[int, ...]
+    reset: tuple[int, ...]
+    evaluate: tuple[int, ...]
+
+
+def timetable(config: FitConfig) -> Timetable:
+    """Scale the recipe's counts by steps / 10 000.
+
+    The interval of densification is never under 10 steps. An opacity reset is left out where fewer than
+    `reset_recovery` steps follow before the next one or the end: the opacities would not come back.
+    """
+    recipe, steps = config.recipe, config.steps
+    scale = steps / recipe.steps
+    interval = max(10, round(recipe.densify_interval * scale))
+    begin = round(recipe.densify_from * scale)
+    densify = tuple(step for step in range(interval, steps, interval) if step > begin)
+    spacing = max(1, round(recipe.reset_interval * scale))
+    resets = list(range(spacing, steps, spacing))
+    reset = tuple(step for step, then in pairwise([*resets, steps]) if then - step >= recipe.reset_recovery)
+    sh = [round(recipe.sh_interval * scale * k) for k in range(1, config.sh_degree + 1)]
+    evaluate = {max(1, round(steps * k / config.evaluations)) for k in range(1, config.evaluations + 1)}
+    return Timetable(tuple(max(1, step) for step in sh), densify, reset, tuple(sorted(evaluate)))

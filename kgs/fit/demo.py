@@ -1,0 +1,59 @@
+"""The demonstration: three views of a synthetic scene, with and without DropGaussian, from equal starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from kgs.datasets import Scene, synthetic_scene
+
+from .config import FitConfig
+from .report import side_by_side, write_curve, write_json, write_png
+from .run import choose_points, measure, train
+from .trainer import Trainer
+
+__all__ = ["DEMO", "run_demo"]
+
+DEMO = FitConfig(steps=1500, drop=0.2, max_gaussians=8000)
+
+
+def run_demo(
+    out: Path, config: FitConfig = DEMO, *, scene: Scene | None = None, say: Callable[[str], None] = print
+) -> dict[str, Any]:
+    """Fit the same scene twice and compare on views that neither fit has seen.
+
+    Args:
+        out: folder for demo.png, curve.png and metrics.json.
+        config: the fit with DropGaussian; the other has drop = 0 and is equal otherwise, the first points and the
+            order of views included.
+        scene: another scene than the built-in one.
+        say: where lines for the user go.
+
+    Returns:
+        What metrics.json holds: `{"without": run, "with": run}`.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if scene is None:
+        scene = synthetic_scene(train_views=3, seed=config.seed)
+    points = choose_points(scene, config)
+    say(
+        f"{len(scene.train)} training and {len(scene.test)} test views of "
+        f"{scene.train.images.shape[-1]}x{scene.train.images.shape[-2]}"
+    )
+    say(f"first points: {len(points.points)} ({points.kind})")
+    runs, renders, curves = {}, {}, {}
+    for name, fit in (("without", replace(config, drop=0.0)), ("with", config)):
+        trainer = Trainer(scene, fit, points)
+        interrupted = train(trainer, None, title=f"{name:>7} DropGaussian")
+        if interrupted:
+            raise KeyboardInterrupt
+        runs[name] = measure(trainer)
+        renders[f"{name} DropGaussian"] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
+        curves[f"{name} DropGaussian"] = trainer.curve
+    write_json(out / "metrics.json", runs)
+    write_curve(out / "curve.png", curves)
+    worst = sorted(range(len(scene.test)), key=lambda i: runs["without"]["test"]["views"][i]["psnr"])[:2]
+    write_png(out / "demo.png", side_by_side(scene.test, renders, sorted(worst)))
+    return runs

@@ -1,0 +1,81 @@
+"""Measures of held-out views: PSNR, SSIM with both borders, LPIPS.
+
+Float renders clamped to [0, 1] are compared, never 8-bit files. Every measure is taken view by view, over all pixels
+and channels (masks are not used), and the mean is over views.
+
+Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
+Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from kornia.geometry.camera import PinholeCamera
+from kornia.metrics import psnr, ssim
+from torch import Tensor
+
+from kgs.datasets.scene import Views
+
+from .lpips import Lpips
+
+__all__ = ["evaluate"]
+
+MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
+WINDOW = 11
+RADIUS = WINDOW // 2
+
+
+@torch.no_grad()
+def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpips | None = None) -> dict[str, Any]:
+    """Render each view and compare it with its photo.
+
+    Args:
+        render: from one camera, on the device of `views`, to an image `(1, 3, H, W)`; called without gradients.
+        views: the views to compare with, at least 6 x 6 pixels (16 x 16 with `lpips`).
+        lpips: a "vgg16" network on the device of the rendered images, or None for no LPIPS.
+
+    Returns:
+        Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
+        published tables), "lpips_vgg" (images in [-1, 1], as the network is meant) and "lpips_vgg_unscaled" (in [0, 1],
+        as in the published tables); under "views" a list with "name" and the same keys for each view. All can go to
+        JSON: None stands for what was not measured, and for the PSNR of an image that equals its photo in every value.
+        That is infinite, as is then the mean, and no finite number is put in its place.
+
+    Raises:
+        ValueError: a render has another shape than its photo or holds NaN or infinity, or `lpips` is no "vgg16".
+    """
+    if lpips is not None and lpips.net != "vgg16":
+        raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
+    rows: list[dict[str, float | None]] = []
+    for index, name in enumerate(views.names):
+        image, target = render(views.camera(index)), views.images[index : index + 1]
+        if image.shape != target.shape:
+            raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
+        if not bool(image.isfinite().all()):
+            raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
+        rows.append(_measure(image.clamp(0.0, 1.0), target.to(image), lpips))
+    means = {key: _mean([row[key] for row in rows]) for key in MEASURES}
+    return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
+
+
+def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
+    level = psnr(image, target, 1.0).item()
+    # Kornia's "valid" map of images inside a border of zeros is the whole map with zero padding.
+    padded, padded_target = F.pad(image, [RADIUS] * 4), F.pad(target, [RADIUS] * 4)
+    return {
+        "psnr": level if math.isfinite(level) else None,
+        "ssim": ssim(image, target, WINDOW).mean().item(),
+        "ssim_zero_padded": ssim(padded, padded_target, WINDOW, eps=0.0, padding="valid").mean().item(),
+        "lpips_vgg": None if lpips is None else lpips(image, target).item(),
+        "lpips_vgg_unscaled": None if lpips is None else lpips(image, target, rescale=False).item(),
+    }
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known and len(known) == len(values) else None

@@ -1,0 +1,183 @@
+"""LPIPS, the learned perceptual distance, from weight files that the user provides.
+
+Source: R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, eq. 1,
+with the linear heads of version 0.1:
+
+    d(x, y) = sum_l mean_hw sum_c w_lc (u_l(x) - u_l(y))^2_hwc
+
+where u_l are the features after the last ReLU of block l, scaled to unit length along the channels.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from os import PathLike
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from kgs.errors import DataError
+
+__all__ = ["Lpips"]
+
+# The mean and deviation of ImageNet, as the authors give them for images in [-1, 1].
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+NORM_EPS = 1e-10
+
+# Positions, in torchvision's `features`, of the ReLUs whose outputs are compared; and the smallest image they take.
+TAPS = {"alexnet": (1, 4, 7, 9, 11), "vgg16": (3, 8, 15, 22, 29)}
+MIN_SIZE = {"alexnet": 31, "vgg16": 16}
+
+
+class Lpips(nn.Module):
+    """Perceptual distance of two images.
+
+    The state dict has the names of the weight files: torchvision's `features.0.weight`, ... and `lin0` to `lin4`. A
+    module made without `load` has random features and heads of ones; it is a distance, but not LPIPS.
+
+    Args:
+        net: "vgg16" or "alexnet".
+
+    Raises:
+        ValueError: `net` is none of the two.
+    """
+
+    def __init__(self, net: str = "vgg16") -> None:
+        super().__init__()
+        if net not in TAPS:
+            raise ValueError(f"net: expected one of {sorted(TAPS)}, got {net!r}")
+        self.net = net
+        self.features: nn.Sequential = _vgg16_features() if net == "vgg16" else _alexnet_features()
+        channels = 0
+        for index, layer in enumerate(self.features):
+            if isinstance(layer, nn.Conv2d):
+                channels = layer.out_channels
+            if index in TAPS[net]:
+                self.register_buffer(f"lin{TAPS[net].index(index)}", torch.ones(channels))
+        self.requires_grad_(False)
+
+    @classmethod
+    def load(cls, folder: str | PathLike[str], net: str = "vgg16") -> Self:
+        """Read the weights from `<net>_features.npz` and `lpips_lin_<net>.npz`.
+
+        Args:
+            folder: holds the two files: convolutions under torchvision's names (`features.0.weight`, OIHW), heads
+                `lin0` to `lin4`, floating point of any width.
+            net: "vgg16" (the one of published tables) or "alexnet".
+
+        Returns:
+            The module, frozen, on the CPU, in float32.
+
+        Raises:
+            DataError: the folder, a file or an array is missing or not what it should be.
+            ValueError: `net` is unknown.
+        """
+        with torch.device("meta"):
+            module = cls(net)
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise DataError(folder, "", f"expected a folder with {net}_features.npz and lpips_lin_{net}.npz, got none")
+        shapes = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+        convolutions = {name: shape for name, shape in shapes.items() if name.startswith("features.")}
+        heads = {name: shape for name, shape in shapes.items() if name not in convolutions}
+        weights = _read(folder / f"{net}_features.npz", convolutions) | _read(folder / f"lpips_lin_{net}.npz", heads)
+        module.load_state_dict(weights, assign=True)
+        return module.requires_grad_(False).eval()
+
+    def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:
+        """Distance of each image to its target; differentiable in both.
+
+        Args:
+            image: `(B, 3, H, W)` in [0, 1], H, W >= 16 for "vgg16" and >= 31 for "alexnet".
+            target: like `image`.
+            rescale: True brings the images to [-1, 1], which the network is meant for. False feeds them in [0, 1], as
+                the published tables of Gaussian splatting do; the two values cannot be compared.
+
+        Returns:
+            Distances >= 0, `(B,)`.
+
+        Raises:
+            ValueError: shapes do not fit.
+        """
+        smallest = MIN_SIZE[self.net]
+        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < smallest:
+            raise ValueError(f"image: expected shape (B, 3, H, W) with H, W >= {smallest}, got {tuple(image.shape)}")
+        if target.shape != image.shape:
+            raise ValueError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
+        x, y = self._normalize(image, rescale), self._normalize(target, rescale)
+        distance = image.new_zeros(len(image))
+        taps = TAPS[self.net]
+        for index, layer in enumerate(self.features):
+            x, y = layer(x), layer(y)
+            if index in taps:
+                head = self.get_buffer(f"lin{taps.index(index)}").view(-1, 1, 1)
+                distance = distance + ((_unit(x) - _unit(y)).square() * head).sum(dim=1).mean(dim=(1, 2))
+        return distance
+
+    def _normalize(self, image: Tensor, rescale: bool) -> Tensor:
+        image = 2.0 * image - 1.0 if rescale else image
+        return (image - image.new_tensor(SHIFT).view(3, 1, 1)) / image.new_tensor(SCALE).view(3, 1, 1)
+
+
+def _unit(features: Tensor) -> Tensor:
+    norm: Tensor = torch.linalg.vector_norm(features, dim=1, keepdim=True)
+    return features / (norm + NORM_EPS)
+
+
+def _vgg16_features() -> nn.Sequential:
+    layers: list[nn.Module] = []
+    channels = 3
+    for block, (width, count) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
+        if block > 0:
+            layers.append(nn.MaxPool2d(2))
+        for _ in range(count):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+    return nn.Sequential(*layers)
+
+
+def _alexnet_features() -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(),
+    )
+
+
+def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    """The named arrays of an npz file as float32 tensors."""
+    if not path.is_file():
+        raise DataError(path, "", "expected an npz file of LPIPS weights, got none")
+    if not zipfile.is_zipfile(path):
+        raise DataError(path, "", "expected an npz file, got another format or a part of one")
+    field = ""
+    weights = {}
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            for field, shape in shapes.items():
+                if field not in arrays:
+                    raise DataError(path, field, f"expected an array of shape {shape}, got none")
+                array = arrays[field]
+                if array.shape != shape or not np.issubdtype(array.dtype, np.floating):
+                    raise DataError(path, field, f"expected floats of shape {shape}, got {array.dtype} {array.shape}")
+                with np.errstate(over="ignore"):
+                    weights[field] = torch.from_numpy(array.astype(np.float32))
+                if not bool(weights[field].isfinite().all()):
+                    raise DataError(path, field, "expected finite numbers in the range of float32, got others")
+    except (OSError, EOFError, ValueError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(path, field, f"expected a readable npz file, got {error}") from error
+    return weights

@@ -1,0 +1,176 @@
+"""One fit from a scene to its files: trains with a progress line, evaluates, writes everything."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from kgs.datasets import Scene
+from kgs.errors import DataError
+from kgs.ply import save_ply
+
+from .config import FitConfig
+from .evaluate import evaluate
+from .initialize import FirstPoints, first_points
+from .lpips import Lpips
+from .report import run_metrics, write_curve, write_json, write_png
+from .trainer import Trainer
+
+__all__ = ["CHECKPOINT", "choose_points", "fit_scene", "measure", "train"]
+
+CHECKPOINT = "checkpoint.pt"
+
+
+def fit_scene(
+    scene: Scene,
+    config: FitConfig,
+    out: Path,
+    *,
+    resume: bool = False,
+    lpips: Lpips | None = None,
+    request: dict[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> tuple[dict[str, Any], bool]:
+    """Fit a scene and write splat.ply, metrics.json, config.json, curve.png, test/*.png and the checkpoint.
+
+    Args:
+        scene: posed training and test views.
+        config: all numbers.
+        out: the folder for the results, made if it is not there.
+        resume: continue from the folder's checkpoint, if there is one.
+        lpips: the perceptual metric, or None to leave it out.
+        request: how the scene was loaded, kept in config.json for `kgs eval`.
+        say: where lines for the user go.
+
+    Returns:
+        What metrics.json holds, and whether the fit was interrupted (its results are valid all the same).
+
+    Raises:
+        DataError: the checkpoint is damaged or belongs to another fit.
+        TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    checkpoint = out / CHECKPOINT
+    if resume and checkpoint.exists():
+        trainer = Trainer.resume(scene, config, checkpoint)
+        say(f"resumed at step {trainer.step}")
+    else:
+        points = choose_points(scene, config)
+        say(f"first points: {len(points.points)} ({points.kind})")
+        trainer = Trainer(scene, config, points)
+    write_json(
+        out / "config.json",
+        {
+            "request": request or {},
+            "fit": config.to_dict(),
+            "timetable": asdict(trainer.times),
+            "max_gaussians": trainer.max_gaussians,
+            "near_plane": trainer.renderer.near_plane,
+            "extent": trainer.extent,
+        },
+    )
+    interrupted = train(trainer, checkpoint)
+    for note in trainer.notes:
+        say(note)
+    save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
+    write_curve(out / "curve.png", {"": trainer.curve})
+    (out / "test").mkdir(exist_ok=True)
+    for i, name in enumerate(scene.test.names):
+        write_png(out / "test" / f"{Path(name).stem}.png", trainer.render(scene.test.camera(i))[0])
+    metrics = measure(trainer, lpips)
+    write_json(out / "metrics.json", metrics)
+    return metrics, interrupted
+
+
+def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
+    """What metrics.json holds of one run; "test" is None where no view is held out."""
+    scene = trainer.scene
+    test = evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None
+    return run_metrics(trainer, test, evaluate(trainer.render, scene.train, lpips), _protocol(scene, trainer.config))
+
+
+def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
+    """First points as `config.init` asks for; from training views alone, unless "model-points" is asked for.
+
+    Raises:
+        DataError: the scene has no points of its own, or the file has none.
+        ValueError: an unknown kind.
+    """
+    kind = config.init
+    if kind == "auto":
+        kind = "scene" if scene.init_kind == "random" else "sift"
+    if kind in ("scene", "model-points"):
+        if len(scene.points) == 0:
+            raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
+        return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
+    return first_points(scene.train, kind, seed=config.seed, file=config.init_file)
+
+
+def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> bool:
+    """Train to the end with a progress line; on Ctrl-C finish the step and stop. Returns whether that happened."""
+    total = trainer.config.steps
+    with (
+        _interruptible() as interrupted,
+        tqdm(total=total, initial=trainer.step, desc=title, unit="step", mininterval=0.5, file=sys.stderr) as bar,
+    ):
+
+        def after_step(trainer: Trainer, loss: float) -> bool:
+            bar.set_postfix(loss=f"{loss:.4f}", gaussians=len(trainer.model), refresh=False)
+            bar.update()
+            if checkpoint is not None and trainer.step in trainer.times.evaluate:
+                trainer.save(checkpoint)
+            return interrupted.is_set()
+
+        trainer.fit(after_step)
+    if checkpoint is not None:
+        trainer.save(checkpoint)
+    return trainer.step < total
+
+
+def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
+    """The conditions under which the figures of a run hold."""
+    height, width = scene.train.images.shape[-2:]
+    return {
+        "train": list(scene.train.names),
+        "test": list(scene.test.names),
+        "image_size": [height, width],
+        "background": scene.background.tolist(),
+        "init": (
+            f"{config.init}: first points from training views alone"
+            if scene.init_kind != "model-points" or config.init != "model-points"
+            else "points seen in training views, but their positions were refined with test views"
+        )
+        + "; poses as given (estimated with all views in real scenes, the field's protocol)",
+        "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
+        "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
+        "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
+        "test_views_used_for": "metrics and the curve only; no early stopping",
+    }
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets; a second Ctrl-C interrupts as usual."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def stop(*_: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,286 @@
+"""The training loop: one training view a step, deterministic, resumable at every step.
+
+Random numbers come from three streams that never mix: the order of views, the children of splits, and the masks of
+DropGaussian. Two fits that differ in the drop rate alone therefore see the same views in the same order.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.metrics import psnr
+from torch import Tensor
+
+from kgs.datasets import Scene, Views
+from kgs.densify import Densifier, camera_extent
+from kgs.drop import DropGaussian
+from kgs.errors import DataError, TrainingDiverged
+from kgs.losses import photometric_loss, target_moments
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
+
+from .checkpoint import load_checkpoint, save_checkpoint
+from .config import FitConfig, timetable
+from .initialize import FirstPoints, relative_near_plane
+
+__all__ = ["Trainer", "move_camera"]
+
+_GROUPS = {
+    "means": "lr_means",
+    "quats": "lr_quats",
+    "log_scales": "lr_scales",
+    "opacity_logits": "lr_opacity",
+    "sh_dc": "lr_sh_dc",
+    "sh_rest": "lr_sh_rest",
+}
+
+
+class Trainer:
+    """Fits Gaussians to the training views of a scene.
+
+    Nothing that is fitted depends on the test views; they are rendered for the curve alone.
+
+    Args:
+        scene: posed training and test views.
+        config: steps, drop rate, seed and all other numbers.
+        points: where the Gaussians begin.
+
+    Attributes:
+        model: the Gaussians.
+        renderer: with the drop layer inside; `eval()` mode renders all Gaussians.
+        step: how many steps are done.
+        curve: dicts of step, seconds of training, test_psnr and train_psnr.
+        seconds: time spent in training steps; evaluations are not counted.
+        notes: lines that a user should read (a capped count, for instance).
+    """
+
+    def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
+        self.scene = scene
+        self.config = config
+        self.init = {"kind": points.kind, "points": len(points.points)}
+        self.device = torch.device(config.device)
+        depths = relative_near_plane(scene.train, points.points) / 0.05
+        near_plane = config.recipe.near_plane * depths
+        # a rig without extent (one camera, or a pure rotation) still has to move its Gaussians
+        self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * depths)
+        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 4 * len(points.points))
+        model = GaussianModel.from_points(points.points, points.colors, config.sh_degree)
+        model.sh_degree = 0
+        self._build(model, near_plane)
+        self.step = 0
+        self.seconds = 0.0
+        self.curve: list[dict[str, float | None]] = []
+        self.notes: list[str] = []
+        self._stack: list[int] = []
+
+    def _build(self, model: GaussianModel, near_plane: float) -> None:
+        config, recipe = self.config, self.config.recipe
+        self.times = timetable(config)
+        self.model = model.to(self.device)
+        groups = [
+            {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, rate), "name": name}
+            for name, rate in _GROUPS.items()
+        ]
+        self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
+        self.drop = DropGaussian(config.drop, config.drop_schedule, seed=_seed(config, 1)) if config.drop else None
+        self.renderer = GaussianRenderer(self.drop, near_plane=near_plane).train()
+        self.densifier = Densifier(
+            self.model,
+            self.optimizer,
+            self.extent,
+            grad_threshold=recipe.grad_threshold,
+            percent_dense=recipe.percent_dense,
+            prune_opacity=recipe.prune_opacity,
+            max_gaussians=self.max_gaussians,
+            generator=torch.Generator().manual_seed(_seed(config, 2)),
+        )
+        self._order = torch.Generator().manual_seed(_seed(config, 3))
+        self._background = self.scene.background.to(self.device)
+        views = self.scene.train
+        self._views = []
+        for i in range(len(views)):
+            image = views.images[i : i + 1].to(self.device)
+            self._views.append((move_camera(views.camera(i), self.device), image, target_moments(image)))
+
+    def fit(self, callback: Callable[[Trainer, float], bool] | None = None) -> None:
+        """Train to the end.
+
+        Args:
+            callback: called after each step with the trainer and the loss (every few steps; NaN in between); training
+                stops, in a valid state, when it returns True.
+
+        Raises:
+            TrainingDiverged: a loss or gradient is not finite; the parameters are those before that step.
+        """
+        while self.step < self.config.steps:
+            start = time.perf_counter()
+            loss = self._train_step()
+            step = self.step
+            self.seconds += time.perf_counter() - start
+            if step in self.times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
+                self.curve.append(
+                    {
+                        "step": step,
+                        "seconds": round(self.seconds, 3),
+                        "test_psnr": self.psnr(self.scene.test),
+                        "train_psnr": self.psnr(self.scene.train),
+                    }
+                )
+            start = time.perf_counter()
+            if step in self.times.densify:
+                capped = self.densifier.step().capped
+                if capped and not any("max_gaussians" in note for note in self.notes):
+                    self.notes.append(
+                        f"step {step}: {capped} Gaussians were not densified, to keep their number at "
+                        f"max_gaussians = {self.max_gaussians}; raise it with --max-gaussians"
+                    )
+            if step in self.times.reset:
+                self.densifier.reset_opacity(self.config.recipe.reset_opacity)
+            self.seconds += time.perf_counter() - start
+            if callback is not None and callback(self, loss):
+                return
+
+    def render(self, camera: PinholeCamera) -> Tensor:
+        """All Gaussians from one camera, `(1, 3, H, W)`; what `evaluate` wants."""
+        self.renderer.eval()
+        with torch.no_grad():
+            image = self.renderer(self.model(), move_camera(camera, self.device), self._background).image
+        self.renderer.train()
+        return image
+
+    def psnr(self, views: Views) -> float | None:
+        """Mean PSNR over some views in dB, clamped renders; None where there are none."""
+        values = [
+            float(psnr(self.render(views.camera(i)).clamp(0, 1).cpu(), views.images[i : i + 1], 1.0))
+            for i in range(len(views))
+        ]
+        return round(sum(values) / len(values), 4) if values else None
+
+    def save(self, path: Path) -> None:
+        """Write everything that the rest of the fit depends on."""
+        save_checkpoint(
+            path,
+            {
+                "config": self.config.to_dict(),
+                "scene": _fingerprint(self.scene),
+                "init": self.init,
+                "step": self.step,
+                "seconds": self.seconds,
+                "curve": self.curve,
+                "notes": self.notes,
+                "extent": self.extent,
+                "max_gaussians": self.max_gaussians,
+                "near_plane": self.renderer.near_plane,
+                "model": self.model.state_dict(),
+                "sh_degree": self.model.sh_degree,
+                "optimizer": self.optimizer.state_dict(),
+                "densifier": self.densifier.state_dict(),
+                "order": self._order.get_state(),
+                "stack": self._stack,
+                "drop": None if self.drop is None else self.drop.get_rng_state(),
+            },
+        )
+
+    @classmethod
+    def resume(cls, scene: Scene, config: FitConfig, path: Path) -> Trainer:
+        """Continue from a checkpoint, bit for bit as if there had been no interruption.
+
+        Raises:
+            DataError: the file is damaged, or belongs to another scene or configuration.
+        """
+        state = load_checkpoint(path)
+        try:
+            _check_same(path, "config", state["config"], config.to_dict())
+            _check_same(path, "scene", state["scene"], _fingerprint(scene))
+            trainer = cls.__new__(cls)
+            trainer.scene, trainer.config, trainer.device = scene, config, torch.device(config.device)
+            trainer.init, trainer.extent, trainer.max_gaussians = (
+                state["init"],
+                state["extent"],
+                state["max_gaussians"],
+            )
+            model = GaussianModel(**state["model"], sh_degree=state["sh_degree"])
+            trainer._build(model, state["near_plane"])
+            trainer.optimizer.load_state_dict(state["optimizer"])
+            trainer.densifier.load_state_dict(state["densifier"])
+            trainer._order.set_state(state["order"])
+            trainer._stack = state["stack"]
+            if trainer.drop is not None:
+                trainer.drop.set_rng_state(state["drop"], trainer.device)
+            trainer.step, trainer.seconds = state["step"], state["seconds"]
+            trainer.curve, trainer.notes = state["curve"], state["notes"]
+        except KeyError as error:
+            raise DataError(path, str(error.args[0]), "expected this entry in the checkpoint, got none") from error
+        return trainer
+
+    def _train_step(self) -> float:
+        config, recipe = self.config, self.config.recipe
+        self.step += 1
+        progress = self.step / config.steps
+        self.optimizer.param_groups[0]["lr"] = self.extent * math.exp(
+            (1 - progress) * math.log(recipe.lr_means) + progress * math.log(recipe.lr_means_final)
+        )
+        self.model.sh_degree = sum(self.step >= step for step in self.times.sh)
+        if self.drop is not None:
+            self.drop.progress = progress
+        camera, target, moments = self._views[self._next_view()]
+        out = self.renderer(self.model(), camera, self._background)
+        loss = photometric_loss(out.image.clamp(0, 1), target, recipe.dssim_weight, moments=moments)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise TrainingDiverged(f"step {self.step}: expected a finite loss, got {value}")
+        if loss.requires_grad:
+            loss.backward()
+            self._check_gradients()
+            if out.projected.means2d.grad is not None:
+                self.densifier.observe(out.projected)
+            if self.step < config.steps:  # as in the release, the last step only looks
+                self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+        return value
+
+    def _check_gradients(self) -> None:
+        for name, parameter in self.model.named_parameters():
+            if parameter.grad is not None and not math.isfinite(float(parameter.grad.sum())):
+                bad = ~torch.isfinite(parameter.grad).reshape(len(self.model), -1).all(1)
+                if bool(bad.any()):
+                    raise TrainingDiverged(
+                        f"step {self.step}: expected finite gradients, got others for {name} of Gaussian "
+                        f"{int(bad.nonzero()[0, 0])}"
+                    )
+
+    def _next_view(self) -> int:
+        if not self._stack:
+            self._stack = torch.randperm(len(self._views), generator=self._order).tolist()
+        return self._stack.pop()
+
+
+def _seed(config: FitConfig, stream: int) -> int:
+    return config.seed * 10 + stream
+
+
+def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
+    """The same camera on another device."""
+    return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
+
+
+def _fingerprint(scene: Scene) -> dict[str, Any]:
+    views = scene.train
+    return {
+        "names": list(views.names),
+        "size": list(views.images.shape[-2:]),
+        "images": float(views.images.double().mean()),
+        "cameras": float(views.cameras.extrinsics.double().sum() + views.cameras.intrinsics.double().sum()),
+    }
+
+
+def _check_same(path: Path, field: str, saved: dict[str, Any], asked: dict[str, Any]) -> None:
+    for key, value in asked.items():
+        if key not in saved or saved[key] != value:
+            raise DataError(path, f"{field}.{key}", f"expected {value!r} as asked for now, got {saved.get(key)!r}")

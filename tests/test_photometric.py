@@ -1,0 +1,206 @@
+"""The photometric loss against Kornia's own `ssim_loss`, differentiated by autograd."""
+
+import math
+
+import pytest
+import torch
+from kornia.losses import ssim_loss
+
+import kgs.losses
+from kgs.losses import photometric_loss, target_moments
+
+SIZES = [(1, 3, 45, 67), (1, 3, 11, 11), (2, 3, 12, 31), (1, 1, 64, 11), (3, 4, 20, 20)]
+
+
+def make_pair(shape, kind="noise", dtype=torch.float32):
+    generator = torch.Generator().manual_seed(sum(shape))
+    target = torch.rand(shape, generator=generator)
+    if kind == "bright":
+        target = 0.9 + 0.05 * target
+    elif kind == "dark":
+        target = 0.02 * target
+    elif kind == "edges":
+        ramp = torch.linspace(0, 1, shape[-1]).expand(shape)
+        target = 0.5 * (torch.sin(17 * ramp) > 0) + 0.3 * ramp.flip(-1)
+    image = (target + 0.05 * torch.randn(shape, generator=generator)).clamp(0, 1)
+    return image.to(dtype), target.to(dtype)
+
+
+def kornia_loss(image, target, weight):
+    return (image - target).abs().mean() + 2 * weight * ssim_loss(image, target, 11)
+
+
+def value_and_gradient(loss, image):
+    image = image.clone().requires_grad_()
+    value = loss(image)
+    value.backward()
+    return value.detach(), image.grad
+
+
+@pytest.mark.parametrize("shape", SIZES)
+@pytest.mark.parametrize("kind", ["noise", "dark"])
+def test_fast_path_has_kornias_value_and_gradient_borders_included(shape, kind):
+    image, target = make_pair(shape, kind)
+    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target, 0.2), image)
+    expected, expected_gradient = value_and_gradient(lambda x: kornia_loss(x, target, 0.2), image)
+    assert abs(value - expected) <= 1e-6
+    assert (gradient - expected_gradient).abs().max() <= 1e-5 * expected_gradient.abs().max()
+
+
+@pytest.mark.parametrize("shape", SIZES)
+@pytest.mark.parametrize("kind", ["noise", "bright", "dark", "edges"])
+def test_fast_path_is_as_accurate_as_kornia(shape, kind):
+    # Variances of bright, flat regions cancel: there Kornia's own float32 gradient is off by up to 1e-4 of the largest.
+    image, target = make_pair(shape, kind)
+    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target, 1.0), image)
+    kornia_value, kornia_gradient = value_and_gradient(lambda x: kornia_loss(x, target, 1.0), image)
+    exact_value, exact = value_and_gradient(lambda x: kornia_loss(x, target.double(), 1.0), image.double())
+    assert abs(value - exact_value) <= max(1e-6, 2 * abs(kornia_value - exact_value))
+    kornia_error = (kornia_gradient - exact).abs().max()
+    assert (gradient - exact).abs().max() <= max(1e-5 * exact.abs().max(), 2 * kornia_error)
+
+
+def test_gradient_of_black_images_keeps_kornias_eps():
+    image, target = torch.full((1, 3, 16, 16), 1e-4), torch.zeros(1, 3, 16, 16)
+    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target, 1.0), image)
+    expected, expected_gradient = value_and_gradient(lambda x: kornia_loss(x, target.double(), 1.0), image.double())
+    assert abs(value - expected) <= 1e-6
+    torch.testing.assert_close(gradient.double(), expected_gradient, rtol=1e-5, atol=0)
+
+
+def test_upstream_gradient_scales_the_gradient():
+    image, target = make_pair((1, 3, 16, 16))
+    _, once = value_and_gradient(lambda x: photometric_loss(x, target), image)
+    _, thrice = value_and_gradient(lambda x: 3 * photometric_loss(x, target), image)
+    torch.testing.assert_close(thrice, 3 * once)
+
+
+def test_cached_moments_change_no_bit_and_several_losses_before_a_backward_do_not_mix():
+    pairs = [make_pair((1, 3, 20, 24), kind) for kind in ("noise", "bright")]
+    alone = [value_and_gradient(lambda x, t=target: photometric_loss(x, t), image) for image, target in pairs]
+    moments = [target_moments(target) for _, target in pairs]
+    images = [image.clone().requires_grad_() for image, _ in pairs]
+    losses = [
+        photometric_loss(image, target, moments=cached)
+        for image, (_, target), cached in zip(images, pairs, moments, strict=True)
+    ]
+    (losses[0] + losses[1]).backward()
+    for image, loss, (value, gradient) in zip(images, losses, alone, strict=True):
+        assert torch.equal(loss, value)
+        assert torch.equal(image.grad, gradient)
+
+
+def test_batch_is_the_mean_of_its_images():
+    image, target = make_pair((4, 3, 16, 18))
+    singles = [photometric_loss(image[i : i + 1], target[i : i + 1]) for i in range(4)]
+    torch.testing.assert_close(photometric_loss(image, target), torch.stack(singles).mean())
+
+
+def test_images_in_other_memory_layouts_give_the_same():
+    image, target = make_pair((2, 3, 16, 18))
+    layout = torch.channels_last
+    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target), image)
+    other, other_gradient = value_and_gradient(
+        lambda x: photometric_loss(x, target.contiguous(memory_format=layout)), image.contiguous(memory_format=layout)
+    )
+    torch.testing.assert_close(other, value)
+    torch.testing.assert_close(other_gradient.contiguous(), gradient)
+
+
+def test_weight_zero_is_plain_l1_at_any_size():
+    image, target = torch.tensor([[[[0.25, 0.5]]]]), torch.tensor([[[[0.75, 0.25]]]])
+    assert photometric_loss(image, target, 0.0).item() == 0.375
+
+
+def test_flat_images_have_the_closed_form():
+    x, y = 0.3, 0.7
+    image, target = torch.full((1, 3, 15, 15), x), torch.full((1, 3, 15, 15), y)
+    ssim = (2 * x * y + 1e-4) / (x * x + y * y + 1e-4)
+    expected = 0.4 + 0.2 * (1 - ssim)
+    # Variances of flat images are rounding, 1e-7 against c2 = 9e-4.
+    assert photometric_loss(image, target, 0.2).item() == pytest.approx(expected, abs=2e-4 * 0.2)
+    assert photometric_loss(image.double(), target.double(), 0.2).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_small_images_take_kornias_path():
+    image, target = make_pair((1, 3, 7, 10))
+    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target), image)
+    expected, expected_gradient = value_and_gradient(lambda x: kornia_loss(x, target, 0.2), image)
+    torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(gradient, expected_gradient)
+
+
+def test_gradient_reaches_a_target_that_asks_for_it():
+    image, target = make_pair((1, 1, 12, 12), dtype=torch.float64)
+    for dtype in (torch.float32, torch.float64):
+        reached = target.to(dtype, copy=True).requires_grad_()
+        photometric_loss(image.to(dtype), reached).backward()
+        _, expected = value_and_gradient(lambda y, x=image: kornia_loss(x, y, 0.2), target)
+        torch.testing.assert_close(reached.grad.double(), expected, rtol=1e-4, atol=1e-8)
+
+
+def test_float64_passes_gradcheck_twice():
+    image, target = make_pair((1, 1, 6, 7), dtype=torch.float64)
+    image.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target), image)
+    assert torch.autograd.gradgradcheck(lambda x: photometric_loss(x, target), image)
+
+
+def test_second_derivative_through_the_fast_path_is_refused():
+    image, target = make_pair((1, 3, 16, 16))
+    image.requires_grad_()
+    with pytest.raises(RuntimeError, match="fast=False"):
+        torch.autograd.grad(photometric_loss(image, target), image, create_graph=True)
+    (gradient,) = torch.autograd.grad(photometric_loss(image, target, fast=False), image, create_graph=True)
+    gradient.square().sum().backward()
+    assert image.grad.abs().max() > 0
+
+
+def test_autocast_does_not_reach_the_ssim():
+    image, target = make_pair((1, 3, 32, 32))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = photometric_loss(image, target)
+    torch.testing.assert_close(inside, photometric_loss(image, target), rtol=0, atol=0)
+
+
+def test_nan_in_the_image_reaches_the_loss():
+    image, target = make_pair((1, 3, 16, 16))
+    image[0, 0, 3, 3] = math.nan
+    assert photometric_loss(image, target).isnan()
+
+
+def test_wrong_arguments_are_named():
+    image, target = make_pair((1, 3, 16, 16))
+    with pytest.raises(TypeError, match=r"image: expected a torch\.Tensor"):
+        photometric_loss(image.numpy(), target)
+    with pytest.raises(TypeError, match="image: expected float32 or float64"):
+        photometric_loss(image.half(), target.half())
+    with pytest.raises(TypeError, match=r"target: expected torch\.float32"):
+        photometric_loss(image, target.double())
+    with pytest.raises(ValueError, match="target: expected shape"):
+        photometric_loss(image, target[..., 1:])
+    with pytest.raises(ValueError, match="image: expected shape"):
+        photometric_loss(image[0], target[0])
+    with pytest.raises(ValueError, match="image: expected at least 6 x 6"):
+        photometric_loss(image[..., :5], target[..., :5])
+    for weight in (-0.1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="dssim_weight"):
+            photometric_loss(image, target, weight)
+    with pytest.raises(ValueError, match="moments"):
+        photometric_loss(image, target, moments=target_moments(target[..., 1:]))
+    with pytest.raises(ValueError, match="target: expected at least 6 x 6"):
+        target_moments(target[..., :5])
+
+
+def test_public_names():
+    assert set(kgs.losses.__all__) == {"photometric_loss", "target_moments", "TargetMoments"}
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_agrees_with_float64_on_the_cpu():
+    image, target = make_pair((1, 3, 45, 67))
+    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target.cuda()), image.cuda())
+    expected, expected_gradient = value_and_gradient(lambda x: kornia_loss(x, target.double(), 0.2), image.double())
+    assert abs(value.cpu() - expected) <= 1e-6
+    assert (gradient.cpu() - expected_gradient).abs().max() <= 1e-5 * expected_gradient.abs().max()
