@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kgs.datasets import Scene, synthetic_scene
+from kgs.datasets.scene import Scene
+from kgs.datasets.synthetic import synthetic_scene
 
 from .config import FitConfig
 from .report import side_by_side, write_curve, write_json, write_png

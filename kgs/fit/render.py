@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from kgs.datasets import Scene
+from kgs.datasets.scene import Scene
 from kgs.ply import load_ply
 from kgs.renderer import GaussianRenderer
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from kgs import __version__
-from kgs.datasets import Views
+from kgs.datasets.scene import Views
 from kgs.errors import DataError
 
 from .trainer import Trainer

@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from kgs.datasets import Scene
+from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.ply import save_ply
 

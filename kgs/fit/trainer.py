@@ -17,7 +17,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.metrics import psnr
 from torch import Tensor
 
-from kgs.datasets import Scene, Views
+from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
 from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged

@@ -1,0 +1,160 @@
+"""Trainer: determinism, resume, and that nothing depends on the test views."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from kgs import DataError, TrainingDiverged
+from kgs.datasets.scene import Views
+from kgs.datasets.synthetic import synthetic_scene
+from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.initialize import FirstPoints
+from kgs.fit.trainer import Trainer
+
+CONFIG = FitConfig(steps=60, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic_scene(train_views=3, test_views=2, size=(32, 40), seed=1)
+
+
+@pytest.fixture(scope="module")
+def points():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
+    return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
+
+
+def parameters(trainer):
+    return {name: value.detach().clone() for name, value in trainer.model.named_parameters()}
+
+
+def assert_same_bits(a, b):
+    for name, value in parameters(a).items():
+        assert torch.equal(value, parameters(b)[name]), name
+
+
+def fitted(scene, points, config=CONFIG):
+    trainer = Trainer(scene, config, points)
+    trainer.fit()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def whole(scene, points):
+    return fitted(scene, points)
+
+
+def test_it_learns(whole, scene):
+    curve = whole.curve
+    assert [point["step"] for point in curve] == [20, 40, 60]
+    assert curve[-1]["train_psnr"] > curve[0]["train_psnr"] + 1
+    assert all(a["seconds"] < b["seconds"] for a, b in zip(curve, curve[1:], strict=False))
+
+
+def test_gaussians_were_added_on_the_way(whole, points):
+    assert len(whole.model) > len(points.points)
+
+
+def test_same_seed_same_bits(whole, scene, points):
+    assert_same_bits(whole, fitted(scene, points))
+
+
+def test_another_seed_other_bits(whole, scene, points):
+    other = fitted(scene, points, replace(CONFIG, seed=6))
+    assert not torch.equal(other.model.means[:50], whole.model.means[:50])
+
+
+def test_with_and_without_drop_see_the_same_views(scene, points):
+    orders = []
+    for drop in (0.0, 0.5):
+        trainer = Trainer(scene, replace(CONFIG, drop=drop), points)
+        orders.append([trainer._next_view() for _ in range(20)])
+    assert orders[0] == orders[1]
+
+
+@pytest.mark.parametrize("at", [1, 20, 31, 59], ids=["first", "densify", "mid-epoch", "last"])
+def test_resumed_is_bit_identical(whole, scene, points, tmp_path, at):
+    if at == 20:
+        assert at in whole.times.densify
+    first = Trainer(scene, CONFIG, points)
+    first.fit(lambda trainer, _: trainer.step == at)
+    assert first.step == at
+    first.save(tmp_path / "checkpoint.pt")
+    second = Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.pt")
+    second.fit()
+    assert_same_bits(whole, second)
+    assert [point["test_psnr"] for point in second.curve] == [point["test_psnr"] for point in whole.curve]
+
+
+def test_test_views_never_matter(whole, scene, points):
+    cameras = scene.test.cameras
+    extrinsics = cameras.extrinsics.clone()
+    extrinsics[:, :3, 3] += 0.5
+    noise = torch.rand(scene.test.images.shape, generator=torch.Generator().manual_seed(9))
+    other = replace(
+        scene,
+        test=Views(
+            PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width), noise, scene.test.names
+        ),
+    )
+    assert_same_bits(whole, fitted(other, points))
+
+
+def test_no_test_views_at_all(whole, scene, points):
+    trainer = fitted(replace(scene, test=scene.test.select([])), points)
+    assert_same_bits(whole, trainer)
+    assert trainer.curve[-1]["test_psnr"] is None
+
+
+def test_evaluation_uses_all_gaussians(whole, scene):
+    camera = scene.test.camera(0)
+    assert torch.equal(whole.render(camera), whole.render(camera))
+    assert whole.renderer.training
+
+
+def test_the_cap_holds_and_is_said(scene, points):
+    trainer = fitted(scene, points, replace(CONFIG, max_gaussians=170))
+    assert len(trainer.model) <= 170
+    assert any("170" in note and "--max-gaussians" in note for note in trainer.notes)
+
+
+@pytest.mark.parametrize("change", [{"seed": 6}, {"steps": 61}, {"drop": 0.0}])
+def test_a_checkpoint_of_another_fit_is_refused(whole, scene, tmp_path, change):
+    whole.save(tmp_path / "checkpoint.pt")
+    with pytest.raises(DataError, match=next(iter(change))):
+        Trainer.resume(scene, replace(CONFIG, **change), tmp_path / "checkpoint.pt")
+
+
+def test_a_checkpoint_of_another_scene_is_refused(whole, scene, tmp_path):
+    whole.save(tmp_path / "checkpoint.pt")
+    other = replace(scene, train=scene.train.select([0, 1]))
+    with pytest.raises(DataError, match="scene"):
+        Trainer.resume(other, CONFIG, tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
+def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(scene, points, name):
+    trainer = Trainer(scene, CONFIG, points)
+    before = parameters(trainer)
+    poison = torch.ones_like(trainer.model.get_parameter(name))
+    poison[7] = torch.nan
+    trainer.model.get_parameter(name).register_hook(lambda gradient: gradient * poison)
+    with pytest.raises(TrainingDiverged, match=f"step 1.*{name}.*Gaussian 7"):
+        trainer.fit()
+    assert all(torch.equal(value, before[key]) for key, value in parameters(trainer).items())
+
+
+def test_a_dropped_layer_is_absent_at_rate_zero(scene, points):
+    trainer = Trainer(scene, replace(CONFIG, drop=0.0), points)
+    assert trainer.drop is None
+
+
+def test_the_rate_follows_the_papers_schedule(scene, points):
+    trainer = Trainer(scene, CONFIG, points)
+    rates = []
+    trainer.fit(lambda trainer, _: rates.append(trainer.drop.rate))
+    assert rates == pytest.approx([0.3 * step / 60 for step in range(1, 61)])
