@@ -1,0 +1,228 @@
+"""From what a layout's files say about each photo to a Scene: the part that all layouts share."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+
+import kornia.geometry as kg
+import numpy as np
+import torch
+from torch import Tensor
+
+from kgs.errors import DataError
+
+from .images import Intrinsics, read_image, resize, undistort
+from .scene import Scene, Views
+
+__all__ = ["BACKGROUNDS", "Frame", "PointCloud", "build_scene", "path_inside"]
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+_LISTED = 20
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photo with its lens and its pose, its pixels not read yet.
+
+    Convention:
+        `pose` is camera-to-world with OpenCV axes (x right, y down, z forward).
+
+    Args:
+        source: the file that gives lens and pose; errors name it.
+        name: what the view is called, unique within its scene.
+        path: the photo.
+        intrinsics: in the files' half-pixel convention, for any size of the photo's aspect.
+        pose: `(4, 4)` float64.
+
+    Raises:
+        DataError: a number is not finite, a size or focal length not positive, or the pose no rotation.
+    """
+
+    source: Path
+    name: str
+    path: Path
+    intrinsics: Intrinsics
+    pose: Tensor
+
+    def __post_init__(self) -> None:
+        lens = self.intrinsics
+        if not np.isfinite((lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)).all():
+            raise DataError(self.source, self.name, "expected finite intrinsics, got NaN or infinity")
+        if not (lens.fx > 0 and lens.fy > 0 and lens.width > 0 and lens.height > 0):
+            raise DataError(
+                self.source,
+                self.name,
+                "expected a focal length and an image size above 0, "
+                f"got {lens.fx:g}, {lens.fy:g} and {lens.width}x{lens.height}",
+            )
+        if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
+            raise DataError(self.source, self.name, "expected a finite 4x4 pose")
+        rotation = self.pose[:3, :3]
+        error = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
+        if error > 1e-3 or float(torch.linalg.det(rotation)) < 0:
+            raise DataError(self.source, self.name, "expected a pose with a right-handed rotation, got another matrix")
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points that come with a layout.
+
+    Args:
+        points: `(P, 3)` float64, in the world of the poses.
+        colors: `(P, 3)` in [0, 1].
+        kind: what `Scene.init_kind` says of them.
+    """
+
+    points: Tensor
+    colors: Tensor
+    kind: str
+
+
+NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), "none")
+
+
+def path_inside(source: Path, root: Path, name: str) -> Path:
+    """The path of a file that a description names, which must not lead out of the scene's folder.
+
+    Raises:
+        DataError: the name is empty, absolute, or has a part "..".
+    """
+    given = PureWindowsPath(name)  # knows both separators and drives
+    if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
+        raise DataError(source, repr(name), "expected the name of a file inside the scene's folder")
+    return root / name
+
+
+def build_scene(
+    root: Path,
+    train: Sequence[Frame],
+    test: Sequence[Frame],
+    downscale: float | None,
+    background: str,
+    cloud: PointCloud = NO_POINTS,
+) -> Scene:
+    """Read the photos of the frames and put cameras and points into one recentred world.
+
+    The offset is the mean of the training cameras' centres, taken and subtracted in float64; nothing of the test
+    frames enters it.
+
+    Args:
+        root: the scene's folder.
+        train: the frames to train on.
+        test: the frames that are held out.
+        downscale: how many times smaller the images shall be, >= 1; None leaves them as they are.
+        background: "black" or "white", put behind images with an alpha channel.
+        cloud: the layout's own points.
+
+    Raises:
+        DataError: there is no training frame, a name is there twice, photos are missing, unreadable or of several
+            sizes, or a photo does not have the aspect of its intrinsics.
+    """
+    for frames in (train, test):
+        name, times = Counter(frame.name for frame in frames).most_common(1)[0] if frames else ("", 1)
+        if times > 1:
+            raise DataError(frames[0].source, name, f"expected each image once, got it {times} times")
+    if not train:
+        raise DataError(root, "", "expected at least one training image, got none")
+    _check_present(root, [frame.path for frame in (*train, *test)])
+    color = torch.tensor(BACKGROUNDS[background])
+    offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)
+    train_views = _views(train, offset, downscale, color)
+    height, width = train_views.images.shape[-2:]
+    return Scene(
+        train=train_views,
+        test=_views(test, offset, downscale, color, size=(height, width)),
+        points=(cloud.points - offset).float(),
+        point_colors=cloud.colors.float(),
+        init_kind=cloud.kind,
+        offset=offset,
+        background=color,
+        root=root,
+    )
+
+
+def _check_present(root: Path, paths: Sequence[Path]) -> None:
+    """Raise one DataError that names every photo that is not there."""
+    missing = [str(path.relative_to(root)) for path in paths if not path.is_file()]
+    if missing:
+        listed = ", ".join(missing[:_LISTED]) + (f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else "")
+        raise DataError(root, "", f"{len(missing)} of {len(paths)} images are missing: {listed}")
+
+
+def _views(
+    frames: Sequence[Frame],
+    offset: Tensor,
+    downscale: float | None,
+    background: Tensor,
+    size: tuple[int, int] | None = None,
+) -> Views:
+    """Read the frames' images; `size` is the (height, width) they shall have, by default the first one's."""
+    count, has_alpha = len(frames), False
+    intrinsics = torch.eye(4).repeat(count, 1, 1)
+    images, masks = torch.empty(count, 3, *(size or (1, 1))), torch.empty(count, 1, *(size or (1, 1)))
+    for i, frame in enumerate(frames):
+        pixels, alpha, lens = _load(frame, downscale, background)
+        if size is None:
+            size = (lens.height, lens.width)
+            images, masks = torch.empty(count, 3, *size), torch.empty(count, 1, *size)
+        if (lens.height, lens.width) != size:
+            raise DataError(
+                frame.path,
+                "",
+                f"expected {size[1]}x{size[0]} pixels as the other images, got {lens.width}x{lens.height}",
+            )
+        images[i] = pixels
+        masks[i] = 1.0 if alpha is None else alpha
+        has_alpha |= alpha is not None
+        intrinsics[i, :3, :3] = torch.from_numpy(lens.matrix())
+    height, width = images.shape[-2:]
+    return Views(
+        cameras=PinholeCamera(
+            intrinsics,
+            _extrinsics(frames, offset),
+            torch.full((count,), float(height)),
+            torch.full((count,), float(width)),
+        ),
+        images=images,
+        names=tuple(frame.name for frame in frames),
+        masks=masks if has_alpha else None,
+    )
+
+
+def _load(
+    frame: Frame, downscale: float | None, background: Tensor
+) -> tuple[Tensor, Tensor | None, Intrinsics]:
+    """A frame's RGB on the background `(3, H, W)`, its alpha `(1, H, W)` if it has one, and its intrinsics."""
+    image = read_image(frame.path)
+    height, width = image.shape[:2]
+    if not frame.intrinsics.same_aspect(width, height):
+        raise DataError(
+            frame.path,
+            "",
+            f"has {width}x{height} pixels, which is no scaled version of the "
+            f"{frame.intrinsics.width}x{frame.intrinsics.height} that {frame.source.name} describes",
+        )
+    if image.shape[2] == 4:
+        alpha = image[..., 3:]
+        image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
+    try:
+        image, lens = undistort(image, frame.intrinsics.scaled(width, height))
+    except ValueError as error:
+        raise DataError(frame.source, frame.name, str(error)) from error
+    if downscale is not None:
+        image, lens = resize(image, lens, max(1, round(width / downscale)), max(1, round(height / downscale)))
+    pixels = torch.from_numpy(image).permute(2, 0, 1)
+    return pixels[:3], pixels[3:] if len(pixels) == 4 else None, lens
+
+
+def _extrinsics(frames: Sequence[Frame], offset: Tensor) -> Tensor:
+    """World-to-camera `(V, 4, 4)` float32 in the recentred world, the rotations made exactly orthogonal."""
+    if not frames:
+        return torch.zeros(0, 4, 4)
+    poses = torch.stack([frame.pose for frame in frames])
+    u, _, vh = torch.linalg.svd(poses[:, :3, :3])
+    rotation, translation = kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])
+    return kg.Rt_to_matrix4x4(rotation, translation).float()

@@ -1,0 +1,184 @@
+"""Photos as arrays: reading, removing the lens's distortion, reducing; each step returns the intrinsics that result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kgs.errors import DataError
+
+__all__ = ["IMAGE_SUFFIXES", "Intrinsics", "image_folder", "list_images", "read_image", "resize", "undistort"]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A lens and the image size that its numbers refer to.
+
+    Convention:
+        The files' half-pixel convention: the first pixel's centre is at (0.5, 0.5), so that the numbers of a resized
+        image are these times the ratio of the sizes. `matrix` has kgs's integer pixel centres.
+
+    Args:
+        width: in pixels, > 0.
+        height: in pixels, > 0.
+        fx: focal length in pixels, > 0.
+        fy: focal length in pixels, > 0.
+        cx: principal point in pixels.
+        cy: principal point in pixels.
+        distortion: coefficients in OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) where
+            `fisheye`; empty for a pinhole.
+        fisheye: the coefficients are those of `cv2.fisheye`.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    fisheye: bool = False
+
+    def scaled(self, width: int, height: int) -> Intrinsics:
+        """The same lens on an image of another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def same_aspect(self, width: int, height: int) -> bool:
+        """Whether an image of this size can be a resized one, each side rounded to whole pixels."""
+        return abs(width * self.height - height * self.width) <= max(self.width, self.height)
+
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 calibration matrix for integer pixel centres: the one place where half a pixel is subtracted."""
+        return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])
+
+
+def image_folder(root: Path) -> Path | None:
+    """The folder of photos beside a model: `images`, else the `images_k` of the largest photos, or None."""
+    if (root / "images").is_dir():
+        return root / "images"
+    reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
+    return min(reduced, key=lambda p: int(p.name.removeprefix("images_")), default=None)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The photos of a folder, sorted by name; hidden files and other kinds of files are passed over."""
+    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    return sorted(files, key=lambda p: p.name)
+
+
+def read_image(path: Path) -> Image:
+    """Read an 8 or 16 bit image as it is stored: a rotation noted in its metadata is not applied.
+
+    Args:
+        path: any format that OpenCV reads.
+
+    Returns:
+        RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
+
+    Raises:
+        DataError: the file cannot be read, is truncated or holds other numbers than 8 or 16 bit integers.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+    # A JPEG cut short decodes, with its rest in grey: its last scan then has no end marker behind it.
+    if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        raise DataError(path, "", "the JPEG ends before its image does (a truncated file?)")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error as error:
+        raise DataError(path, "", f"OpenCV cannot decode this image ({error.err})") from error
+    if image is None:
+        raise DataError(path, "", "OpenCV cannot decode this as an image (truncated, or no image?)")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise DataError(path, "", f"expected 8 or 16 bit integers, got {image.dtype}")
+    if image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    else:
+        image = cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+    return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+
+
+def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:
+    """Reduce an image to the given size, each new pixel the mean over the area it covers.
+
+    Args:
+        image: `(H, W)` or `(H, W, K)`.
+        intrinsics: of `image`.
+        width: not above the image's.
+        height: not above the image's.
+
+    Returns:
+        The reduced image, and the intrinsics scaled by the exact ratio of each axis.
+    """
+    if (width, height) == (intrinsics.width, intrinsics.height):
+        return image, intrinsics
+    reduced = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.clip(reduced, 0.0, 1.0).astype(np.float32), intrinsics.scaled(width, height)
+
+
+def undistort(image: Image, intrinsics: Intrinsics) -> tuple[Image, Intrinsics]:
+    """Resample an image as a pinhole with the same principal point would have seen it.
+
+    The focal length stays too, unless that would leave pixels blank (pincushion distortion): then it grows, the same
+    on both axes, until every pixel is covered by the image.
+
+    Args:
+        image: `(H, W)` or `(H, W, K)`.
+        intrinsics: of `image`.
+
+    Returns:
+        The pinhole's image and intrinsics; the arguments themselves where there is no distortion.
+
+    Raises:
+        ValueError: the coefficients fold the image or map it outside itself.
+    """
+    if not intrinsics.fisheye and not any(intrinsics.distortion):
+        return image, replace(intrinsics, distortion=())
+    zoom = _covering_zoom(intrinsics)
+    pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
+    width, height = intrinsics.width, intrinsics.height
+    rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap
+    coefficients = np.array(intrinsics.distortion)
+    x, y = rectify(intrinsics.matrix(), coefficients, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)
+    inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
+    if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
+        raise ValueError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), pinhole
+
+
+def _covering_zoom(intrinsics: Intrinsics) -> float:
+    """The least factor from 1 to 2 on the focal length with which the pinhole's border falls inside the image."""
+    width, height, matrix = intrinsics.width, intrinsics.height, intrinsics.matrix()
+    columns, rows = np.arange(float(width)), np.arange(float(height))
+    ones, project = np.ones_like, cv2.fisheye.projectPoints if intrinsics.fisheye else cv2.projectPoints
+    border = np.concatenate(
+        [np.stack([columns, y * ones(columns)], axis=1) for y in (0.0, height - 1.0)]
+        + [np.stack([x * ones(rows), rows], axis=1) for x in (0.0, width - 1.0)]
+    )
+    rays = (border - matrix[:2, 2]) / (intrinsics.fx, intrinsics.fy)
+
+    def covered(zoom: float) -> bool:
+        points = np.concatenate([rays / zoom, ones(rays[:, :1])], axis=1)[:, None]
+        pixels = project(points, np.zeros(3), np.zeros(3), matrix, np.array(intrinsics.distortion))[0]
+        return bool((np.abs(pixels * 2 - (width - 1, height - 1)) <= (width - 1 + 1e-6, height - 1 + 1e-6)).all())
+
+    if covered(1.0):
+        return 1.0
+    low, high = 1.0, 2.0
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (low, middle) if covered(middle) else (middle, high)
+    return high

@@ -1,0 +1,55 @@
+"""Which views are for training: the splits of the sparse-view tables (RegNeRF, FSGS, DropGaussian's release)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["BLENDER_TRAIN_FRAMES", "TEST_EVERY", "select_evenly", "split_by_name"]
+
+TEST_EVERY = 8
+BLENDER_TRAIN_FRAMES = (2, 16, 26, 55, 73, 76, 86, 93)
+
+
+def split_by_name(names: Sequence[str], train_views: int | None = None) -> tuple[list[int], list[int]]:
+    """Hold out every eighth name for testing and choose training views evenly among the others.
+
+    Names are sorted by code point ("img10" before "img2"), as the published splits were; the first one is a test view.
+
+    Args:
+        names: the views, in any order.
+        train_views: how many training views to choose; None takes all that are not held out.
+
+    Returns:
+        Positions in `names` of the training and of the test views, both in the order of the sorted names.
+
+    Raises:
+        ValueError: train_views is outside [1, number of views that are not held out].
+    """
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    test = order[::TEST_EVERY]
+    pool = [index for position, index in enumerate(order) if position % TEST_EVERY]
+    return [pool[i] for i in select_evenly(len(pool), train_views)], test
+
+
+def select_evenly(count: int, train_views: int | None = None) -> list[int]:
+    """Choose positions evenly among `count`, the first and the last included.
+
+    The positions are linspace(0, count - 1, train_views), rounded half to even: other roundings give other views.
+
+    Args:
+        count: how many there are to choose from.
+        train_views: how many to choose; None takes all.
+
+    Returns:
+        Increasing positions in [0, count - 1].
+
+    Raises:
+        ValueError: train_views is no whole number in [1, count].
+    """
+    if train_views is None:
+        return list(range(count))
+    if isinstance(train_views, bool) or not isinstance(train_views, int) or not 1 <= train_views <= count:
+        raise ValueError(f"train_views: expected None or a whole number from 1 to {count}, got {train_views!r}")
+    return [int(i) for i in np.round(np.linspace(0, count - 1, train_views))]

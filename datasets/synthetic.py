@@ -1,0 +1,175 @@
+"""A synthetic scene with exact poses and exact depth: textured objects before a textured background.
+
+Meshes are trimesh's; `raycast` finds the first surface of each pixel, and a procedural texture is evaluated at that
+very point, so nothing of kgs takes part in making the images. Four rays a pixel are averaged. Surfaces are matt: a
+point has one colour in all views that see it.
+
+The world's axes are OpenCV's: x right, y down, z away from the forward-facing cameras. The floor is at y = 1.2 and
+the objects stand around (0, 0.5, 4.4). The world depends on `kind` and `seed` only, never on the cameras.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from kornia.geometry.camera import PinholeCamera
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .raycast import Array, raycast
+from .scene import Scene, Views
+from .synthetic_world import CENTER, World, make_world, shade
+
+__all__ = ["synthetic_depths", "synthetic_scene"]
+
+FOCAL = 0.85  # focal length over the longer side of the image, as a phone's
+SUPERSAMPLING = 2  # rays along each side of a pixel
+PATCH = np.array([0.48, 0.27, 0.1])  # half the extent of the forward-facing training cameras: 0.4 of the near depth
+ORBIT = (4.2, 2.6)  # radius and mean height above `CENTER` of the orbit
+
+
+def synthetic_scene(
+    kind: str = "forward",
+    train_views: int = 3,
+    test_views: int = 6,
+    size: tuple[int, int] = (126, 168),
+    seed: int = 0,
+) -> Scene:
+    """Make a scene of about 20 objects in a second or two, without any file.
+
+    Convention:
+        Kornia's: world-to-camera extrinsics with OpenCV axes, integer pixel centres (cx = (W - 1) / 2). Float32.
+
+    Args:
+        kind: "forward": cameras on a small patch of a plane that look into a room, the test views between the
+            training views and a little outside of them. "orbit": cameras on a circle around the objects that look
+            inwards, on a piece of floor before a black background, the test views between the training views.
+        train_views: at least 1.
+        test_views: at least 0.
+        size: (height, width) of all images in pixels. The field of view is 61 degrees along the longer side.
+        seed: of places, textures and cameras, at least 0. The same seed gives the same scene.
+
+    Returns:
+        The scene, without points (`init_kind` "none").
+
+    Raises:
+        ValueError: the kind is unknown, or a number is out of range.
+    """
+    if train_views < 1:
+        raise ValueError(f"train_views: expected at least 1, got {train_views}")
+    if test_views < 0:
+        raise ValueError(f"test_views: expected at least 0, got {test_views}")
+    if min(size) < 1:
+        raise ValueError(f"size: expected a positive height and width, got {size}")
+    world = make_world(kind, seed)
+    rng = np.random.default_rng([seed, 1])
+    place = _patch_eyes if kind == "forward" else _orbit_eyes
+    train_eyes, test_eyes = place(train_views, test_views, rng)
+    return Scene(
+        train=_views(world, train_eyes, size, "train"),
+        test=_views(world, test_eyes, size, "test"),
+        points=torch.zeros(0, 3),
+        point_colors=torch.zeros(0, 3),
+        init_kind="none",
+        offset=torch.zeros(3, dtype=torch.float64),
+        background=torch.zeros(3),
+        root=Path("synthetic"),
+    )
+
+
+def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 0) -> Tensor:
+    """The true depth of the synthetic scene at the pixel centres of any cameras.
+
+    Convention:
+        Kornia's: world-to-camera extrinsics with OpenCV axes, integer pixel centres; depth is z in the camera frame.
+
+    Args:
+        cameras: for example `scene.train.cameras`, all of one image size.
+        kind: as given to `synthetic_scene`.
+        seed: as given to `synthetic_scene`.
+
+    Returns:
+        Float64, `(C, 1, H, W)`; 0 where a camera sees past the scene.
+
+    Raises:
+        ValueError: the kind is unknown, or the cameras differ in image size.
+    """
+    sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
+    if len(sizes) != 1:
+        raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
+    size = sizes.pop()
+    triangles = make_world(kind, seed).triangles
+    matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
+    depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
+    return torch.from_numpy(np.stack(depths)[:, None])
+
+
+def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> Views:
+    height, width = size
+    count = len(eyes)
+    intrinsics = torch.eye(4).repeat(count, 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = FOCAL * max(size)
+    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
+    extrinsics = torch.zeros(count, 4, 4)
+    images = np.zeros((count, 3, height, width), dtype=np.float32)
+    for i, eye in enumerate(eyes):
+        # rounded to float32 first and then drawn: the images show exactly what the cameras say
+        extrinsics[i] = torch.from_numpy(_look_at(eye, CENTER))
+        images[i] = _render(world, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
+    return Views(
+        cameras=PinholeCamera(
+            intrinsics, extrinsics, torch.full((count,), float(height)), torch.full((count,), float(width))
+        ),
+        images=torch.from_numpy(images),
+        names=tuple(f"{split}_{i:02d}" for i in range(count)),
+    )
+
+
+def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+    """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
+    s = SUPERSAMPLING
+    fine = intrinsics[:3, :3].copy()
+    fine[:2] *= s
+    fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
+    depths, faces = raycast(world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
+    v, u = np.nonzero(faces >= 0)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(fine).T
+    points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
+    colors = np.zeros((*faces.shape, 3), dtype=np.float32)
+    colors[v, u] = shade(world, points, faces[v, u])
+    image: NDArray[np.float32] = colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
+    return image
+
+
+def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Training cameras in a zigzag from left to right, test cameras spread over a patch 1.15 times as large."""
+    x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
+    y = np.where(np.arange(train) % 2, 0.5, -0.5)
+    # M. Roberts' R2 sequence: evenly spread, however many there are
+    spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
+    flat = np.concatenate([np.stack([x, y], axis=-1), 1.15 * (2.0 * spread - 1.0)])
+    eyes = PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
+    return eyes[:train], eyes[train:]
+
+
+def _orbit_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Training cameras all around at equal angles, test cameras in the middle half of the gaps between them."""
+    gaps = np.arange(test) * train // max(test, 1) + rng.uniform(0.25, 0.75, size=test)
+    angles = 2 * np.pi / train * np.concatenate([np.arange(train), gaps])
+    radius, height = ORBIT
+    heights = height + rng.uniform(-0.5, 0.5, size=train + test)
+    eyes = CENTER + np.stack([radius * np.sin(angles), -heights, -radius * np.cos(angles)], axis=-1)
+    return eyes[:train], eyes[train:]
+
+
+def _look_at(eye: Array, target: Array) -> Array:
+    """World-to-camera matrix of an upright camera: its x axis is level, its y axis points down."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose

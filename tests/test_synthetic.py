@@ -1,0 +1,296 @@
+"""The synthetic scene against closed forms, against itself across views, and as OpenCV's SIFT sees it."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from kornia.geometry.depth import warp_frame_depth
+
+from kgs.datasets.raycast import raycast
+from kgs.datasets.scene import Scene
+from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
+from kgs.datasets.synthetic_world import make_world, shade
+
+SMALL = (42, 56)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return synthetic_scene()
+
+
+@pytest.fixture(scope="module")
+def orbit() -> Scene:
+    return synthetic_scene("orbit", train_views=5, test_views=5, size=SMALL)
+
+
+def test_fields_are_those_of_a_scene_without_first_points(scene):
+    assert scene.train.images.shape == (3, 3, 126, 168)
+    assert scene.test.images.shape == (6, 3, 126, 168)
+    assert scene.train.images.dtype == scene.train.cameras.extrinsics.dtype == torch.float32
+    assert scene.train.names == ("train_00", "train_01", "train_02")
+    assert scene.test.names[-1] == "test_05"
+    assert scene.points.shape == (0, 3)
+    assert scene.init_kind == "none"
+    assert scene.offset.dtype == torch.float64
+    assert not scene.offset.any()
+    assert not scene.background.any()
+    assert scene.train.images.min() >= 0.0
+    assert scene.train.images.max() <= 1.0
+    # integer pixel centres: a centred image has cx = (W - 1) / 2
+    torch.testing.assert_close(scene.train.cameras.cx, torch.full((3,), 83.5))
+    torch.testing.assert_close(scene.train.cameras.cy, torch.full((3,), 62.5))
+
+
+@pytest.mark.parametrize("kind", ["forward", "orbit"])
+def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
+    first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (3, 3, 4))
+    for split in ("train", "test"):
+        a, b, c = (getattr(x, split) for x in (first, again, other))
+        assert torch.equal(a.images, b.images)
+        assert torch.equal(a.cameras.extrinsics, b.cameras.extrinsics)
+        assert (a.images - c.images).abs().mean() > 0.05
+        assert not torch.equal(a.cameras.extrinsics, c.cameras.extrinsics)
+
+
+def test_world_does_not_depend_on_the_number_of_views(scene):
+    few = synthetic_scene(train_views=1, test_views=0)
+    depth = synthetic_depths(few.train.cameras)
+    torch.testing.assert_close(depth, _shown_depth(few.train, "forward"), rtol=1e-9, atol=0.0)
+    # the one camera and the middle one of three see one and the same world
+    warped, seen, error = _photo_error(scene.train, 1, few.train, 0)
+    assert seen.double().mean() > 0.5
+    assert error[seen].median() < 0.02
+    assert warped.shape == few.train.images[:1].shape
+
+
+def test_train_and_test_cameras_are_disjoint(scene, orbit):
+    for both in (scene, orbit):
+        centers = [_centers(views.cameras.extrinsics) for views in (both.train, both.test)]
+        assert torch.cdist(*centers).min() > 0.01
+        assert torch.pdist(torch.cat(centers)).min() > 0.01
+        assert not set(both.train.names) & set(both.test.names)
+
+
+def test_forward_test_views_lie_around_the_training_views(scene):
+    train, test = (_centers(views.cameras.extrinsics) for views in (scene.train, scene.test))
+    extent = train.amax(0) - train.amin(0)
+    assert (test[:, :2] > train.amin(0)[:2] - extent[:2]).all()
+    assert (test[:, :2] < train.amax(0)[:2] + extent[:2]).all()
+    assert ((test[:, 0] > train[:, 0].min()) & (test[:, 0] < train[:, 0].max())).sum() >= 3
+
+
+@pytest.mark.parametrize(("seed", "size"), [(0, (42, 56)), (1, (56, 42)), (2, (48, 48))])
+def test_forward_views_are_covered_wholly(seed, size):
+    scene = synthetic_scene(train_views=3, test_views=6, size=size, seed=seed)
+    for views in (scene.train, scene.test):
+        depths = synthetic_depths(views.cameras, seed=seed)
+        assert (depths > 1.0).all()
+        assert (depths < 9.5).all()
+
+
+def test_orbit_views_look_inwards_and_are_mostly_covered(orbit):
+    for views in (orbit.train, orbit.test):
+        covered = synthetic_depths(views.cameras, "orbit") > 0
+        assert (covered.double().mean(dim=(1, 2, 3)) > 0.6).all()
+        assert not covered.all(dim=3).all(dim=2).any()  # and the black background is seen, too
+    centers = _centers(torch.cat([orbit.train.cameras.extrinsics, orbit.test.cameras.extrinsics]))
+    axes = torch.cat([orbit.train.cameras.extrinsics, orbit.test.cameras.extrinsics])[:, 2, :3]
+    inwards = torch.nn.functional.normalize(centers.mean(0) - centers, dim=1)
+    assert ((axes * inwards).sum(1) > 0.7).all()
+
+
+def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
+    """The middle of the scene has a disparity of many pixels between neighbours, and some of it is hidden."""
+    depths = synthetic_depths(scene.train.cameras)
+    assert depths.amax() / depths.amin() > 2.5
+    _, seen, _ = _photo_error(scene.train, 0, scene.train, 1)
+    assert 0.6 < seen.double().mean() < 0.95
+
+
+@pytest.mark.parametrize(("source", "target"), [(0, 1), (1, 2), (2, 0)])
+def test_views_agree_on_the_colour_of_the_surfaces_they_both_see(scene, source, target):
+    """Kornia warps one view into the other by the true depth: pose, depth, intrinsics and images must fit together."""
+    _, seen, error = _photo_error(scene.train, source, scene.train, target)
+    assert seen.sum() > 5000
+    assert error[seen].median() < 0.02
+    # the same test a pixel beside the truth fails: it can see a wrong convention
+    shifted = torch.roll(scene.train.images[target : target + 1], 1, dims=3)
+    warped, _, _ = _photo_error(scene.train, source, scene.train, target)
+    assert (warped - shifted).abs().mean(dim=1, keepdim=True)[seen].median() > 0.03
+
+
+def test_a_surface_point_has_its_colour_in_every_view(scene):
+    """A point on the world's mesh, projected by Kornia's camera, lands on a pixel of the colour that it has."""
+    world = make_world("forward", 0)
+    wall = np.flatnonzero(world.owners == world.owners.max() - 1)
+    points = world.triangles[wall].mean(axis=1)
+    colors = torch.from_numpy(shade(world, points, wall)).float()
+    hits = torch.zeros(len(wall), dtype=torch.int64)
+    depths = synthetic_depths(scene.train.cameras)
+    for i in range(3):
+        camera = scene.train.camera(i)
+        inside = torch.from_numpy(points).float() @ camera.rotation_matrix[0].T + camera.translation_vector[0, :, 0]
+        pixels = camera.project(torch.from_numpy(points).float())
+        grid = (pixels / torch.tensor([83.5, 62.5]) - 1).clamp(-2, 2)[None, None]
+        shown = torch.nn.functional.grid_sample(scene.train.images[i : i + 1], grid, align_corners=True)[0, :, 0].T
+        z = torch.nn.functional.grid_sample(depths[i : i + 1].float(), grid, align_corners=True)[0, 0, 0]
+        visible = (grid.abs() < 1).all(-1)[0, 0] & (z - inside[:, 2]).abs().lt(0.01)
+        assert visible.sum() > 300
+        assert (shown - colors)[visible].abs().mean(dim=1).median() < 0.02
+        hits += visible
+    assert (hits >= 2).sum() > 300
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_sift_matches_neighbouring_training_views_along_the_epipolar_lines(seed):
+    train = synthetic_scene(test_views=0, seed=seed).train
+    sift = cv2.SIFT_create()
+    gray = [cv2.cvtColor(_to_bytes(image), cv2.COLOR_RGB2GRAY) for image in train.images]
+    features = [sift.detectAndCompute(image, None) for image in gray]
+    inverse = np.linalg.inv(train.cameras.intrinsics[0, :3, :3].double().numpy())
+    extrinsics = train.cameras.extrinsics.double().numpy()
+    for i in range(2):
+        pairs = cv2.BFMatcher().knnMatch(features[i][1], features[i + 1][1], k=2)
+        good = [best for best, second in pairs if best.distance < 0.8 * second.distance]
+        a = cv2.convertPointsToHomogeneous(np.array([features[i][0][m.queryIdx].pt for m in good]))[:, 0]
+        b = cv2.convertPointsToHomogeneous(np.array([features[i + 1][0][m.trainIdx].pt for m in good]))[:, 0]
+        motion = extrinsics[i + 1] @ np.linalg.inv(extrinsics[i])
+        cross = np.cross(motion[:3, 3], np.eye(3)).T
+        lines = a @ (inverse.T @ cross @ motion[:3, :3] @ inverse).T
+        distance = np.abs((lines * b).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
+        assert (distance < 1.0).sum() >= 150
+        assert (distance < 1.0).mean() > 0.9
+
+
+def test_raycast_of_a_plane_has_its_closed_form_depth():
+    """A tilted square, part of which is behind the camera: z = c / (n . ray)."""
+    corners = np.array([[-50.0, -50.0, 0.0], [50.0, -50.0, 0.0], [50.0, 50.0, 0.0], [-50.0, 50.0, 0.0]])
+    turn = trimesh.transformations.euler_matrix(1.1, 0.3, 0.2)[:3, :3]
+    corners = corners @ turn.T + [0.0, 0.0, 4.0]
+    intrinsics, size = _pinhole(60, 80)
+    depths, faces = raycast(corners[[[0, 1, 2], [0, 2, 3]]], intrinsics, np.eye(4), size)
+    slope = _rays(intrinsics, size) @ turn[:, 2]
+    expected = 4.0 * turn[2, 2] / slope
+    clear = (expected > 0) & (expected < 30.0)
+    assert clear.mean() > 0.5
+    assert not clear.all()
+    np.testing.assert_allclose(depths[clear], expected[clear], rtol=1e-10)
+    assert (faces[expected < 0] == -1).all()
+    assert (depths[expected < 0] == 0).all()
+
+
+def test_raycast_of_a_sphere_has_its_closed_form_depth():
+    center, radius = np.array([0.3, -0.2, 4.0]), 1.1
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=radius).apply_translation(center)
+    intrinsics, size = _pinhole(90, 120)
+    depths, _ = raycast(np.asarray(mesh.triangles), intrinsics, np.eye(4), size)
+    rays = _rays(intrinsics, size)
+    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - radius**2
+    discriminant = b**2 - a * c
+    inner = discriminant > 0.2 * discriminant.max()
+    expected = (b - np.sqrt(discriminant.clip(0.0))) / a
+    assert inner.sum() > 2000
+    np.testing.assert_allclose(depths[inner], expected[inner], rtol=1e-4)
+    assert (depths[discriminant < 0] == 0).all()
+
+
+def test_raycast_closed_mesh_has_no_cracks_and_hides_what_is_behind():
+    """From inside a finely divided ball every ray hits, also at pixels that lie exactly on edges."""
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=4, radius=3.0).triangles)
+    intrinsics, size = _pinhole(61, 81)
+    depths, faces = raycast(ball, intrinsics, np.eye(4), size)
+    assert (faces >= 0).all()
+    np.testing.assert_allclose(depths * np.linalg.norm(_rays(intrinsics, size), axis=-1), 3.0, rtol=4e-3)
+    screen = np.array([[[-9.0, -9.0, 2.0], [9.0, -9.0, 2.0], [0.0, 9.0, 2.0]]])
+    depths, faces = raycast(np.concatenate([ball, screen]), intrinsics, np.eye(4), size)
+    np.testing.assert_allclose(depths[faces == len(ball)], 2.0, rtol=1e-12)
+    assert (faces == len(ball)).mean() > 0.4
+
+
+def test_raycast_follows_the_extrinsics():
+    mesh = np.asarray(trimesh.creation.icosphere(subdivisions=2).triangles)
+    pose = trimesh.transformations.euler_matrix(0.4, -0.3, 2.0)
+    pose[:3, 3] = 0.1, 0.2, 3.0
+    intrinsics, size = _pinhole(30, 40)
+    depths, faces = raycast(mesh, intrinsics, pose, size)
+    moved = mesh @ pose[:3, :3].T + pose[:3, 3]
+    expected_depths, expected_faces = raycast(moved, intrinsics, np.eye(4), size)
+    np.testing.assert_array_equal(faces, expected_faces)
+    np.testing.assert_allclose(depths, expected_depths, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"kind": "sideways"}, "kind"),
+        ({"train_views": 0}, "train_views"),
+        ({"test_views": -1}, "test_views"),
+        ({"size": (0, 8)}, "size"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, name):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        synthetic_scene(**arguments)
+
+
+def test_depths_refuse_unknown_kinds_and_mixed_sizes(scene):
+    with pytest.raises(ValueError, match=r"^kind: expected"):
+        synthetic_depths(scene.train.cameras, "sideways")
+    mixed = scene.train.camera([0, 1])
+    mixed.height[1] = 64.0
+    with pytest.raises(ValueError, match=r"^cameras: expected one image size"):
+        synthetic_depths(mixed)
+    with pytest.raises(ValueError, match=r"^triangles: expected"):
+        raycast(np.zeros((3, 3)), np.eye(3), np.eye(4), (2, 2))
+
+
+def _photo_error(source, i, target, j):
+    """View i of `source` warped into view j of `target`, where both see the surface, and the mean absolute error."""
+    camera, other = target.camera(j), source.camera(i)
+    depth = synthetic_depths(camera)
+    matrix = camera.intrinsics[:, :3, :3].double()
+    motion = other.extrinsics.double() @ torch.linalg.inv(camera.extrinsics.double())
+    warped = warp_frame_depth(source.images[i : i + 1].double(), depth, motion, matrix)
+    v, u = torch.meshgrid(torch.arange(depth.shape[2]), torch.arange(depth.shape[3]), indexing="ij")
+    rays = torch.stack([u, v, torch.ones_like(u)], -1).double() @ torch.linalg.inv(matrix[0]).T
+    points = (rays * depth[0, 0, ..., None]) @ motion[0, :3, :3].T + motion[0, :3, 3]
+    grid = points @ matrix[0].T
+    grid = grid[..., :2] / grid[..., 2:] / torch.tensor([depth.shape[3] - 1, depth.shape[2] - 1]) * 2 - 1
+    # nearest, so that no value is mixed across the outline of an object
+    there = torch.nn.functional.grid_sample(synthetic_depths(other), grid[None], mode="nearest", align_corners=True)
+    seen = ((there[0, 0] - points[..., 2]).abs() < 0.05 * points[..., 2]) & (grid.abs() <= 1).all(-1)
+    error = (warped - target.images[j : j + 1]).abs().mean(dim=1, keepdim=True)
+    return warped, seen[None, None], error
+
+
+def _shown_depth(views, kind):
+    """Depth by scaling the image plane: a camera of three times the pixels has the same centres at every third."""
+    triangles = make_world(kind, 0).triangles
+    depths = []
+    for k, e in zip(views.cameras.intrinsics.double(), views.cameras.extrinsics.double(), strict=True):
+        fine = k[:3, :3].numpy().copy()
+        fine[:2] *= 3
+        fine[:2, 2] += 1
+        height, width = views.images.shape[-2:]
+        depths.append(raycast(triangles, fine, e.numpy(), (3 * height, 3 * width))[0][1::3, 1::3])
+    return torch.from_numpy(np.stack(depths)[:, None])
+
+
+def _centers(extrinsics):
+    return torch.linalg.inv(extrinsics.double())[:, :3, 3]
+
+
+def _to_bytes(image):
+    return (image.permute(1, 2, 0) * 255).round().byte().numpy()
+
+
+def _pinhole(height, width):
+    matrix = np.array([[0.9 * width, 0.0, (width - 1) / 2], [0.0, 0.9 * width, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return matrix, (height, width)
+
+
+def _rays(intrinsics, size):
+    v, u = np.mgrid[: size[0], : size[1]]
+    return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(intrinsics).T
