@@ -20,7 +20,7 @@ from .types import TileBins
 
 __all__ = ["Band", "Rules"]
 
-_STEP_ELEMENTS = {"cpu": 2**19, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers
+_STEP_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers
 
 
 @dataclass(frozen=True)
@@ -70,15 +70,17 @@ class Band:
     def forward(self, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Sums of features `(T, F, P)`, transmittance `(T, 1, P)` and median depth `(T, 1, P)` or `(T, 0, P)`."""
         tiles, like = self.bins.num_tiles, self.table
-        sums = like.new_zeros(tiles, self.features.shape[1], self.pixels)
+        # three columns at a time: what is asked for beside the image does not change its bits
+        blocks = self.features.split(3, dim=1)
+        sums = [like.new_zeros(tiles, block.shape[1], self.pixels) for block in blocks]
         transmittance = like.new_ones(tiles, 1, self.pixels)
         median = like.new_zeros(tiles, 1 if self.depths is not None else 0, self.pixels)
 
         def worker() -> Forward:
-            return Forward(self, sums, transmittance, median, keep)
+            return Forward(self, blocks, (transmittance, median, *sums), keep)
 
         run_all(self.groups, worker, like.device)
-        return sums, transmittance, median
+        return torch.cat(sums, 1), transmittance, median
 
     def backward(self, grads: Tensor, behind: Tensor) -> Tensor:
         """What each Gaussian of the bins gets: six moments of dL/d ln alpha about its centre, and dL/d features.
@@ -117,9 +119,12 @@ class Band:
 
 
 def _chunk_size(bins: TileBins) -> int:
+    """Short chunks waste little at the ends of lists; long ones need fewer operator calls, so few tiles want them."""
     if bins.entries.device.type != "cpu":
         return 32
-    return 8 if bins.entries.shape[0] < 256 * bins.num_tiles else 16
+    entries, tiles = bins.entries.shape[0], bins.num_tiles
+    few = tiles * bins.tile_size**2 < 2**15
+    return 16 if entries >= (32 if few else 256) * tiles else 8
 
 
 def _below(value: float, dtype: torch.dtype) -> float:

@@ -155,7 +155,9 @@ class _Composite(torch.autograd.Function):
             tiles = slice(begin * columns, end * columns)
             total = total + band.backward(grads[tiles], behind[tiles])
         ids = spans.ids
-        found = _to_inputs(total, factors.index_select(0, ids), opacities.index_select(0, ids), ctx.projected.eps2d)
+        used = factors.index_select(0, ids), opacities.index_select(0, ids)
+        with torch.autocast(factors.device.type, enabled=False):
+            found = _to_inputs(total, *used, ctx.projected.eps2d)
         rows = factors.shape[0]
         return (
             *(
@@ -203,7 +205,7 @@ def _to_images(tiles: Tensor, projected: ProjectedGaussians, spans: TileSpans) -
     size, (rows, columns) = spans.tile_size, spans.grid
     height, width = projected.image_size
     images = tiles.view(projected.num_cameras, rows, columns, -1, size, size).permute(0, 3, 1, 4, 2, 5)
-    return images.reshape(projected.num_cameras, -1, rows * size, columns * size)[:, :, :height, :width].contiguous()
+    return images.reshape(projected.num_cameras, -1, rows * size, columns * size)[:, :, :height, :width].clone()
 
 
 def _to_tiles(images: Tensor, spans: TileSpans) -> Tensor:

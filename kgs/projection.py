@@ -52,7 +52,6 @@ def project(
         ValueError: cameras of different image sizes, or opacities `(C, N)` for another number of cameras.
     """
     size = image_size(cameras)
-    views = lenses(cameras)
     means = gaussians.means
     extrinsics = cameras.extrinsics
     if extrinsics.dtype != means.dtype or extrinsics.device != means.device:
@@ -60,6 +59,7 @@ def project(
             f"cameras: expected {means.dtype} on {means.device} as the Gaussians, "
             f"got {extrinsics.dtype} on {extrinsics.device}"
         )
+    views = lenses(cameras)
     if gaussians.opacities.ndim == 2 and gaussians.opacities.shape[0] != len(views):
         raise ValueError(
             f"opacities: expected shape ({len(gaussians)},) or ({len(views)}, {len(gaussians)}) for {len(views)} "
@@ -176,8 +176,8 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
 
 def _finite(gaussians: Gaussians) -> Tensor:
     """Which Gaussians have only finite parameters, `(N,)`."""
-    n = len(gaussians)
-    values = [gaussians.opacities.detach().reshape(-1, n).T]
+    opacities = gaussians.opacities.detach()
+    values = [opacities.T if opacities.ndim == 2 else opacities[:, None]]
     values += [x.detach().flatten(1) for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors)]
     # a finite sum has finite terms; the slower exact test is needed only where a sum is not finite
     finite = torch.isfinite(torch.stack([x.sum(1) for x in values]).sum(0))

@@ -76,8 +76,8 @@ def render(
     if background is not None:
         if tuple(background.shape) not in {(3,), (1, 3), (1, *image.shape)}:
             raise ValueError(f"background: expected (3,), (1, 3) or (1, 3, H, W), got {tuple(background.shape)}")
-        flat = background.double().reshape(3, -1) * drawn.transmittance.reshape(1, -1)
-        image = image + flat.reshape(image.shape)
+        behind = background.double().reshape(3, *(background.shape[2:] or (1, 1)))
+        image = image + behind * drawn.transmittance
     return image[None]
 
 
@@ -93,10 +93,8 @@ def layers(
     if not isinstance(camera, PinholeCamera):
         raise TypeError(f"camera: expected a kornia PinholeCamera, got {type(camera).__name__}")
     if camera.batch_size != 1 or gaussians.opacities.numel() != len(gaussians):
-        raise ValueError(
-            "camera: expected one camera and one row of opacities, "
-            f"got {camera.batch_size} and {tuple(gaussians.opacities.shape)}"
-        )
+        shape = tuple(gaussians.opacities.shape)
+        raise ValueError(f"camera: expected one camera and one row of opacities, got {camera.batch_size} and {shape}")
     height, width = int(camera.height), int(camera.width)
     intrinsics, extrinsics = camera.intrinsics[0, :3, :3].double(), camera.extrinsics[0].double()
     rotation, translation = extrinsics[:3, :3], extrinsics[:3, 3]
@@ -128,7 +126,7 @@ def layers(
 
 
 def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
-    """D pixel / d point, with x/z and y/z limited to 15 % of the image size beyond its borders."""
+    """Derivative of the pixel, with x/z and y/z limited to 15 % of the image size beyond its borders."""
     size = torch.tensor([width, height]).to(points)
     focal, centre = intrinsics.detach().diagonal()[:2], intrinsics.detach()[:2, 2]
     low, high = (-0.5 - centre - 0.15 * size) / focal, (size - 0.5 - centre + 0.15 * size) / focal
@@ -143,7 +141,8 @@ def _covariances(quats: Tensor, scales: Tensor) -> Tensor:
     quats = torch.where((quats == 0).all(1, keepdim=True), torch.eye(4).to(quats)[0], quats)
     w, v = quats[:, :1, None], quats[:, None, 1:]
     square = (v * v).sum(2, keepdim=True)
-    rotations = ((w * w - square) * eye + 2 * v.mT @ v + 2 * w * torch.linalg.cross(eye[None], v)) / (w * w + square)
+    cross: Tensor = torch.linalg.cross(eye[None], v)
+    rotations = ((w * w - square) * eye + 2 * v.mT @ v + 2 * w * cross) / (w * w + square)
     return rotations @ torch.diag_embed(scales**2) @ rotations.mT
 
 
@@ -154,13 +153,13 @@ def _harmonics(directions: Tensor, size: int) -> Tensor:
     """
     x, y, z = directions.unbind(1)
     basis, degree = [z] * size, math.isqrt(size) - 1
-    real, imaginary, diagonal = torch.ones_like(z), torch.zeros_like(z), 1.0
+    power, diagonal = torch.complex(torch.ones_like(x), torch.zeros_like(y)), 1.0
     for m in range(degree + 1):
         before, legendre = torch.zeros_like(z), torch.full_like(z, diagonal)
         for n in range(m, degree + 1):
             square = (1 if m == 0 else 2) * (2 * n + 1) / (4 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
-            basis[n * n + n - m] = (-1) ** m * math.sqrt(square) * legendre * imaginary
-            basis[n * n + n + m] = (-1) ** m * math.sqrt(square) * legendre * real  # for m = 0 the one that stays
+            basis[n * n + n - m] = (-1) ** m * math.sqrt(square) * legendre * power.imag
+            basis[n * n + n + m] = (-1) ** m * math.sqrt(square) * legendre * power.real  # the one that stays for m = 0
             before, legendre = legendre, ((2 * n + 1) * z * legendre - (n + m) * before) / (n - m + 1)
-        real, imaginary, diagonal = x * real - y * imaginary, x * imaginary + y * real, (2 * m + 1) * diagonal
+        power, diagonal = power * torch.complex(x, y), (2 * m + 1) * diagonal
     return torch.stack(basis, 1)

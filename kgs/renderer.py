@@ -85,6 +85,8 @@ class GaussianRenderer(nn.Module):
             ValueError: an unknown output, or shapes that do not fit.
         """
         wanted = _check_outputs(outputs)
+        if not isinstance(gaussians, Gaussians):
+            raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
         with torch.autocast(gaussians.means.device.type, enabled=False):
             opacities = self.opacity_layer(gaussians.opacities)
             if opacities is not gaussians.opacities:

@@ -105,10 +105,9 @@ class _Worker:
 class Forward(_Worker):
     """Adds the layers of a group to the sums, front to back."""
 
-    def __init__(self, band: Band, sums: Tensor, transmittance: Tensor, median: Tensor, keep: bool) -> None:
+    def __init__(self, band: Band, blocks: tuple[Tensor, ...], outputs: tuple[Tensor, ...], keep: bool) -> None:
         super().__init__(band, buffers=2)
-        self.outputs = (sums, transmittance, median)
-        self.keep = keep
+        self.blocks, self.outputs, self.keep = blocks, outputs, keep
 
     def __call__(self, group: Group) -> None:
         """Composite a group."""
@@ -121,7 +120,7 @@ class Forward(_Worker):
         while chunks[0] > j:
             while chunks[n - 1] <= j:
                 n -= 1
-            sums, light, median = (x[:n] for x in state)
+            light, median, *sums = (x[:n] for x in state)
             if self.keep:
                 group.steps.append(Step(j, rows, n, light[:, 0].clone()))
             positions, beyond = self.positions(starts[:n], ends[:n], j)
@@ -135,7 +134,8 @@ class Forward(_Worker):
                 crossing = ((self.light[:, :-1] >= 0.5) & (self.light[:, 1:] < 0.5)).to(light.dtype)
                 median.baddbmm_(band.depths.index_select(0, ids).view(n, 1, size), crossing)
             weights = self.alpha.mul_(self.light[:, :-1])
-            sums.baddbmm_(band.features.index_select(0, ids).view(n, size, -1).transpose(1, 2), weights)
+            for block, total in zip(self.blocks, sums, strict=True):
+                total.baddbmm_(block.index_select(0, ids).view(n, size, -1).transpose(1, 2), weights)
             light[:, 0] = self.light[:, -1]
             live = light[:, 0].amax(1) > 0
             live_count = int(live.sum())

@@ -36,8 +36,11 @@ def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], No
     queue = deque(items)
     threads = min(torch.get_num_threads(), len(queue)) if device.type == "cpu" else 1
 
+    inference = torch.is_inference_mode_enabled()
+
     def drain() -> None:
-        with torch.no_grad():
+        # all of these are states of a thread
+        with torch.inference_mode(inference), torch.no_grad(), torch.autocast(device.type, enabled=False):
             worker = make_worker()
             while True:
                 try:

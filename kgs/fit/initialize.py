@@ -1,0 +1,208 @@
+"""First points of a fit, from the training views alone: nothing here ever sees a test view."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import torch
+import trimesh
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.datasets.scene import Views
+from kgs.errors import DataError
+from kgs.fit.tracks import find_tracks
+from kgs.fit.triangulate import camera_centers, project_all, triangulate_certain
+
+__all__ = ["FirstPoints", "first_points", "relative_near_plane"]
+
+KINDS = ("sift", "random", "file")
+FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
+DEFAULT_NEAR_PLANE = 0.01
+
+
+@dataclass(frozen=True)
+class FirstPoints:
+    """What a fit starts from.
+
+    Args:
+        points: in the frame of the views, `(P, 3)` float32 on the CPU.
+        colors: RGB in [0, 1], `(P, 3)` float32.
+        kind: where the points come from: "sift", "random" or "file".
+    """
+
+    points: Tensor
+    colors: Tensor
+    kind: str
+
+
+def first_points(
+    views: Views,
+    kind: str = "sift",
+    *,
+    seed: int = 0,
+    num_random: int = 10_000,
+    file: str | PathLike[str] | None = None,
+) -> FirstPoints:
+    """Find the points a fit starts from.
+
+    Args:
+        views: the training views, and only these.
+        kind: "sift": SIFT keypoints of the images, matched and triangulated with the given poses; where fewer than 20
+            such points come out, "random" ones with a warning. "random": points spread evenly over the space that at
+            least two of the views see (one, if there is only one), in the images' mean colours there; its depths are
+            those of the SIFT points, or else follow from where the cameras are and look. "file": a point cloud or the
+            vertices of a mesh, in any format of trimesh, in the frame of the views; grey if it has no colours.
+        seed: of the random points; the other kinds have no randomness.
+        num_random: how many points "random" gives, >= 1.
+        file: the file of the kind "file".
+
+    Returns:
+        The points; their `kind` is what they are, so "random" where "sift" found too few.
+
+    Raises:
+        ValueError: another kind, `num_random` below 1, or no file for "file".
+        DataError: the file is missing, broken, or has no points.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
+    if num_random < 1:
+        raise ValueError(f"num_random: expected at least 1, got {num_random}")
+    if kind == "file":
+        if file is None:
+            raise ValueError("file: expected a path for the kind 'file', got None")
+        return FirstPoints(*_read_points(Path(file)), kind="file")
+    points, tracks = triangulate_certain(find_tracks(views), views.cameras)
+    inside = _typical_depths(points, tracks.seen, views.cameras)
+    points, pixels, seen = points[inside], tracks.pixels[inside], tracks.seen[inside]
+    if kind == "sift" and len(points) >= FEWEST_POINTS:
+        return FirstPoints(points.float(), _mean_colors(views, pixels, seen), kind="sift")
+    if kind == "sift":
+        warnings.warn(
+            f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
+            f"the fit starts from {num_random} random points instead",
+            stacklevel=2,
+        )
+    near, far = _depth_range(points, views.cameras)
+    points = _random_points(views, num_random, near, far, torch.Generator().manual_seed(seed))
+    pixels, depths = project_all(points, views.cameras)
+    colors = _mean_colors(views, pixels, _inside(pixels, depths, views, near, far))
+    return FirstPoints(points.float(), colors, kind="random")
+
+
+def relative_near_plane(views: Views, points: Tensor) -> float:
+    """Give the near plane that fits a scene's scale: 0.05 times the 1st percentile of the points' depths.
+
+    Convention:
+        Depth is z in the camera's frame (OpenCV axes), in world units.
+
+    Args:
+        views: the training views.
+        points: `(P, 3)`; P may be 0.
+
+    Returns:
+        The near plane; the depths are those of points inside an image, else of all points before a camera; 0.01 where
+        there are none.
+    """
+    pixels, depths = project_all(points.detach().cpu(), views.cameras)
+    before = depths[depths > 0]
+    seen = depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
+    depths = seen if len(seen) else before
+    return 0.05 * _quantile(depths, 0.01) if len(depths) else DEFAULT_NEAR_PLANE
+
+
+def _typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
+    """Whether points lie between half the 1st and twice the 99th percentile of all depths in all views that see them.
+
+    The few false matches that satisfy the geometry by chance mostly lie right before a camera or far behind the scene.
+    """
+    _, depths = project_all(points, cameras)
+    if not seen.any():
+        return torch.zeros(len(points), dtype=torch.bool)
+    least, most = 0.5 * _quantile(depths[seen], 0.01), 2.0 * _quantile(depths[seen], 0.99)
+    return (((depths > least) & (depths < most)) | ~seen).all(1)
+
+
+def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
+    """Nearest and farthest depth to expect: from points if there are any, else from the cameras."""
+    if len(points) > 1:
+        _, depths = project_all(points, cameras)
+        depths = depths[depths > 0]
+        return 0.8 * _quantile(depths, 0.01), 1.25 * _quantile(depths, 0.99)
+    centers, axes = camera_centers(cameras), cameras.extrinsics[:, 2, :3].double().cpu()
+    # The point nearest to all optical axes; near-parallel axes (within some 5 degrees) do not tell where they meet.
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    if torch.linalg.eigvalsh(across.mean(0))[0] > 0.005:
+        meeting = torch.linalg.solve(across.sum(0), (across @ centers[..., None]).sum(0)[:, 0])
+        depths = ((meeting - centers) * axes).sum(1)
+        if bool((depths > 0).all()):
+            return 0.3 * float(depths.min()), 2.0 * float(depths.max())
+    baseline = float(torch.cdist(centers, centers).max()) or 1.0
+    return baseline, 20.0 * baseline
+
+
+def _random_points(views: Views, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
+    """Points of even density where at least two views see; where there is no such place, where one sees."""
+    intrinsics, extrinsics = views.cameras.intrinsics[:, :3, :3].double().cpu(), views.cameras.extrinsics.double().cpu()
+    size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
+    found: list[Tensor] = []
+    for fewest in (2, 1):
+        for _ in range(50):
+            draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
+            view = (torch.rand(4 * count, generator=generator) * len(views)).long()
+            pixels = torch.cat([draws[:, :2] * size - 0.5, torch.ones(4 * count, 1)], dim=1)
+            depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
+            local = (torch.linalg.inv(intrinsics)[view] @ pixels[..., None])[..., 0] * depths[:, None]
+            points = ((local - extrinsics[view, :3, 3])[:, None] @ extrinsics[view, :3, :3])[:, 0]
+            # A place that k views see is drawn k times as often as one that a single view sees.
+            seeing = _inside(*project_all(points, views.cameras), views, near, far).sum(1)
+            found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])
+            if sum(map(len, found)) >= count:
+                return torch.cat(found)[:count]
+    return torch.cat(found)[:count]
+
+
+def _inside(pixels: Tensor, depths: Tensor, views: Views, near: float, far: float) -> Tensor:
+    """Whether points `(P, V)` lie in the images of the views, between two depths."""
+    height, width = views.images.shape[-2:]
+    limits = torch.tensor([width - 0.5, height - 0.5], dtype=pixels.dtype)
+    return ((pixels > -0.5) & (pixels < limits)).all(-1) & (depths >= near) & (depths <= far)
+
+
+def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:
+    """The mean of the images' colours at pixels `(P, V, 2)`, over the views where `seen` `(P, V)`."""
+    images = views.images.cpu()
+    height, width = images.shape[-2:]
+    span = torch.tensor([max(width - 1, 1), max(height - 1, 1)])
+    grid = (2.0 * pixels / span - 1.0).transpose(0, 1)[:, :, None].to(images.dtype)
+    samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)[..., 0]
+    weights = (seen / seen.sum(1, keepdim=True)).T[:, None].to(images.dtype)
+    return torch.where(weights > 0, weights * samples, 0.0).sum(0).T.clamp(0.0, 1.0).contiguous()
+
+
+def _read_points(path: Path) -> tuple[Tensor, Tensor]:
+    if not path.is_file():
+        raise DataError(path, "", "expected a point cloud or mesh, found no such file")
+    try:
+        geometry = trimesh.load(path, process=False)
+        geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
+        points = torch.tensor(geometry.vertices, dtype=torch.float32).reshape(-1, 3)
+    except Exception as error:  # trimesh's readers raise whatever their format's parser meets
+        raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
+    if not len(points) or not bool(points.isfinite().all()):
+        raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
+    if isinstance(geometry, trimesh.PointCloud):
+        values = geometry.colors
+    else:
+        values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
+    if len(values) != len(points):
+        return points, torch.full_like(points, 0.5)
+    return points, torch.tensor(values)[:, :3].float() / 255.0
+
+
+def _quantile(values: Tensor, fraction: float) -> float:
+    """As `torch.quantile`, for any number of values."""
+    return float(torch.tensor(fraction, dtype=torch.float64).mul(len(values) - 1).pipe(values)) if False else 0.0
