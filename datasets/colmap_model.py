@@ -7,18 +7,22 @@ read. Every count is held against the file's length before anything of that size
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kgs.errors import DataError
 
-__all__ = ["ColmapCamera", "ColmapImage", "find_model", "read_cameras", "read_images", "read_points"]
+__all__ = ["ColmapCamera", "ColmapImage", "find_model", "model_file", "read_cameras", "read_images", "read_points"]
 
-# Names in the order of COLMAP's model ids, with the number of parameters of those that are read.
+T = TypeVar("T")
+
+_LONGEST_NAME = 4096
+# Names in the order of COLMAP's model ids.
 _MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -32,6 +36,7 @@ _MODELS = (
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
 )
+# The models that are read, with their number of parameters.
 _PARAMETERS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -100,12 +105,11 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
         data.finish()
     else:
-        for line in _lines(path):
-            if line:
-                camera_id, model, width, height, *params = _fields(path, line, "iSii", "f")
-                if len(params) != _parameter_count(path, camera_id, model):
-                    raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
-                _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, tuple(params)))
+        for line in filter(None, _lines(path)):
+            camera_id, model, width, height, params = _fields(path, line, (int, str, int, int, _floats))
+            if len(params) != _parameter_count(path, camera_id, model):
+                raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
+            _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
     return cameras
 
 
@@ -126,11 +130,10 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
         data.finish()
     else:
         lines = _lines(path)
-        for line in lines:
-            if line:
-                image_id, *pose, camera_id, name = _fields(path, line, "ifffffffiS")
-                _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
-                next(lines, None)  # the observations, a line that may be empty
+        for line in filter(None, lines):
+            image_id, *pose, camera_id, name = _fields(path, line, (int, *[float] * 7, int, str))
+            _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
+            next(lines, None)  # the observations, a line that may be empty
     return images
 
 
@@ -148,18 +151,104 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
         data = _Binary(path)
         for _ in range(data.count("number of points", 51)):
             _, *row, _ = data.take("<Q3d3Bd", "point")
-            track = data.array("<u4", 2 * data.count("track", 8))
-            if len(image_ids.intersection(track[::2].tolist())) >= 2:
+            track = data.take(f"<{2 * data.count('track', 8)}I", "track")
+            if len(image_ids.intersection(track[::2])) >= 2:
                 rows.append(tuple(row))
         data.finish()
     else:
-        for line in _lines(path):
-            if line:
-                _, *row, _ = _fields(path, " ".join(line.split(maxsplit=8)[:8]), "ifffiiif")
-                track = _fields(path, line.split(maxsplit=8)[8] if len(line.split(maxsplit=8)) > 8 else "", "", "i")
-                if len(image_ids.intersection(track[::2])) >= 2:
-                    rows.append(tuple(row))
-    points = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
+        for line in filter(None, _lines(path)):
+            _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, _integers))
+            if len(image_ids.intersection(track[::2])) >= 2:
+                rows.append(tuple(row))
+    points, colors = np.array([row[:3] for row in rows], np.float64), np.array([row[3:] for row in rows], np.int64)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")
-    return points, np.array([row[3:] for row in rows], dtype=np.uint8).reshape(-1, 3)
+    if colors.size and (colors.min() < 0 or colors.max() > 255):
+        raise DataError(path, "", "expected colours from 0 to 255, got others")
+    return points.reshape(-1, 3), colors.reshape(-1, 3).astype(np.uint8)
+
+
+class _Binary:
+    """A file's bytes with a position that cannot leave them."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._data = path.read_bytes()
+        self._at = 0
+
+    def take(self, form: str, what: str) -> tuple[Any, ...]:
+        """The next values, of a format of `struct`."""
+        self._need(struct.calcsize(form), what)
+        self._at += struct.calcsize(form)
+        return struct.unpack_from(form, self._data, self._at - struct.calcsize(form))
+
+    def count(self, what: str, least_bytes: int) -> int:
+        """The next 64 bit count, of things that take at least that many bytes each."""
+        (number,) = self.take("<Q", what)
+        self._need(number * least_bytes, what)
+        return int(number)
+
+    def string(self, what: str) -> str:
+        """The next text, up to its zero byte."""
+        end = self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)
+        if end < 0:
+            raise DataError(self._path, what, "expected a name that ends with a zero byte")
+        text, self._at = self._data[self._at : end], end + 1
+        try:
+            return text.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise DataError(self._path, what, f"expected a name in UTF-8, got {text!r}") from error
+
+    def skip(self, size: int) -> None:
+        """Pass over bytes whose presence `count` has checked."""
+        self._at += size
+
+    def finish(self) -> None:
+        """Make sure that nothing is left."""
+        if self._at != len(self._data):
+            raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
+
+    def _need(self, size: int, what: str) -> None:
+        left = len(self._data) - self._at
+        if size > left:
+            raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """The lines of a text model without its comments, stripped; empty ones included."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(path, "", "expected text in UTF-8") from error
+    return (line.strip() for line in text.split("\n") if not line.startswith("#"))
+
+
+def _fields(path: Path, line: str, kinds: Sequence[Callable[[str], Any]]) -> list[Any]:
+    """The words of a line, converted; the last kind gets all that is left, which may be nothing."""
+    words = line.split(maxsplit=len(kinds) - 1)
+    try:
+        return [kind(word) for kind, word in zip(kinds, (*words, "")[: len(kinds)], strict=True)]
+    except ValueError as error:
+        raise DataError(path, f"line {line[:60]!r}", f"expected {len(kinds)} fields as COLMAP writes them") from error
+
+
+def _floats(text: str) -> tuple[float, ...]:
+    return tuple(map(float, text.split()))
+
+
+def _integers(text: str) -> tuple[int, ...]:
+    return tuple(map(int, text.split()))
+
+
+def _parameter_count(path: Path, camera_id: int, model: str) -> int:
+    if model not in _PARAMETERS:
+        raise DataError(
+            path, f"camera {camera_id}", f"camera model {model} cannot be read, only {', '.join(_PARAMETERS)}"
+        )
+    return _PARAMETERS[model]
+
+
+def _add(path: Path, what: str, table: dict[int, T], key: int, value: T) -> None:
+    if key in table:
+        raise DataError(path, f"{what} {key}", "is there twice")
+    table[key] = value

@@ -10,14 +10,25 @@ from pathlib import Path, PureWindowsPath
 import kornia.geometry as kg
 import numpy as np
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.errors import DataError
 
 from .images import Intrinsics, read_image, resize, undistort
 from .scene import Scene, Views
+from .splits import split_by_name
 
-__all__ = ["BACKGROUNDS", "Frame", "PointCloud", "build_scene", "path_inside"]
+__all__ = [
+    "BACKGROUNDS",
+    "NO_POINTS",
+    "Frame",
+    "PointCloud",
+    "build_scene",
+    "check_unique",
+    "path_inside",
+    "split_frames",
+]
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
@@ -96,6 +107,26 @@ def path_inside(source: Path, root: Path, name: str) -> Path:
     return root / name
 
 
+def check_unique(frames: Sequence[Frame]) -> None:
+    """Raise a DataError where two frames have one name."""
+    name, times = Counter(frame.name for frame in frames).most_common(1)[0]
+    if times > 1:
+        raise DataError(frames[0].source, name, f"expected each image once, got it {times} times")
+
+
+def split_frames(root: Path, frames: Sequence[Frame], train_views: int | None) -> tuple[list[int], list[int]]:
+    """Positions of the training and of the test frames: see `split_by_name`.
+
+    Raises:
+        DataError: there are fewer than two frames, or two of one name.
+        ValueError: train_views is out of range.
+    """
+    if len(frames) < 2:
+        raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
+    check_unique(frames)
+    return split_by_name([frame.name for frame in frames], train_views)
+
+
 def build_scene(
     root: Path,
     train: Sequence[Frame],
@@ -111,22 +142,16 @@ def build_scene(
 
     Args:
         root: the scene's folder.
-        train: the frames to train on.
-        test: the frames that are held out.
+        train: the frames to train on, at least one.
+        test: the frames that are held out, at least one.
         downscale: how many times smaller the images shall be, >= 1; None leaves them as they are.
         background: "black" or "white", put behind images with an alpha channel.
         cloud: the layout's own points.
 
     Raises:
-        DataError: there is no training frame, a name is there twice, photos are missing, unreadable or of several
-            sizes, or a photo does not have the aspect of its intrinsics.
+        DataError: photos are missing, unreadable or of several sizes, or a photo does not have the aspect of its
+            intrinsics.
     """
-    for frames in (train, test):
-        name, times = Counter(frame.name for frame in frames).most_common(1)[0] if frames else ("", 1)
-        if times > 1:
-            raise DataError(frames[0].source, name, f"expected each image once, got it {times} times")
-    if not train:
-        raise DataError(root, "", "expected at least one training image, got none")
     _check_present(root, [frame.path for frame in (*train, *test)])
     color = torch.tensor(BACKGROUNDS[background])
     offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)
@@ -160,25 +185,22 @@ def _views(
     size: tuple[int, int] | None = None,
 ) -> Views:
     """Read the frames' images; `size` is the (height, width) they shall have, by default the first one's."""
-    count, has_alpha = len(frames), False
+    count, alphas = len(frames), []
     intrinsics = torch.eye(4).repeat(count, 1, 1)
-    images, masks = torch.empty(count, 3, *(size or (1, 1))), torch.empty(count, 1, *(size or (1, 1)))
     for i, frame in enumerate(frames):
         pixels, alpha, lens = _load(frame, downscale, background)
-        if size is None:
-            size = (lens.height, lens.width)
-            images, masks = torch.empty(count, 3, *size), torch.empty(count, 1, *size)
-        if (lens.height, lens.width) != size:
+        if i == 0:
+            height, width = size or (lens.height, lens.width)
+            images = torch.empty(count, 3, height, width)
+        if (lens.height, lens.width) != (height, width):
             raise DataError(
-                frame.path,
-                "",
-                f"expected {size[1]}x{size[0]} pixels as the other images, got {lens.width}x{lens.height}",
+                frame.path, "", f"expected {width}x{height} pixels as the other images, got {lens.width}x{lens.height}"
             )
         images[i] = pixels
-        masks[i] = 1.0 if alpha is None else alpha
-        has_alpha |= alpha is not None
+        alphas.append(alpha)
         intrinsics[i, :3, :3] = torch.from_numpy(lens.matrix())
-    height, width = images.shape[-2:]
+    opaque = torch.ones(1, height, width)
+    has_alpha = any(alpha is not None for alpha in alphas)
     return Views(
         cameras=PinholeCamera(
             intrinsics,
@@ -188,13 +210,11 @@ def _views(
         ),
         images=images,
         names=tuple(frame.name for frame in frames),
-        masks=masks if has_alpha else None,
+        masks=torch.stack([opaque if alpha is None else alpha for alpha in alphas]) if has_alpha else None,
     )
 
 
-def _load(
-    frame: Frame, downscale: float | None, background: Tensor
-) -> tuple[Tensor, Tensor | None, Intrinsics]:
+def _load(frame: Frame, downscale: float | None, background: Tensor) -> tuple[Tensor, Tensor | None, Intrinsics]:
     """A frame's RGB on the background `(3, H, W)`, its alpha `(1, H, W)` if it has one, and its intrinsics."""
     image = read_image(frame.path)
     height, width = image.shape[:2]
@@ -220,8 +240,6 @@ def _load(
 
 def _extrinsics(frames: Sequence[Frame], offset: Tensor) -> Tensor:
     """World-to-camera `(V, 4, 4)` float32 in the recentred world, the rotations made exactly orthogonal."""
-    if not frames:
-        return torch.zeros(0, 4, 4)
     poses = torch.stack([frame.pose for frame in frames])
     u, _, vh = torch.linalg.svd(poses[:, :3, :3])
     rotation, translation = kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])

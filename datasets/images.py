@@ -108,7 +108,7 @@ def read_image(path: Path) -> Image:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     else:
         image = cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-    return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    return np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:
@@ -156,7 +156,8 @@ def undistort(image: Image, intrinsics: Intrinsics) -> tuple[Image, Intrinsics]:
     inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
     if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
         raise ValueError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), pinhole
+    resampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(resampled, dtype=np.float32), pinhole
 
 
 def _covering_zoom(intrinsics: Intrinsics) -> float:

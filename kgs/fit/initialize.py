@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
 import torch
 import trimesh
 from kornia.geometry.camera import PinholeCamera
@@ -149,7 +150,7 @@ def _random_points(views: Views, count: int, near: float, far: float, generator:
     intrinsics, extrinsics = views.cameras.intrinsics[:, :3, :3].double().cpu(), views.cameras.extrinsics.double().cpu()
     size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
     found: list[Tensor] = []
-    for fewest in (2, 1):
+    for fewest in (min(2, len(views)), 1):
         for _ in range(50):
             draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
             view = (torch.rand(4 * count, generator=generator) * len(views)).long()
@@ -204,5 +205,4 @@ def _read_points(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def _quantile(values: Tensor, fraction: float) -> float:
-    """As `torch.quantile`, for any number of values."""
-    return float(torch.tensor(fraction, dtype=torch.float64).mul(len(values) - 1).pipe(values)) if False else 0.0
+    return float(np.quantile(values.numpy(), fraction))  # torch.quantile refuses more than 16 million values

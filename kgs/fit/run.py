@@ -123,7 +123,7 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> bool
     ):
 
         def after_step(trainer: Trainer, loss: float) -> bool:
-            bar.set_postfix(loss=f"{loss:.4f}", gaussians=len(trainer.model), refresh=False)
+            bar.set_postfix(loss=f"{loss:.4f}", gaussians=str(len(trainer.model)), refresh=False)
             bar.update()
             if checkpoint is not None and trainer.step in trainer.times.evaluate:
                 trainer.save(checkpoint)

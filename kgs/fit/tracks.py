@@ -23,7 +23,9 @@ __all__ = ["Tracks", "find_tracks"]
 SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
 MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
 MAX_RATIO = 0.8  # of the best descriptor distance to the second best
-MAX_DISTANCE = 0.4  # between descriptors of length 1: a match that has no rival on its epipolar line must still be alike
+MAX_DISTANCE = (
+    0.4  # between descriptors of length 1: a match that has no rival on its epipolar line must still be alike
+)
 
 
 @dataclass(frozen=True)

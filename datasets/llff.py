@@ -1,0 +1,108 @@
+"""LLFF scenes: `poses_bounds.npy` beside `images/` or `images_k/`.
+
+Source: https://github.com/Fyusion/LLFF, "Using your own poses without running COLMAP".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kgs.errors import DataError
+
+from .colmap import camera_to_world, track_points
+from .colmap_model import find_model, model_file, read_images
+from .frames import NO_POINTS, Frame, PointCloud, build_scene, split_frames
+from .images import Intrinsics, image_folder, list_images
+from .scene import Scene
+
+__all__ = ["load_llff"]
+
+
+def load_llff(
+    root: Path,
+    train_views: int | None = None,
+    downscale: float | None = None,
+    background: str = "black",
+    points: str = "none",
+) -> Scene:
+    """Load a scene whose poses stand in `poses_bounds.npy`, one row an image in the order of the names.
+
+    Convention:
+        A row is a 3x5 matrix and two depths. Its columns are the camera's down, right and backward axes and its
+        centre in the world, then height, width and focal length in pixels; the principal point is the image's
+        centre. The focal length is scaled to the images that are read.
+
+    Args:
+        root: the folder with `poses_bounds.npy` and `images/`, or else `images_k/` (the smallest k is taken).
+        train_views: how many views to train on (see `split_by_name`).
+        downscale: how many times smaller the images shall be.
+        background: "black" or "white", behind transparent images.
+        points: "none", or "model-points" for those points of the COLMAP model beside it that two training views
+            observe; its poses must be those of the file.
+
+    Raises:
+        DataError: the file is damaged, its rows are not as many as the images, or points are asked for and there is
+            no model that agrees.
+        ValueError: train_views is out of range.
+    """
+    source, folder = root / "poses_bounds.npy", image_folder(root)
+    rows = _read_rows(source)
+    if folder is None:
+        raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")
+    paths = list_images(folder)
+    if len(paths) != len(rows):
+        raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")
+    frames = [_frame(source, path, row) for path, row in zip(paths, rows, strict=True)]
+    train, test = split_frames(root, frames, train_views)
+    cloud = _model_points(root, frames, train) if points == "model-points" else NO_POINTS
+    return build_scene(root, [frames[i] for i in train], [frames[i] for i in test], downscale, background, cloud)
+
+
+def _read_rows(path: Path) -> NDArray[np.float64]:
+    """The rows `(N, 17)`; mapping the file checks its size before anything of that size is made."""
+    try:
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # numpy parses the header as Python source: damaged bytes raise whatever that raises
+        raise DataError(path, "", f"is no array that numpy can read ({error})") from error
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        got = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else type(rows).__name__
+        raise DataError(path, "", f"expected floating point numbers of shape (N, 17), got {got}")
+    rows = np.array(rows, dtype=np.float64)
+    for name, wrong in (
+        ("finite numbers", ~np.isfinite(rows).all(axis=1)),
+        ("a near depth below the far depth", ~(rows[:, 15] < rows[:, 16])),
+        ("a height and width of whole pixels", (rows[:, [4, 9]] < 1).any(axis=1) | (rows[:, [4, 9]] % 1).any(axis=1)),
+    ):
+        if wrong.any():
+            raise DataError(path, f"row {int(wrong.argmax())}", f"expected {name}")
+    return rows
+
+
+def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
+    matrix = row[:15].reshape(3, 5)
+    down, right, backward, center = matrix[:, 0], matrix[:, 1], matrix[:, 2], matrix[:, 3]
+    height, width, focal = matrix[:, 4]
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, down, -backward, center], axis=1)
+    lens = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
+    return Frame(source, path.name, path, lens, torch.from_numpy(pose))
+
+
+def _model_points(root: Path, frames: list[Frame], train: list[int]) -> PointCloud:
+    """The points of the COLMAP model that the poses were made from; its images pair with ours in order of name."""
+    folder = find_model(root)
+    if folder is None:
+        raise DataError(root, "points", "model-points need a COLMAP model in sparse/0 beside poses_bounds.npy")
+    images = sorted(read_images(model_file(folder, "images")).items(), key=lambda item: item[1].name)
+    if len(images) == len(frames):
+        given = torch.stack([frame.pose for frame in frames])
+        model = torch.stack([camera_to_world(image) for _, image in images])
+        span = (given[:, :3, 3] - given[:, :3, 3].mean(dim=0)).abs().max()
+        difference = (given - model).abs().amax(dim=0)
+        if bool((difference[:, :3] < 1e-3).all()) and bool((difference[:, 3] <= 1e-3 * span).all()):
+            return track_points(folder, {images[i][0] for i in train})
+    raise DataError(folder, "points", "model-points are not available: the model's poses are not those of the scene")

@@ -1,0 +1,257 @@
+"""The COLMAP loader, on models that pycolmap wrote."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kgs.datasets import Scene, Views, load_scene
+from kgs.errors import DataError
+
+WIDTH, HEIGHT, COUNT = 48, 32, 10
+FAR = np.array([100.0, -200.0, 0.0])  # the world is far from the origin, as georeferenced ones are
+WORLD_POINT = FAR + np.array([0.3, -0.2, 6.0])
+DISTORTED = {
+    "SIMPLE_RADIAL": [40.0, 24.3, 15.6, -0.1],
+    "RADIAL": [40.0, 24.3, 15.6, -0.1, 0.02],
+    "OPENCV": [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002],
+    "FULL_OPENCV": [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002, 0.01, 0.02, 0.01, 0.0],
+    "OPENCV_FISHEYE": [40.0, 42.0, 24.3, 15.6, 0.02, -0.01, 0.003, 0.001],
+}
+
+
+def poses(seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
+    """World-to-camera rotations and translations that look at `WORLD_POINT`, roughly."""
+    rng = np.random.default_rng(seed)
+    turns = [cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] for _ in range(COUNT)]
+    return [(turn, rng.normal(0, 0.4, 3) - FAR @ turn.T) for turn in turns]
+
+
+def pixel_of(rotation: np.ndarray, translation: np.ndarray, principal: tuple[float, float]) -> np.ndarray:
+    """The half-pixel coordinates of `WORLD_POINT` with a focal length of 40."""
+    x, y, z = rotation @ WORLD_POINT + translation
+    return np.array([40 * x / z + principal[0], 40 * y / z + principal[1]])
+
+
+def write_model(
+    root: Path, model: str = "PINHOLE", params: list[float] | None = None, text: bool = False, names: Any = None
+) -> None:
+    """A scene of ten black images; image i is called img{i}.png and has the id 100 - i, so ids sort backwards."""
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap writes the models")
+    scene = pycolmap.Reconstruction()
+    params = params or [40.0, 40.0, WIDTH / 2, HEIGHT / 2]
+    scene.add_camera_with_trivial_rig(
+        pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=7)
+    )
+    for i, (rotation, translation) in reversed(list(enumerate(poses()))):
+        name = names[i] if names else f"img{i}.png"
+        seen = pycolmap.Point2DList([pycolmap.Point2D(np.array([3.0, 4.0])) for _ in range(i % 3)])
+        image = pycolmap.Image(name=name, camera_id=7, image_id=100 - i, points2D=seen)
+        scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
+    # the first point is seen by images 1, 4 and 7, the second by 2 and 8
+    for position, color, views, slot in (
+        (WORLD_POINT, (255, 0, 51), (1, 4, 7), 0),
+        (WORLD_POINT + 1, (0, 51, 255), (2, 8), 1),
+    ):
+        track = pycolmap.Track()
+        for view in views:
+            track.add_element(100 - view, slot)
+        scene.add_point3D(np.asarray(position), track, np.array(color, np.uint8))
+    (root / "sparse" / "0").mkdir(parents=True)
+    (root / "images").mkdir()
+    (scene.write_text if text else scene.write_binary)(str(root / "sparse" / "0"))
+    for i in range(COUNT):
+        name = root / "images" / (names[i] if names else f"img{i}.png")
+        name.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(name), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
+
+
+def project(scene: Scene, views: Views, index: int) -> np.ndarray:
+    point = torch.from_numpy(WORLD_POINT) - scene.offset
+    return np.asarray(views.camera(index).project(point.float()[None, None])[0, 0])
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_what_pycolmap_wrote(tmp_path: Path, text: bool) -> None:
+    write_model(tmp_path, text=text)
+    scene = load_scene(tmp_path)
+    assert scene.train.names == tuple(f"img{i}.png" for i in (1, 2, 3, 4, 5, 6, 7, 9))
+    assert scene.test.names == ("img0.png", "img8.png")
+    given = poses()
+    for views in (scene.train, scene.test):
+        for row, name in enumerate(views.names):
+            i = int(name[3])
+            assert int(views.images[row].max() * 255 + 0.5) == i  # its own pixels
+            rotation, translation = given[i]
+            np.testing.assert_allclose(views.cameras.extrinsics[row, :3, :3], rotation, atol=1e-6)
+            recentred = translation + rotation @ scene.offset.numpy()
+            np.testing.assert_allclose(views.cameras.extrinsics[row, :3, 3], recentred, atol=1e-5)
+            expected = pixel_of(rotation, translation, (WIDTH / 2, HEIGHT / 2)) - 0.5
+            np.testing.assert_allclose(project(scene, views, row), expected, atol=1e-4)
+    assert scene.init_kind == "none"
+    assert len(scene.points) == 0
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_model_points_need_two_training_images(tmp_path: Path, text: bool) -> None:
+    write_model(tmp_path, text=text)
+    scene = load_scene(tmp_path, points="model-points")  # 8 is a test image: the second point has one view left
+    assert scene.init_kind == "model-points"
+    np.testing.assert_allclose((scene.points.double() + scene.offset).numpy(), [WORLD_POINT], atol=1e-5)
+    np.testing.assert_allclose(scene.point_colors, [[1.0, 0.0, 0.2]], atol=1e-6)
+    assert load_scene(tmp_path, 6).train.names == tuple(f"img{i}.png" for i in (1, 2, 4, 5, 7, 9))
+    assert len(load_scene(tmp_path, 6, points="model-points").points) == 1
+    assert load_scene(tmp_path, 3).train.names == ("img1.png", "img5.png", "img9.png")
+    assert len(load_scene(tmp_path, 3, points="model-points").points) == 0
+
+
+@pytest.mark.parametrize("downscale", [None, 2])
+def test_a_dot_is_where_the_camera_sees_its_point(tmp_path: Path, downscale: int | None) -> None:
+    """The half pixel: a dot is drawn where COLMAP's rule puts the point, and found where Kornia's camera puts it."""
+    step = downscale or 1
+    column, row = 11, 8  # of the image that is loaded
+    rotation, translation = poses()[1]
+    x, y, z = rotation @ WORLD_POINT + translation
+    principal = [(column + 0.5) * step - 40 * x / z, (row + 0.5) * step - 40 * y / z]
+    write_model(tmp_path, params=[40.0, 40.0, *principal])
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[row * step : (row + 1) * step, column * step : (column + 1) * step] = 255
+    cv2.imwrite(str(tmp_path / "images" / "img1.png"), image)
+    scene = load_scene(tmp_path, downscale=downscale)
+    found = torch.nonzero(scene.train.images[0, 0] > 0.99)
+    assert found.tolist() == [[row, column]]
+    np.testing.assert_allclose(project(scene, scene.train, 0), [column, row], atol=1e-4)
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_distorted_lenses_become_pinholes(tmp_path: Path, model: str) -> None:
+    """Ramps say where each pixel comes from; pycolmap's own projection says where it should."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_model(tmp_path, model, DISTORTED[model])
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    ramps = np.stack([np.zeros_like(rows), rows * 1000, columns * 1000], axis=2).astype(np.uint16)  # red: columns
+    cv2.imwrite(str(tmp_path / "images" / "img1.png"), ramps)
+    scene = load_scene(tmp_path)
+    matrix = scene.train.cameras.intrinsics[0, :3, :3].double()
+    pixels = torch.from_numpy(np.stack([columns, rows, np.ones_like(rows)], axis=2).reshape(-1, 3)).double()
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=DISTORTED[model])
+    expected = camera.img_from_cam((pixels @ torch.linalg.inv(matrix).T).numpy()) - 0.5
+    got = scene.train.images[0, :2].permute(1, 2, 0).reshape(-1, 2).numpy() * 65.535
+    np.testing.assert_allclose(got, expected, atol=0.02)
+
+
+def test_several_lenses_and_names_with_spaces_and_folders(tmp_path: Path) -> None:
+    names = [f"cam {i % 2}/img {i}.png" for i in range(COUNT)]
+    write_model(tmp_path, text=True, names=names)
+    cameras = tmp_path / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text() + f"9 SIMPLE_PINHOLE {WIDTH} {HEIGHT} 55 20 10\n")
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace(" 7 cam 1/", " 9 cam 1/"))
+    scene = load_scene(tmp_path)
+    focal = dict(zip(scene.train.names, scene.train.cameras.fx.tolist(), strict=True))
+    assert focal["cam 1/img 3.png"] == 55
+    assert focal["cam 0/img 4.png"] == 40
+    assert float(scene.train.cameras.cx[-1]) == 19.5
+
+
+def test_intrinsics_follow_the_size_of_the_images(tmp_path: Path) -> None:
+    write_model(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
+    scene = load_scene(tmp_path)
+    assert float(scene.train.cameras.fx[0]) == 20.0
+    assert float(scene.train.cameras.cx[0]) == WIDTH / 4 - 0.5
+    cv2.imwrite(str(tmp_path / "images" / "img4.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(DataError, match=r"img4\.png.*expected 24x16.*got 48x32"):
+        load_scene(tmp_path)
+    cv2.imwrite(str(tmp_path / "images" / "img4.png"), np.zeros((WIDTH, HEIGHT, 3), np.uint8))
+    with pytest.raises(DataError, match=r"img4\.png.*no scaled version"):
+        load_scene(tmp_path)
+
+
+def test_all_missing_images_are_named_at_once_and_extra_ones_do_no_harm(tmp_path: Path) -> None:
+    write_model(tmp_path)
+    before = load_scene(tmp_path)
+    cv2.imwrite(str(tmp_path / "images" / "aaa.png"), np.zeros((5, 5, 3), np.uint8))
+    assert load_scene(tmp_path).train.names == before.train.names
+    for i in (2, 5, 8):
+        (tmp_path / "images" / f"img{i}.png").unlink()
+    with pytest.raises(DataError, match=r"3 of 10 images.*img2\.png.*img5\.png.*img8\.png"):
+        load_scene(tmp_path)
+
+
+def test_test_poses_never_reach_the_training_cameras(tmp_path: Path) -> None:
+    write_model(tmp_path, text=True)
+    before = load_scene(tmp_path, points="model-points")
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    lines = images.read_text().split("\n")
+    for i, line in enumerate(lines):
+        if line.endswith(("img0.png", "img8.png")):
+            number, name = line.split()[0], line.split()[-1]
+            lines[i] = f"{number} 0.5 0.5 0.5 0.5 17 -3 900 7 {name}"
+    images.write_text("\n".join(lines))
+    for i in (0, 8):
+        cv2.imwrite(str(tmp_path / "images" / f"img{i}.png"), np.full((HEIGHT, WIDTH, 3), 200, np.uint8))
+    after = load_scene(tmp_path, points="model-points")
+    assert not torch.equal(before.test.cameras.extrinsics, after.test.cameras.extrinsics)
+    assert torch.equal(before.offset, after.offset)
+    assert torch.equal(before.train.cameras.extrinsics, after.train.cameras.extrinsics)
+    assert torch.equal(before.train.images, after.train.images)
+    assert torch.equal(before.points, after.points)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("cameras", "PINHOLE", "FOV", "FOV cannot be read"),
+        ("cameras", " 40 40 ", " 40 ", "3 parameters do not fit PINHOLE"),
+        ("cameras", " 40 40 ", " forty 40 ", "line"),
+        ("cameras", " 40 40 ", " -40 40 ", "focal length"),
+        ("cameras", " 40 40 ", " nan 40 ", "finite"),
+        ("cameras", "\n7 ", "\n8 ", "camera 7, which cameras.txt lacks"),
+        ("images", " 7 img3.png", " 7 ../img3.png", "inside the scene"),
+        ("images", " 7 img3.png", " 7 /img3.png", "inside the scene"),
+        ("images", " 7 img3.png", " 7 C:\\img3.png", "inside the scene"),
+        ("images", " 7 img3.png", " 7 img4.png", "img4.png.*2 times"),
+        ("images", "\n97 ", "\n96 ", "image 96: is there twice"),
+        ("images", " 7 img3.png", " seven img3.png", "line"),
+    ],
+)
+def test_text_models_that_are_wrong(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+    write_model(tmp_path, text=True)
+    path = tmp_path / "sparse" / "0" / f"{file}.txt"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("pose", ["0 0 0 0 1 2 3", "nan 0 0 1 1 2 3", "1 0 0 0 inf 2 3"])
+def test_poses_that_are_none(tmp_path: Path, pose: str) -> None:
+    write_model(tmp_path, text=True)
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    lines = [f"97 {pose} 7 img3.png" if line.endswith("img3.png") else line for line in path.read_text().split("\n")]
+    path.write_text("\n".join(lines))
+    with pytest.raises(DataError, match=r"img3\.png.*finite 4x4 pose"):
+        load_scene(tmp_path)
+
+
+def test_real_scene() -> None:
+    if "KGS_DATA" not in os.environ:
+        pytest.skip("KGS_DATA is not set: no real scenes")
+    scene = load_scene(Path(os.environ["KGS_DATA"]) / "colmap" / "trex", 3, points="model-points")
+    assert scene.train.names == ("img002.jpg", "img029.jpg", "img055.jpg")
+    assert len(scene.test) == 7
+    assert scene.train.images.shape == (3, 3, 375, 501)
+    assert float(scene.train.cameras.cx[0]) == pytest.approx(250.82686 - 0.5, abs=1e-4)
+    # the points are in front of the training cameras and most of them inside their images
+    pixels = scene.train.camera(0).project(scene.points[None])[0]
+    inside = ((pixels > 0) & (pixels < torch.tensor([500.0, 374.0]))).all(dim=1)
+    assert len(scene.points) > 1000
+    assert inside.float().mean() > 0.7

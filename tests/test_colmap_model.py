@@ -1,0 +1,77 @@
+"""The readers of COLMAP's files, on bytes packed by hand from the format's description, whole and damaged."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from kgs.datasets.colmap_model import read_cameras, read_images, read_points
+from kgs.errors import DataError
+
+CAMERA = struct.pack("<QIiQQ4d", 1, 3, 1, 8, 6, 5.0, 6.0, 4.0, 3.0)
+IMAGES = (
+    struct.pack("<QI7dI", 1, 9, 1, 0, 0, 0, 0.5, 0.25, 2, 3)
+    + "bücher/ä.png".encode()
+    + b"\0"
+    + struct.pack("<Qddq", 1, 1.0, 2.0, -1)
+)
+POINTS = struct.pack("<QQ3d3BdQ4I", 1, 77, 1.0, 2.0, 3.0, 10, 20, 30, 0.5, 2, 9, 0, 4, 1)
+
+
+def packed(folder: Path, name: str, data: bytes) -> Path:
+    (folder / name).write_bytes(data)
+    return folder / name
+
+
+def test_hand_packed_bytes(tmp_path: Path) -> None:
+    camera = read_cameras(packed(tmp_path, "cameras.bin", CAMERA))[3]
+    assert (camera.model, camera.width, camera.height, camera.params) == ("PINHOLE", 8, 6, (5.0, 6.0, 4.0, 3.0))
+    image = read_images(packed(tmp_path, "images.bin", IMAGES))[9]
+    assert (image.name, image.camera_id) == ("bücher/ä.png", 3)
+    assert (image.quat, image.translation) == ((1, 0, 0, 0), (0.5, 0.25, 2))
+    path = packed(tmp_path, "points3D.bin", POINTS)
+    points, colors = read_points(path, {4, 9})
+    assert (points.tolist(), colors.tolist()) == ([[1.0, 2.0, 3.0]], [[10, 20, 30]])
+    assert read_points(path, {4, 5})[0].shape == (0, 3)
+
+
+@pytest.mark.parametrize(("name", "data"), [("cameras.bin", CAMERA), ("images.bin", IMAGES), ("points3D.bin", POINTS)])
+def test_every_truncation_and_any_extra_byte_is_noticed(tmp_path: Path, name: str, data: bytes) -> None:
+    def read(path: Path) -> None:
+        if "points" in name:
+            read_points(path, {4, 9})
+        else:
+            (read_cameras if "cameras" in name else read_images)(path)
+
+    for broken in [data[:size] for size in range(len(data))] + [data + b"\0"]:
+        with pytest.raises(DataError, match=name):
+            read(packed(tmp_path, name, broken))
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("count", [2**40, 2**64 - 1])
+def test_a_lying_count_is_held_against_the_file(tmp_path: Path, name: str, count: int) -> None:
+    path = packed(tmp_path, name, struct.pack("<Q", count) + b"\0" * 100)
+    with pytest.raises(DataError, match=r"needs \d+ bytes"):
+        read_points(path, {1}) if "points" in name else (read_cameras if "cam" in name else read_images)(path)
+
+
+def test_lying_lengths_within(tmp_path: Path) -> None:
+    track = POINTS[:-24] + struct.pack("<Q4I", 2**61, 9, 0, 4, 1)
+    with pytest.raises(DataError, match="track"):
+        read_points(packed(tmp_path, "points3D.bin", track), {4, 9})
+    endless = IMAGES[:72] + b"x" * 10_000
+    with pytest.raises(DataError, match="zero byte"):
+        read_images(packed(tmp_path, "images.bin", endless))
+    latin = IMAGES.replace("ä".encode(), b"\xe4\xe4")
+    with pytest.raises(DataError, match="UTF-8"):
+        read_images(packed(tmp_path, "images.bin", latin))
+
+
+@pytest.mark.parametrize(("number", "name"), [(7, "FOV"), (10, "THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "-1")])
+def test_camera_models_that_cannot_be_read_are_named(tmp_path: Path, number: int, name: str) -> None:
+    data = struct.pack("<QIiQQ5d", 1, 3, number, 8, 6, 5.0, 4.0, 3.0, 0.1, 0.0)
+    with pytest.raises(DataError, match=name):
+        read_cameras(packed(tmp_path, "cameras.bin", data))

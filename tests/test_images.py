@@ -1,0 +1,173 @@
+"""Reading, undistorting and reducing images, against OpenCV's projection and counting by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from kgs.datasets.images import Intrinsics, image_folder, list_images, read_image, resize, undistort
+from kgs.errors import DataError
+
+WIDTH, HEIGHT = 120, 90
+
+
+def blob(x: float, y: float, sigma: float = 2.0) -> np.ndarray:
+    """A Gaussian spot at (x, y), integer pixel centres, `(H, W, 1)`."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return np.asarray(np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2)), dtype=np.float32)
+
+
+def centroid(image: np.ndarray) -> np.ndarray:
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    return np.array([(image * columns).sum() / image.sum(), (image * rows).sum() / image.sum()])
+
+
+def lens(*distortion: float, fisheye: bool = False) -> Intrinsics:
+    return Intrinsics(WIDTH, HEIGHT, 100.0, 98.0, 58.0, 47.0, distortion, fisheye)
+
+
+def test_colours_come_as_rgb(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((2, 3, 3), (255, 51, 0), np.uint8))  # blue, green, red
+    image = read_image(tmp_path / "a.png")
+    assert image.shape == (2, 3, 3)
+    assert image.dtype == np.float32
+    np.testing.assert_array_equal(image[0, 0], np.array([0, 0.2, 1], np.float32))
+
+
+def test_alpha_grey_and_16_bit(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "rgba.png"), np.full((2, 3, 4), (255, 0, 0, 200), np.uint8))
+    np.testing.assert_allclose(read_image(tmp_path / "rgba.png")[1, 2], [0, 0, 1, 200 / 255], rtol=1e-6)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((2, 3), 51, np.uint8))
+    np.testing.assert_allclose(read_image(tmp_path / "grey.png"), np.full((2, 3, 3), 0.2), rtol=1e-6)
+    cv2.imwrite(str(tmp_path / "deep.png"), np.full((2, 3, 3), 13107, np.uint16))
+    np.testing.assert_allclose(read_image(tmp_path / "deep.png"), np.full((2, 3, 3), 0.2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.98])
+def test_a_truncated_image_is_named(tmp_path: Path, suffix: str, kept: float) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    path = tmp_path / f"cut{suffix}"
+    cv2.imwrite(str(path), noise)
+    assert read_image(path).shape == (40, 60, 3)
+    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+    with pytest.raises(DataError, match=r"cut\."):
+        read_image(path)
+
+
+def test_float_images_and_missing_files_are_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.tif"), np.zeros((2, 2), np.float32))
+    with pytest.raises(DataError, match="8 or 16 bit"):
+        read_image(tmp_path / "a.tif")
+    with pytest.raises(DataError, match=r"nowhere\.png"):
+        read_image(tmp_path / "nowhere.png")
+
+
+def test_folders(tmp_path: Path) -> None:
+    assert image_folder(tmp_path) is None
+    for name in ("images_8", "images_4", "images_16", "images_old"):
+        (tmp_path / name).mkdir()
+    assert image_folder(tmp_path) == tmp_path / "images_4"
+    (tmp_path / "images").mkdir()
+    assert image_folder(tmp_path) == tmp_path / "images"
+    for name in ("b.JPG", "a10.png", "a2.png", ".hidden.png", "notes.txt"):
+        (tmp_path / "images" / name).touch()
+    assert [p.name for p in list_images(tmp_path / "images")] == ["a10.png", "a2.png", "b.JPG"]
+
+
+def test_reducing_takes_the_mean_and_scales_each_axis_by_its_exact_ratio() -> None:
+    image = np.random.default_rng(0).random((HEIGHT, WIDTH, 3)).astype(np.float32)
+    small, result = resize(image, lens(), WIDTH // 2, HEIGHT // 3)
+    expected = image.reshape(HEIGHT // 3, 3, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(small, expected, atol=1e-6)
+    assert (result.width, result.height, result.fx, result.fy) == (60, 30, 50.0, 98.0 / 3)
+    # a point keeps its place: (u + 1/2) / W is the same in both images
+    x, y = result.matrix()[:2, 2]
+    np.testing.assert_allclose([(x + 0.5) / 60, (y + 0.5) / 30], [58 / WIDTH, 47 / HEIGHT])
+
+
+def test_reducing_by_a_fraction_moves_a_spot_as_its_camera_says() -> None:
+    small, result = resize(blob(50.0, 31.0, 4.0), lens(), 77, 58)
+    ray = (np.array([50.0, 31.0]) - lens().matrix()[:2, 2]) / (100.0, 98.0)
+    expected = ray * (result.fx, result.fy) + result.matrix()[:2, 2]
+    np.testing.assert_allclose(centroid(small), expected, atol=2e-3)
+
+
+def sources(result: np.ndarray) -> np.ndarray:
+    """Where the pixels of an undistorted `ramps` come from, `(H, W, 2)` in pixels."""
+    return np.asarray(result * np.array([WIDTH, HEIGHT]))
+
+
+def ramps() -> np.ndarray:
+    """An image whose two channels say x / W and y / H; bilinear resampling keeps it exact."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    return np.stack([columns / WIDTH, rows / HEIGHT], axis=2)
+
+
+def rays(pinhole: Intrinsics) -> np.ndarray:
+    """The direction of each pixel, `(H * W, 3)`, z = 1."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=2).reshape(-1, 3)
+    return np.asarray(pixels @ np.linalg.inv(pinhole.matrix()).T)
+
+
+@pytest.mark.parametrize(
+    "coefficients",
+    [(-0.2, 0.03, 0.0, 0.0), (0.15, 0.02, 0.004, -0.006), (-0.3, 0.1, 0.002, 0.001, 0.02, 0.05, 0.01, 0.0)],
+)
+def test_undistortion_is_the_inverse_of_opencvs_projection(coefficients: tuple[float, ...]) -> None:
+    given = lens(*coefficients)
+    result, pinhole = undistort(ramps(), given)
+    expected = cv2.projectPoints(rays(pinhole), np.zeros(3), np.zeros(3), given.matrix(), np.array(coefficients))[0]
+    # half a pixel in the principal point would show as 0.1 px; OpenCV interpolates in steps of 1/32 px
+    np.testing.assert_allclose(sources(result), expected.reshape(HEIGHT, WIDTH, 2), atol=0.02)
+    assert not pinhole.distortion
+
+
+@pytest.mark.parametrize("coefficients", [(0.0, 0.0, 0.0, 0.0), (0.05, -0.01, 0.002, 0.0)])
+def test_fisheye_undistortion_also_with_all_coefficients_zero(coefficients: tuple[float, ...]) -> None:
+    k1, k2, k3, _ = coefficients
+    given = lens(*coefficients, fisheye=True)
+    result, pinhole = undistort(ramps(), given)
+    xy = rays(pinhole)[:, :2]
+    radius = np.hypot(*xy.T)[:, None]
+    theta = np.arctan(radius)
+    bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6)
+    expected = xy / radius * bent * (given.fx, given.fy) + given.matrix()[:2, 2]
+    np.testing.assert_allclose(sources(result), expected.reshape(HEIGHT, WIDTH, 2), atol=0.02)
+    assert not pinhole.fisheye
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.0, 0.1, 0.3])
+def test_no_pixel_of_an_undistorted_image_is_blank_or_smeared(k1: float) -> None:
+    """Every pixel of the result looks at a place inside the photo; barrel lenses keep their focal length."""
+    _, pinhole = undistort(blob(60.0, 45.0), lens(k1, 0.0, 0.0, 0.0))
+    distortion = np.array([k1, 0.0, 0.0, 0.0])
+    pixels = cv2.projectPoints(rays(pinhole), np.zeros(3), np.zeros(3), lens().matrix(), distortion)[0][:, 0]
+    assert (pixels >= -1e-3).all()
+    assert (pixels <= np.array([WIDTH - 1, HEIGHT - 1]) + 1e-3).all()
+    assert pinhole.fx == 100.0 if k1 <= 0 else 100.0 < pinhole.fx < 150.0
+    assert pinhole.fy / pinhole.fx == pytest.approx(0.98)
+
+
+def test_no_distortion_changes_nothing() -> None:
+    image = blob(30.0, 30.0)
+    result, pinhole = undistort(image, lens(0.0, 0.0, 0.0, 0.0))
+    assert result is image
+    assert pinhole == lens()
+
+
+def test_distortion_that_folds_the_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="folds"):
+        undistort(blob(30.0, 30.0), lens(-3.0, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="folds"):
+        undistort(blob(30.0, 30.0), lens(40.0, 0.0, 0.0, 0.0))
+
+
+def test_sizes_that_can_be_scaled_versions() -> None:
+    full = Intrinsics(4032, 3024, 3000.0, 3000.0, 2016.0, 1512.0)
+    assert all(full.same_aspect(*size) for size in ((504, 378), (501, 376), (1008, 756), (4032, 3024), (253, 190)))
+    assert not any(full.same_aspect(*size) for size in ((3024, 4032), (504, 370), (500, 378)))

@@ -1,0 +1,272 @@
+"""Pixels and Jacobians against OpenCV, finite differences of Kornia, and the tangent clamp by its definition."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.vector import Vector3
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
+
+from kgs import PosedCamera
+from kgs.lenses import image_size, lenses
+
+HEIGHT, WIDTH = 48, 64
+INTRINSICS = [50.0, 55.0, 30.0, 25.0]  # fx fy cx cy, off centre
+PARAMS = {
+    CameraModelType.PINHOLE: INTRINSICS,
+    CameraModelType.BROWN_CONRADY: [*INTRINSICS, 0.1, -0.05, 0.003, -0.002, 0.01, 0.02, 0.03, 0.01],
+    CameraModelType.KANNALA_BRANDT_K3: [*INTRINSICS, 0.1, -0.05, 0.003, -0.002],
+    CameraModelType.ORTHOGRAPHIC: [10.0, 11.0, 30.0, 25.0],
+}
+KINDS = list(PARAMS)
+PERSPECTIVE = KINDS[:3]
+CLAMPED = KINDS[:2]
+
+
+def posed(kind, params=None, cameras=1, dtype=torch.float64):
+    params = torch.tensor(PARAMS[kind], dtype=dtype) if params is None else params
+    return PosedCamera(
+        CameraModel(ImageSize(HEIGHT, WIDTH), kind, params), torch.eye(4, dtype=dtype).repeat(cameras, 1, 1)
+    )
+
+
+def pinhole(intrinsics=INTRINSICS, skew=0.0, cameras=1, size=(HEIGHT, WIDTH), dtype=torch.float64):
+    fx, fy, cx, cy = intrinsics
+    k = torch.tensor([[fx, skew, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=dtype)
+    sizes = (torch.full((cameras,), value) for value in size)
+    return PinholeCamera(k.repeat(cameras, 1, 1), torch.eye(4, dtype=dtype).repeat(cameras, 1, 1), *sizes)
+
+
+def points(n=20, spread=0.45, seed=0, dtype=torch.float64):
+    """In front of the camera, with |x/z| and |y/z| below `spread`."""
+    random = torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    z = 1 + 3 * random[:, 2:]
+    return torch.cat([spread * (2 * random[:, :2] - 1) * z, z], 1).to(dtype)
+
+
+def all_cameras():
+    return [pytest.param(pinhole(), id="pinhole"), pytest.param(pinhole(skew=3.0), id="skew")] + [
+        pytest.param(posed(kind), id=kind.name) for kind in KINDS
+    ]
+
+
+def kornia_pixels(cameras, at):
+    if isinstance(cameras, PinholeCamera):
+        return cameras.project(at[None])[0]
+    return cameras.model.project(Vector3(at)).data
+
+
+# -- pixels and Jacobians inside the field of view -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cameras", all_cameras())
+def test_pixels_are_kornias_and_jacobians_their_finite_differences(cameras):
+    (lens,) = lenses(cameras)
+    at, step = points(), 1e-6
+    torch.testing.assert_close(lens.project(at, at), kornia_pixels(cameras, at), rtol=0, atol=0)
+    columns = []
+    for axis in range(3):
+        shift = step * torch.eye(3, dtype=torch.float64)[axis]
+        columns.append((kornia_pixels(cameras, at + shift) - kornia_pixels(cameras, at - shift)) / (2 * step))
+    torch.testing.assert_close(lens.jacobian(at), torch.stack(columns, 2), rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", PERSPECTIVE)
+def test_pixels_and_jacobians_are_opencvs(kind):
+    """OpenCV differentiates with respect to the translation, which is the point itself while nothing is turned."""
+    (lens,) = lenses(posed(kind))
+    at, zero = points(), np.zeros(3)
+    k = np.array([[50.0, 0, 30], [0, 55, 25], [0, 0, 1]])
+    distortion = np.array(PARAMS[kind][4:])
+    if kind is CameraModelType.KANNALA_BRANDT_K3:
+        pixels, jacobian = cv2.fisheye.projectPoints(at.numpy()[None], zero, zero, k, distortion)
+        columns = jacobian[:, 11:14]
+    else:
+        pixels, jacobian = cv2.projectPoints(at.numpy(), zero, zero, k, distortion if len(distortion) else None)
+        columns = jacobian[:, 3:6]
+    expected = torch.from_numpy(pixels.reshape(-1, 2))
+    torch.testing.assert_close(lens.project(at, at), expected, rtol=0, atol=1e-10)
+    torch.testing.assert_close(lens.jacobian(at), torch.from_numpy(columns).reshape(-1, 2, 3), rtol=1e-8, atol=1e-8)
+
+
+def test_skew_by_hand():
+    (lens,) = lenses(pinhole(skew=3.0))
+    at = torch.tensor([[0.2, 0.4, 2.0]], dtype=torch.float64)
+    pixel = torch.tensor([[50 * 0.1 + 3 * 0.2 + 30, 55 * 0.2 + 25]], dtype=torch.float64)
+    jacobian = torch.tensor([[[25, 1.5, -(50 * 0.1 + 3 * 0.2) / 2], [0, 27.5, -55 * 0.2 / 2]]], dtype=torch.float64)
+    torch.testing.assert_close(lens.project(at, at), pixel)
+    torch.testing.assert_close(lens.jacobian(at), jacobian)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parameters_of_one_camera_or_of_each(kind):
+    base = torch.tensor(PARAMS[kind], dtype=torch.float64)
+    rows = torch.stack([base, base * 1.1, base * 0.9])
+    at = points()
+    for shared in (base, base[None]):
+        for lens in lenses(posed(kind, shared, cameras=3)):
+            torch.testing.assert_close(lens.project(at, at), kornia_pixels(posed(kind, base), at), rtol=0, atol=0)
+    for lens, row in zip(lenses(posed(kind, rows, cameras=3)), rows, strict=True):
+        (single,) = lenses(posed(kind, row))
+        torch.testing.assert_close(lens.project(at, at), kornia_pixels(posed(kind, row), at), rtol=0, atol=0)
+        assert torch.equal(lens.jacobian(at), single.jacobian(at))
+
+
+def test_only_orthographic_rays_are_parallel():
+    assert [lenses(posed(kind))[0].parallel for kind in KINDS] == [False, False, False, True]
+    assert not lenses(pinhole())[0].parallel
+
+
+@pytest.mark.parametrize("kind", PERSPECTIVE)
+def test_on_the_optical_axis_everything_is_finite(kind):
+    (lens,) = lenses(posed(kind))
+    at = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64, requires_grad=True)
+    expected = torch.tensor([[[25, 0, 0], [0, 27.5, 0]]], dtype=torch.float64)
+    jacobian = lens.jacobian(at)
+    torch.testing.assert_close(jacobian.detach(), expected)
+    (jacobian.sum() + lens.project(at, at).sum()).backward()
+    assert at.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("cameras", all_cameras())
+def test_without_gradients_the_values_are_the_same_and_no_graph_is_left(cameras):
+    (lens,) = lenses(cameras)
+    at = points(spread=1.5)
+    expected = lens.jacobian(at.clone().requires_grad_())
+    assert expected.requires_grad or lens.parallel
+    for context in (torch.no_grad, torch.inference_mode):
+        with context():
+            got = lens.jacobian(at)
+            assert torch.equal(got, expected)
+            assert not got.requires_grad
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_float32_stays_float32_and_is_close(kind):
+    (lens,), (exact,) = lenses(posed(kind, dtype=torch.float32)), lenses(posed(kind))
+    at = points(spread=1.5, dtype=torch.float32)
+    assert lens.jacobian(at).dtype == lens.project(at, at).dtype == torch.float32
+    torch.testing.assert_close(lens.jacobian(at).double(), exact.jacobian(at.double()), rtol=1e-4, atol=1e-4)
+
+
+# -- the tangent clamp ---------------------------------------------------------------------------------------------
+
+
+def far_points():
+    """Tangents on all sides of the limits, which are (pixel coordinates of the widened image - centre) / focal."""
+    tangents = torch.tensor([-3.0, -1.1, -0.85, -0.4, 0.3, 0.8, 0.9, 1.05, 3.0], dtype=torch.float64)
+    x, y = (t.flatten() for t in torch.meshgrid(tangents, tangents, indexing="ij"))
+    z = torch.linspace(0.5, 4, len(x), dtype=torch.float64)
+    return torch.stack([x * z, y * z, z], 1)
+
+
+def pulled_in(at):
+    """The points at the same depth whose undistorted pixels lie at most 15 % of the size beyond the image's border."""
+    fx, fy, cx, cy = INTRINSICS
+    u = (fx * at[:, 0] / at[:, 2] + cx).clamp(-0.5 - 0.15 * WIDTH, WIDTH - 0.5 + 0.15 * WIDTH)
+    v = (fy * at[:, 1] / at[:, 2] + cy).clamp(-0.5 - 0.15 * HEIGHT, HEIGHT - 0.5 + 0.15 * HEIGHT)
+    return torch.stack([(u - cx) / fx * at[:, 2], (v - cy) / fy * at[:, 2], at[:, 2]], 1)
+
+
+def unclamped(cameras, at):
+    at = at.clone().requires_grad_()
+    pixels = kornia_pixels(cameras, at)
+    return torch.stack([torch.autograd.grad(pixels[:, i].sum(), at, retain_graph=True)[0] for i in (0, 1)], 1)
+
+
+@pytest.mark.parametrize(
+    "cameras", [pinhole(), pinhole(skew=3.0), *map(posed, CLAMPED)], ids=["pinhole", "skew", "PINHOLE", "BROWN_CONRADY"]
+)
+def test_beyond_the_limits_the_jacobian_is_taken_at_the_limit_but_the_pixel_is_not(cameras):
+    (lens,) = lenses(cameras)
+    at = far_points()
+    inside = (at - pulled_in(at)).abs().amax(1) < 1e-12
+    assert 0 < inside.sum() < len(at)
+    torch.testing.assert_close(lens.jacobian(at), unclamped(cameras, pulled_in(at)), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(lens.jacobian(at)[inside], unclamped(cameras, at[inside]), rtol=1e-10, atol=1e-10)
+    assert torch.equal(lens.project(at, at), kornia_pixels(cameras, at))
+
+
+@pytest.mark.parametrize("kind", [CameraModelType.KANNALA_BRANDT_K3, CameraModelType.ORTHOGRAPHIC])
+def test_fisheye_and_orthographic_have_no_limits(kind):
+    (lens,) = lenses(posed(kind))
+    at = far_points()
+    torch.testing.assert_close(lens.jacobian(at), unclamped(posed(kind), at), rtol=1e-10, atol=1e-10)
+
+
+def test_without_distortion_brown_conrady_is_pinhole():
+    (plain,), (model,) = lenses(pinhole()), lenses(posed(CameraModelType.PINHOLE))
+    params = torch.tensor([*INTRINSICS, *[0.0] * 8], dtype=torch.float64)
+    (distorted,) = lenses(posed(CameraModelType.BROWN_CONRADY, params))
+    at = far_points()
+    for lens in (model, distorted):
+        torch.testing.assert_close(lens.project(at, at), plain.project(at, at), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(lens.jacobian(at), plain.jacobian(at), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("cameras", all_cameras()[:-1])  # the last one's Jacobian, orthographic, is constant
+def test_gradcheck_with_respect_to_points_on_both_sides_of_the_limits(cameras):
+    (lens,) = lenses(cameras)
+    at = far_points()[::7].requires_grad_()
+    assert torch.autograd.gradcheck(lens.jacobian, at, eps=1e-6, atol=1e-6)
+    assert torch.autograd.gradcheck(lambda x: lens.project(x, x), at, eps=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("points_too", [True, False])
+def test_gradcheck_with_respect_to_the_parameters_inside_the_limits(kind, points_too):
+    at = points(3).requires_grad_(points_too)
+    params = torch.tensor(PARAMS[kind], dtype=torch.float64, requires_grad=True)
+
+    def both(params, at):
+        (lens,) = lenses(posed(kind, params))
+        return lens.project(at, at), lens.jacobian(at)
+
+    assert torch.autograd.gradcheck(both, (params, at), eps=1e-6, atol=1e-6)
+
+
+def test_gradcheck_with_respect_to_the_pinhole_intrinsics_inside_the_limits():
+    camera, at = pinhole(skew=3.0), points(3)
+
+    def both(k):
+        (lens,) = lenses(PinholeCamera(k, camera.extrinsics, camera.height, camera.width))
+        return lens.project(at, at), lens.jacobian(at)
+
+    assert torch.autograd.gradcheck(both, camera.intrinsics.clone().requires_grad_(), eps=1e-6, atol=1e-6)
+
+
+def test_the_limits_are_constants():
+    """Beyond them only 1/z and the focal length itself are differentiated, not the border that moves with them."""
+    params = torch.tensor(INTRINSICS, dtype=torch.float64, requires_grad=True)
+    (lens,) = lenses(posed(CameraModelType.PINHOLE, params))
+    lens.jacobian(torch.tensor([[6.0, 0.2, 2.0]], dtype=torch.float64))[0, 0, 2].backward()
+    limit = (WIDTH - 0.5 - 30 + 0.15 * WIDTH) / 50
+    torch.testing.assert_close(params.grad, torch.tensor([-limit / 2, 0, 0, 0], dtype=torch.float64))
+
+
+# -- sizes ---------------------------------------------------------------------------------------------------------
+
+
+def test_image_size_is_height_and_width():
+    assert image_size(pinhole(cameras=3)) == (HEIGHT, WIDTH)
+    assert image_size(posed(CameraModelType.PINHOLE, cameras=3)) == (HEIGHT, WIDTH)
+
+
+def test_size_errors():
+    two = pinhole(cameras=2)
+    for height, width in (([4, 5], [6, 6]), ([4, 4], [6, 7])):
+        cameras = PinholeCamera(two.intrinsics, two.extrinsics, torch.tensor(height), torch.tensor(width))
+        with pytest.raises(ValueError, match="one image size"):
+            image_size(cameras)
+    with pytest.raises(ValueError, match="positive image size, got 0x64"):
+        image_size(pinhole(size=(0, WIDTH)))
+
+
+@pytest.mark.parametrize(
+    "wrong", [None, torch.eye(4), posed(CameraModelType.PINHOLE).model], ids=["None", "tensor", "model"]
+)
+def test_other_cameras_are_a_type_error(wrong):
+    with pytest.raises(TypeError, match="cameras: expected a kornia PinholeCamera or a kgs.PosedCamera"):
+        image_size(wrong)

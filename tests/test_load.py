@@ -1,0 +1,142 @@
+"""`load_scene` tells the layouts apart, refuses what is none, and real scenes obey epipolar geometry."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kgs.datasets import Views, load_scene
+from kgs.errors import DataError
+
+
+def photos(folder: Path, count: int = 3) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        cv2.imwrite(str(folder / f"{i}.jpg"), np.zeros((4, 6, 3), np.uint8))
+
+
+@pytest.mark.parametrize("folder", [".", "images", "images_4"])
+def test_bare_photos_are_answered_with_what_is_needed(tmp_path: Path, folder: str) -> None:
+    photos(tmp_path / folder)
+    with pytest.raises(DataError, match=r"3 photos but no camera poses.*COLMAP.*ns-process-data") as error:
+        load_scene(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_other_folders_are_answered_with_what_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"poses_bounds\.npy.*sparse/0.*transforms_train\.json.*transforms\.json"):
+        load_scene(tmp_path)
+    with pytest.raises(DataError, match="there is none"):
+        load_scene(tmp_path / "nowhere")
+    (tmp_path / "transforms.json").touch()
+    with pytest.raises(DataError, match="got a file"):
+        load_scene(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize(
+    ("files", "reason"),
+    [
+        (["poses_bounds.npy", "sparse/0/images.bin", "transforms.json"], r"poses_bounds\.npy"),
+        (["sparse/0/images.bin", "transforms_train.json"], "cameras.bin or cameras.txt"),
+        (["sparse/images.txt", "transforms.json"], "cameras.bin or cameras.txt"),
+        (["transforms_train.json", "transforms.json"], r"transforms_train\.json"),
+        (["transforms.json"], r"transforms\.json"),
+    ],
+)
+def test_the_layout_is_told_in_a_fixed_order(tmp_path: Path, files: list[str], reason: str) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=reason):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"background": "green"}, "background"),
+        ({"points": "dense"}, "points"),
+        ({"downscale": 0}, "downscale"),
+        ({"downscale": 0.5}, "downscale"),
+        ({"downscale": float("nan")}, "downscale"),
+        ({"downscale": float("inf")}, "downscale"),
+        ({"downscale": "2"}, "downscale"),
+    ],
+)
+def test_wrong_arguments_are_named(tmp_path: Path, arguments: dict[str, object], name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}: expected"):
+        load_scene(tmp_path, **arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_scene_needs_a_view_to_train_on_and_one_to_test_on(tmp_path: Path, count: int) -> None:
+    photos(tmp_path / "images", count)
+    np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (count, 1)))
+    with pytest.raises(DataError, match=f"at least 2 posed images.*got {count}"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("train_views", [0, 10, -1])
+def test_a_number_of_views_out_of_range_is_answered_with_the_range(tmp_path: Path, train_views: int) -> None:
+    photos(tmp_path / "images", 11)
+    np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (11, 1)))
+    with pytest.raises(ValueError, match=r"train_views.*1 to 9"):
+        load_scene(tmp_path, train_views)
+
+
+@pytest.mark.parametrize(("downscale", "size"), [(2, (2, 3)), (1.5, (3, 4)), (100, (1, 1)), (1, (4, 6))])
+def test_sizes_are_rounded_and_never_empty(tmp_path: Path, downscale: float, size: tuple[int, int]) -> None:
+    photos(tmp_path / "images")
+    np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (3, 1)))
+    scene = load_scene(tmp_path, downscale=downscale)
+    assert tuple(scene.train.images.shape[-2:]) == tuple(scene.test.images.shape[-2:]) == size
+    assert float(scene.train.cameras.cx[0]) == pytest.approx((size[1] - 1) / 2, abs=1e-6)
+
+
+# an LLFF row for 6x4 images: axes down, right, backward, the centre, (height, width, focal), then two depths
+UPRIGHT = np.array([0, 1, 0, 0, 4, 1, 0, 0, 0, 6, 0, 0, -1, 0, 5, 1, 9], dtype=float)
+
+
+def sampson_error(views: Views, first: int, second: int) -> float:
+    """The median Sampson error of SIFT matches in pixels, from the fundamental matrix of the two cameras."""
+    sift = cv2.SIFT_create()
+    images = [np.round(views.images[i].permute(1, 2, 0).numpy() * 255).astype(np.uint8) for i in (first, second)]
+    found = [sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None) for image in images]
+    pairs = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
+    good = [a for a, b in pairs if a.distance < 0.7 * b.distance]
+    assert len(good) >= 20
+    x = np.array([[*found[0][0][match.queryIdx].pt, 1.0] for match in good])
+    y = np.array([[*found[1][0][match.trainIdx].pt, 1.0] for match in good])
+    intrinsics, extrinsics = views.cameras.intrinsics.double().numpy(), views.cameras.extrinsics.double().numpy()
+    relative = extrinsics[second] @ np.linalg.inv(extrinsics[first])
+    cross = np.cross(np.eye(3), relative[:3, 3]).T
+    inverses = [np.linalg.inv(intrinsics[i, :3, :3]) for i in (first, second)]
+    fundamental = inverses[1].T @ cross @ relative[:3, :3] @ inverses[0]
+    lines_y, lines_x = x @ fundamental.T, y @ fundamental
+    residual = (y * lines_y).sum(axis=1)
+    scale = (lines_y[:, :2] ** 2).sum(axis=1) + (lines_x[:, :2] ** 2).sum(axis=1)
+    return float(np.median(np.abs(residual) / np.sqrt(scale)))
+
+
+@pytest.mark.parametrize(
+    ("name", "train_views"),
+    [("llff/fern", 6), ("llff/flower", 6), ("colmap/trex", 9), ("nerfstudio/fox", 24), ("blender/lego", None)],
+)
+def test_matches_of_real_photos_lie_on_epipolar_lines(name: str, train_views: int | None) -> None:
+    """A wrong axis, a shifted pairing of images and poses or a wrong focal length gives tens of pixels."""
+    if "KGS_DATA" not in os.environ:
+        pytest.skip("KGS_DATA is not set: no real scenes")
+    views = load_scene(Path(os.environ["KGS_DATA"]) / name, train_views).train
+    centers = -(views.cameras.extrinsics[:, :3, :3].mT @ views.cameras.extrinsics[:, :3, 3:])[..., 0]
+    axes = views.cameras.extrinsics[:, 2, :3]
+    pairs = list(itertools.combinations(range(len(views)), 2))
+    # two views side by side: the pair that looks the most alike
+    apart = [float((centers[i] - centers[j]).norm() * (2 - axes[i] @ axes[j])) for i, j in pairs]
+    first, second = pairs[int(torch.tensor(apart).argmin())]
+    assert sampson_error(views, first, second) < 0.5

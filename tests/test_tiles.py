@@ -1,0 +1,363 @@
+"""Binning against brute force: every tile with a pixel whose alpha reaches the threshold, and hardly another."""
+
+import functools
+
+import pytest
+import torch
+from oracles import pinhole, random_camera, random_gaussians
+
+import kgs
+from kgs import Gaussians, ProjectedGaussians, bin_to_tiles, project
+from kgs.tiles import tile_spans
+
+THRESHOLD = 1 / 255
+INTEGERS = ("offsets", "entries", "ids", "by_gaussian", "gaussian_offsets")
+
+
+def packed(means2d, factors, opacities, size, camera_ids=None, depths=None, cameras=1, eps2d=0.3):
+    """What `project` would have returned."""
+    m = len(means2d)
+    return ProjectedGaussians(
+        camera_ids=torch.zeros(m, dtype=torch.int64) if camera_ids is None else camera_ids,
+        gaussian_ids=torch.arange(m),
+        means2d=means2d,
+        factors=factors,
+        depths=torch.arange(1, m + 1).to(means2d) if depths is None else depths,
+        radii=torch.ones(m).to(means2d),
+        opacities=opacities,
+        colors=torch.ones(m, 3).to(means2d),
+        image_size=size,
+        num_cameras=cameras,
+        num_gaussians=m,
+        num_nonfinite=torch.tensor(0),
+        eps2d=eps2d,
+    )
+
+
+def dots(means2d, size, opacity=0.9, **options):
+    """Round footprints of variance 0.3 px^2."""
+    means2d = torch.as_tensor(means2d, dtype=torch.float32).reshape(-1, 2)
+    return packed(means2d, torch.zeros(len(means2d), 2, 3), torch.full((len(means2d),), opacity), size, **options)
+
+
+@functools.cache
+def scene(seed, dtype=torch.float32, size=(45, 67), n=150, cameras=1):
+    gaussians = random_gaussians(n, seed, dtype, None, max(size))
+    parts = [project(gaussians, random_camera(*size, seed + c, dtype)) for c in range(cameras)]
+    names = ("means2d", "factors", "opacities", "depths")
+    fields = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    camera_ids = torch.cat([torch.full((len(part),), c) for c, part in enumerate(parts)])
+    return packed(size=size, camera_ids=camera_ids, cameras=cameras, **fields)
+
+
+def needles(seed, ratio, size=(45, 67)):
+    """Lines, 0.5 px thick and `ratio` times as long, at all angles."""
+    generator = torch.Generator().manual_seed(seed)
+    random = torch.rand(100, 5, generator=generator)
+    along = torch.stack([torch.cos(3.2 * random[:, 0]), torch.sin(3.2 * random[:, 0])], 1)
+    across = torch.stack([-along[:, 1], along[:, 0]], 1)
+    factors = torch.stack([0.5 * ratio * along, 0.5 * across, torch.zeros_like(along)], 2)
+    means2d = random[:, 1:3] * torch.tensor([size[1], size[0]])
+    return packed(means2d, factors, random[:, 3] * 0.9 + 0.1, size)
+
+
+def strengths(projected, tile_size):
+    """For each Gaussian and tile the largest alpha over the tile's pixels, and which tiles it owns; float64."""
+    height, width = projected.image_size
+    rows, columns = -(-height // tile_size), -(-width // tile_size)
+    factors = projected.factors.double()
+    inverse = torch.linalg.inv(factors @ factors.mT + projected.eps2d * torch.eye(2, dtype=torch.float64))
+    alphas = torch.zeros(len(projected), rows * tile_size, columns * tile_size, dtype=torch.float64)
+    dx = torch.arange(width) - projected.means2d[:, :1].double()
+    dy = torch.arange(height) - projected.means2d[:, 1:].double()
+    a, b, c = (value[:, None, None] for value in (inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]))
+    dx, dy = dx[:, None, :], dy[:, :, None]
+    exponent = (a * dx + 2 * b * dy) * dx + c * dy * dy
+    alphas[:, :height, :width] = projected.opacities.double()[:, None, None] * torch.exp(-0.5 * exponent)
+    largest = alphas.reshape(-1, rows, tile_size, columns, tile_size).amax((2, 4)).flatten(1)
+    everywhere = torch.zeros(len(projected), projected.num_cameras, rows * columns, dtype=torch.float64)
+    everywhere[torch.arange(len(projected)), projected.camera_ids] = largest
+    return everywhere.flatten(1)
+
+
+def tiles_of_entries(bins):
+    return torch.repeat_interleave(torch.arange(bins.num_tiles), bins.offsets.diff())
+
+
+def listed(projected, bins):
+    """(M, tiles) booleans from the lists; no pair may be listed twice."""
+    table = torch.zeros(len(projected), bins.num_tiles, dtype=torch.int64)
+    table.index_put_(
+        (bins.ids[bins.entries.long()], tiles_of_entries(bins)), torch.ones(len(bins.entries), dtype=torch.int64), True
+    )
+    assert table.max() <= 1
+    return table.bool()
+
+
+def check_structure(projected, bins):
+    """Everything that the docstring of TileBins promises of offsets, order and the inverse permutation."""
+    entries, n = bins.entries.long(), len(bins.ids)
+    assert bins.entries.dtype == torch.int32
+    assert all(getattr(bins, name).dtype == torch.int64 for name in INTEGERS if name != "entries")
+    assert bins.offsets[0] == 0
+    assert bins.offsets[-1] == len(entries)
+    assert (bins.offsets.diff() >= 0).all()
+    depths = projected.depths[bins.ids]
+    assert (depths.diff() >= 0).all()
+    assert (bins.ids.diff()[depths.diff() == 0] > 0).all(), "ties by index"
+    tile = tiles_of_entries(bins)
+    assert (entries.diff()[tile.diff() == 0] > 0).all(), "front to back, nobody twice"
+    rows_of_camera = bins.grid[0]
+    camera = (tile + bins.first_tile) // bins.grid[1] // rows_of_camera
+    assert torch.equal(projected.camera_ids[bins.ids[entries]], camera)
+    # by_gaussian lists the entries of ids[0], then of ids[1], ...; gaussian_offsets where each begins
+    assert torch.equal(bins.by_gaussian.sort().values, torch.arange(len(entries)))
+    assert torch.equal(entries[bins.by_gaussian], entries.sort().values)
+    counts = entries.bincount(minlength=n)
+    assert torch.equal(bins.gaussian_offsets, counts.cumsum(0) - counts)
+
+
+# -- which tiles ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tile_size", [1, 4, 8, 16, 64, 100])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("threshold", [THRESHOLD, 0.1, 1e-4])
+def test_no_tile_is_missed_and_few_are_in_vain(tile_size, dtype, threshold):
+    extra = total = 0
+    for seed in (0, 1):
+        projected = scene(seed, dtype)
+        bins = bin_to_tiles(projected, tile_size, threshold)
+        check_structure(projected, bins)
+        got, wanted = listed(projected, bins), strengths(projected, tile_size) >= threshold
+        assert not (wanted & ~got).any()
+        extra, total = extra + (got & ~wanted).sum().item(), total + got.sum().item()
+    assert extra < 0.03 * total
+
+
+@pytest.mark.parametrize("ratio", [1, 10, 1e3, 1e5])
+@pytest.mark.parametrize("tile_size", [4, 16])
+def test_needles_at_all_angles(tile_size, ratio):
+    projected = needles(int(ratio), ratio)
+    bins = bin_to_tiles(projected, tile_size)
+    check_structure(projected, bins)
+    got, wanted = listed(projected, bins), strengths(projected, tile_size) >= THRESHOLD
+    assert not (wanted & ~got).any()
+    assert (got & ~wanted).sum() < 0.03 * got.sum()
+
+
+@pytest.mark.parametrize("width", [64, 1024, 8192])
+@pytest.mark.parametrize("length", [0.3, 3.0, 300.0, 3000.0])
+def test_a_single_pixel_just_above_the_threshold_is_enough(width, length):
+    """Leaning ellipses that reach the last tile with one corner pixel, 1e-5 above the threshold, if at all."""
+    n, edge = 2000, width - 8
+    random = torch.rand(n, 3, generator=torch.Generator().manual_seed(width), dtype=torch.float64)
+    angle = 0.35 + 0.8 * random[:, 0]
+    lean = torch.stack([angle.cos(), angle.sin()], 1)
+    factors = torch.zeros(n, 2, 3)
+    factors[:, :, 0] = length * lean
+    offset, side = 0.5 + random[:, 1] * min(2 * length, 2000), random[:, 2] - 0.5
+    centres = torch.tensor([edge, 7.0]) - offset[:, None] * lean + torch.stack([-0.5 * side - 0.4, side], 1)
+    means2d = centres.float()
+    wide = factors.double()
+    inverse = torch.linalg.inv(wide @ wide.mT + 0.3 * torch.eye(2, dtype=torch.float64))
+    d = torch.tensor([edge, 7.0]) - means2d.double()
+    reach = torch.exp(((d[:, None] @ inverse) * d[:, None]).sum((1, 2)) / 2)
+    bins = bin_to_tiles(packed(means2d, factors, (THRESHOLD * reach * (1 + 1e-5)).float(), (8, width)))
+    reachable = THRESHOLD * reach < 2
+    last = bins.ids[bins.entries[bins.offsets[-2] :].long()]
+    assert reachable.sum() > 1000
+    assert torch.isin(reachable.nonzero()[:, 0], last).all()
+
+
+def test_a_dot_is_in_the_tiles_around_it_only():
+    """Alpha 0.9 falls to 1/255 at sqrt(0.6 ln(229.5)) = 1.806 px: by hand, from one tile to two and to four."""
+    size = (32, 32)
+    for (x, y), tiles in {
+        (3.0, 3.0): [0],
+        (6.19, 3.0): [0],
+        (6.2, 3.0): [0, 1],
+        (7.5, 7.5): [0, 1, 4, 5],
+        (8.8, 3.0): [0, 1],
+        (8.81, 3.0): [1],
+        (3.0, 6.2): [0, 4],
+        (31.0, 31.0): [15],
+        (-1.8, 3.0): [0],
+        (-1.81, 3.0): [],
+        (32.8, 3.0): [3],
+        (32.81, 3.0): [],
+        (3.0, 34.0): [],
+    }.items():
+        assert listed(dots([x, y], size), bin_to_tiles(dots([x, y], size))).nonzero()[:, 1].tolist() == tiles
+
+
+def test_threshold_zero_is_every_tile_of_the_own_camera():
+    projected = scene(0, cameras=3)
+    bins = bin_to_tiles(projected, 8, 0.0)
+    check_structure(projected, bins)
+    per_camera = bins.grid[0] * bins.grid[1]
+    own = torch.arange(3 * per_camera)[None] // per_camera == projected.camera_ids[:, None]
+    assert torch.equal(listed(projected, bins), own)
+
+
+@pytest.mark.parametrize("threshold", [0.0, THRESHOLD])
+def test_opacity_zero_or_below_the_threshold_is_in_no_tile(threshold):
+    projected = scene(0)
+    opacities = projected.opacities.clone()
+    opacities[::3] = 0
+    opacities[1::3] *= 1 if threshold == 0 else 1e-3
+    projected = packed(projected.means2d, projected.factors, opacities, projected.image_size)
+    got = listed(projected, bin_to_tiles(projected, 8, threshold)).any(1)
+    assert not got[::3].any()
+    assert got[1::3].any() == (threshold == 0)
+    assert got[2::3].any()
+
+
+def test_opacities_above_one_reach_farther():
+    assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 0.99)).offsets.tolist() == [0, 1, 1]
+    assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 5.0)).offsets.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("huge", [1e3, 1e6, 1e12])
+def test_a_gaussian_larger_than_the_world_is_in_every_tile(huge):
+    projected = packed(torch.tensor([[1e3, -1e3]]), huge * torch.eye(2, 3)[None] * 1e3, torch.tensor([0.5]), (45, 67))
+    assert listed(projected, bin_to_tiles(projected)).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (16, 16), (17, 15)])
+def test_image_sizes_that_are_no_multiple_of_the_tile(size):
+    projected = scene(0, size=size, n=40)
+    for tile_size in (8, 16):
+        bins = bin_to_tiles(projected, tile_size)
+        check_structure(projected, bins)
+        assert bins.grid == (-(-size[0] // tile_size), -(-size[1] // tile_size))
+        got, wanted = listed(projected, bins), strengths(projected, tile_size) >= THRESHOLD
+        assert not (wanted & ~got).any()
+
+
+# -- order ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_tile_is_sorted_by_depth_and_ties_by_index():
+    depths = torch.tensor([3.0, 1.0, 3.0, 2.0, 1.0, 3.0])
+    projected = dots([[3.0, 3.0]] * 6, (8, 8), depths=depths)
+    for _ in range(3):
+        bins = bin_to_tiles(projected)
+        assert bins.ids[bins.entries.long()].tolist() == [1, 4, 3, 0, 2, 5]
+
+
+def test_many_ties_and_negative_depths():
+    projected = scene(0, n=300)
+    for depths in ((projected.depths * 2).round(), -projected.depths, torch.zeros_like(projected.depths)):
+        tied = packed(projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths)
+        check_structure(tied, bin_to_tiles(tied))
+
+
+def test_the_lists_are_integers_without_gradient_and_repeatable():
+    gaussians = Gaussians(*(x.requires_grad_() for x in vars(random_gaussians(50, 0, torch.float32)).values()))
+    projected = project(gaussians, random_camera(45, 67, 0, torch.float32))
+    assert projected.means2d.requires_grad
+    first, second = bin_to_tiles(projected), bin_to_tiles(projected)
+    for name in INTEGERS:
+        assert torch.equal(getattr(first, name), getattr(second, name))
+        assert not getattr(first, name).is_floating_point()
+
+
+# -- many tiles ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cameras", [1, 16])
+def test_tile_numbers_beyond_16_bits(cameras):
+    """16 cameras of 4096 px: a dot at the middle of a random tile is in that tile alone."""
+    height, width = 64, 4096
+    grid, generator = (16, 1024), torch.Generator().manual_seed(0)
+    m = 3000
+    camera, row, column = (torch.randint(0, high, (m,), generator=generator) for high in (cameras, *grid))
+    camera[:2], row[:2], column[:2] = torch.tensor([0, cameras - 1]), torch.tensor([0, 15]), torch.tensor([0, 1023])
+    camera, order = camera.sort(stable=True)
+    row, column = row[order], column[order]
+    means2d = torch.stack([column * 4 + 1.5, row * 4 + 1.5], 1)
+    depths = torch.rand(m, generator=generator)
+    projected = dots(means2d, (height, width), 0.2, camera_ids=camera, cameras=cameras, depths=depths)
+    bins = bin_to_tiles(projected, 4)
+    assert bins.num_tiles == cameras * 16 * 1024
+    check_structure(projected, bins)
+    tile = torch.empty(m, dtype=torch.int64)
+    tile[bins.ids[bins.entries.long()]] = tiles_of_entries(bins)
+    assert len(bins.entries) == m
+    assert torch.equal(tile, (camera * grid[0] + row) * grid[1] + column)
+
+
+@pytest.mark.parametrize("rows", [2**15 // 64 - 1, 2**15 // 64, 2**15 // 64 + 1])
+def test_tile_counts_around_the_border_of_16_bits(rows):
+    projected = dots([[2.0, 2.0], [2.0 + 63 * 4, 2.0 + 4 * (rows - 1)]], (4 * rows, 256), 0.1)
+    bins = bin_to_tiles(projected, 4)
+    assert bins.num_tiles == 64 * rows
+    assert tiles_of_entries(bins).tolist() == [0, 64 * rows - 1]
+
+
+def test_a_batch_of_cameras_is_its_cameras_one_by_one():
+    cameras = 16
+    together = scene(0, cameras=cameras, n=40)
+    bins = bin_to_tiles(together)
+    check_structure(together, bins)
+    table = listed(together, bins).reshape(len(together), cameras, -1)
+    for c in range(cameras):
+        own = together.camera_ids == c
+        single = packed(*(x[own] for x in (together.means2d, together.factors, together.opacities)), (45, 67))
+        assert torch.equal(table[own, c], listed(single, bin_to_tiles(single)))
+        assert not table[own][:, torch.arange(cameras) != c].any()
+
+
+# -- bands ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.1, 0.0])
+def test_bands_cover_all_rows_within_the_budget_and_together_are_the_whole(share):
+    projected = scene(0, cameras=3)
+    spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)
+    budget = max(int(share * len(whole.entries)), int(spans.entries_per_row.max()))
+    bands = spans.bands(budget)
+    assert [begin for begin, _ in bands] == [0, *(end for _, end in bands[:-1])]
+    assert bands[-1][1] == 3 * whole.grid[0]
+    assert all(begin < end for begin, end in bands)
+    assert len(bands) == 1 if share == 1 else len(bands) > 1
+    parts = [spans.bin(begin, end) for begin, end in bands]
+    for (begin, end), part in zip(bands, parts, strict=True):
+        check_structure(projected, part)
+        assert len(part.entries) <= budget
+        assert (part.first_tile, part.num_tiles) == (begin * whole.grid[1], (end - begin) * whole.grid[1])
+        assert (part.tile_size, part.grid) == (8, whole.grid)
+    entries = torch.cat([part.ids[part.entries.long()] for part in parts])
+    assert torch.equal(entries, whole.ids[whole.entries.long()])
+    assert torch.equal(torch.cat([part.offsets.diff() for part in parts]), whole.offsets.diff())
+
+
+def test_entries_per_row_are_what_the_rows_hold():
+    projected = scene(0, cameras=2)
+    spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)
+    assert torch.equal(spans.entries_per_row, whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1))
+
+
+def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
+    spans = tile_spans(scene(0), 8, THRESHOLD)
+    most = int(spans.entries_per_row.max())
+    with pytest.raises(ValueError, match=rf"max_bytes: .* needs \d+ entries, the budget allows {most - 1}"):
+        spans.bands(most - 1)
+
+
+# -- nothing to do -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("projected", [dots([], (45, 67)), dots([[1e4, 1e4]] * 3, (45, 67))], ids=["none", "outside"])
+def test_nothing_to_draw_gives_empty_lists_for_every_tile(projected):
+    bins = bin_to_tiles(projected)
+    assert bins.offsets.tolist() == [0] * (6 * 9 + 1)
+    assert len(bins.entries) == len(bins.by_gaussian) == 0
+    assert tile_spans(projected, 8, THRESHOLD).bands(1) == [(0, 6)]
+
+
+def test_the_public_names_and_defaults():
+    projected = project(random_gaussians(5, 0), pinhole(16, 16, 16.0))
+    assert kgs.bin_to_tiles is bin_to_tiles
+    assert torch.equal(bin_to_tiles(projected).offsets, bin_to_tiles(projected, 8, 1 / 255).offsets)

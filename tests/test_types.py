@@ -1,0 +1,139 @@
+"""The dataclasses check shapes, dtypes and devices, name the culprit, and never look at values."""
+
+import dataclasses
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
+
+import kgs
+from kgs import Gaussians, PosedCamera
+from kgs.types import sh_degree
+
+PARAMS = {
+    CameraModelType.PINHOLE: 4,
+    CameraModelType.BROWN_CONRADY: 12,
+    CameraModelType.KANNALA_BRANDT_K3: 8,
+    CameraModelType.ORTHOGRAPHIC: 4,
+}
+
+
+def fields(n=5, bands=4, dtype=torch.float32):
+    return {
+        "means": torch.zeros(n, 3, dtype=dtype),
+        "quats": torch.zeros(n, 4, dtype=dtype),
+        "scales": torch.ones(n, 3, dtype=dtype),
+        "opacities": torch.ones(n, dtype=dtype),
+        "colors": torch.zeros(n, bands, 3, dtype=dtype),
+    }
+
+
+def model(kind=CameraModelType.PINHOLE, batch=()):
+    return CameraModel(ImageSize(4, 6), kind, torch.ones(*batch, PARAMS[kind]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("bands", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3)])
+@pytest.mark.parametrize("n", [0, 1, 5])
+def test_harmonics_of_degree_0_to_3_are_taken(n, bands, degree, dtype):
+    gaussians = Gaussians(**fields(n, bands, dtype))
+    assert len(gaussians) == n
+    assert sh_degree(gaussians.colors) == degree
+
+
+@pytest.mark.parametrize(("name", "shape"), [("colors", (5, 3)), ("opacities", (2, 5))])
+def test_other_shapes_that_are_meant(name, shape):
+    Gaussians(**fields() | {name: torch.zeros(shape)})
+
+
+def test_the_tensors_are_kept_as_they_are_and_fields_cannot_be_set():
+    given = fields()
+    gaussians = Gaussians(**given)
+    assert all(getattr(gaussians, name) is value for name, value in given.items())
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        gaussians.means = given["means"]
+
+
+def test_values_are_not_checked():
+    given = {name: torch.full_like(value, torch.nan) for name, value in fields().items()}
+    Gaussians(**given)
+    Gaussians(**fields() | {"opacities": torch.full((5,), 1.25), "scales": -torch.ones(5, 3)})
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (5, 2)),
+        ("means", (3,)),
+        ("means", ()),
+        ("means", (1, 5, 3)),
+        ("quats", (5, 3)),
+        ("quats", (4, 4)),
+        ("scales", (5,)),
+        ("scales", (5, 1)),
+        ("opacities", (4,)),
+        ("opacities", (5, 1)),
+        ("opacities", ()),
+        ("opacities", (1, 2, 5)),
+        ("colors", (5,)),
+        ("colors", (5, 4)),
+        ("colors", (4, 3)),
+        ("colors", (5, 3, 4)),
+        ("colors", (5, 5, 3)),
+        ("colors", (5, 25, 3)),
+        ("colors", (5, 0, 3)),
+        ("colors", (6, 4, 3)),
+    ],
+)
+def test_wrong_shapes_name_the_argument_and_what_came(name, shape):
+    with pytest.raises(ValueError, match=f"{name}: expected shape") as error:
+        Gaussians(**fields() | {name: torch.zeros(shape)})
+    assert str(tuple(shape)) in str(error.value)
+
+
+@pytest.mark.parametrize("name", list(fields()))
+def test_wrong_types_name_the_argument(name):
+    given = fields()
+    for wrong in (given[name].tolist(), given[name].numpy(), None):
+        with pytest.raises(TypeError, match=f"{name}: expected a torch.Tensor, got {type(wrong).__name__}"):
+            Gaussians(**given | {name: wrong})
+    for dtype in (torch.float16, torch.bfloat16, torch.int64, torch.complex64):
+        with pytest.raises(TypeError, match=f"{name}: expected float32 or float64, got {dtype}"):
+            Gaussians(**given | {name: given[name].to(dtype)})
+
+
+@pytest.mark.parametrize("name", ["quats", "scales", "opacities", "colors"])
+def test_dtype_and_device_are_those_of_the_means(name):
+    given = fields()
+    for other in (given[name].double(), given[name].to("meta")):
+        with pytest.raises(TypeError, match=f"{name}: expected torch.float32 on cpu as means"):
+            Gaussians(**given | {name: other})
+
+
+@pytest.mark.parametrize("kind", list(PARAMS))
+@pytest.mark.parametrize("batch", [(), (1,), (3,)])
+def test_posed_camera_takes_every_model_with_shared_or_own_parameters(kind, batch):
+    PosedCamera(model(kind, batch), torch.eye(4).expand(3, 4, 4))
+
+
+def test_posed_camera_errors():
+    extrinsics = torch.eye(4)[None]
+    pinhole = PinholeCamera(extrinsics, extrinsics, torch.tensor([4]), torch.tensor([6]))
+    for wrong in (pinhole, torch.ones(4), None):
+        with pytest.raises(TypeError, match=f"model: expected .* got {type(wrong).__name__}"):
+            PosedCamera(wrong, extrinsics)
+    with pytest.raises(TypeError, match="extrinsics: expected a torch.Tensor, got list"):
+        PosedCamera(model(), extrinsics.tolist())
+    for shape in ((4, 4), (1, 3, 4), (1, 1, 4, 4)):
+        with pytest.raises(ValueError, match="extrinsics: expected shape"):
+            PosedCamera(model(), torch.zeros(shape))
+    with pytest.raises(ValueError, match="params of 1 or 3 cameras"):
+        PosedCamera(model(batch=(2,)), torch.eye(4).expand(3, 4, 4))
+
+
+def test_the_public_names():
+    for name in ("Gaussians", "PosedCamera", "ProjectedGaussians", "Rendering", "TileBins"):
+        assert dataclasses.is_dataclass(getattr(kgs, name))
+        assert getattr(kgs, name).__dataclass_params__.frozen
