@@ -112,10 +112,11 @@ class Band:
         per_group = max(1, elements // (self.chunk_size * self.pixels))
         counts = chunks.tolist()
         starts, ends = self.bins.offsets[:-1].index_select(0, order), self.bins.offsets[1:].index_select(0, order)
-        return [
-            Group(*(x[i : i + per_group] for x in (order, starts, ends)), counts[i : min(i + per_group, len(order))])
-            for i in range(0, len(order), per_group)
-        ]
+        groups = []
+        for begin in range(0, len(order), per_group):
+            part = slice(begin, min(begin + per_group, len(order)))
+            groups.append(Group(order[part], starts[part], ends[part], counts[part]))
+        return groups
 
 
 def _chunk_size(bins: TileBins) -> int:

@@ -20,8 +20,8 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         import tyro
 
-        commands = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
-        code = tyro.extras.subcommand_cli_from_dict(
+        commands: dict[str, Any] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
+        code: int = tyro.extras.subcommand_cli_from_dict(
             commands, prog="kgs", description=sys.modules[__package__].__doc__, args=arguments
         )
     except ModuleNotFoundError as error:

@@ -23,11 +23,11 @@ that quantity over the pixels, again one matrix product; they are shifted to its
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 
 from .chunks import Band, Rules
 from .covariance import variances, whitening
@@ -101,8 +101,8 @@ class _Composite(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: FunctionCtx,
+    def forward(
+        ctx: Any,
         means2d: Tensor,
         factors: Tensor,
         opacities: Tensor,
@@ -112,7 +112,7 @@ class _Composite(torch.autograd.Function):
         bands: list[tuple[int, int]],
         rules: Rules,
         keep: bool,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         table = F.pad(_table(means2d, factors, opacities, projected.eps2d).index_select(1, spans.ids), (0, 1))
         table[0, -1] = -torch.inf
         colors = F.pad(features.index_select(0, spans.ids), (0, 0, 0, 1))
@@ -135,9 +135,7 @@ class _Composite(torch.autograd.Function):
         return images
 
     @staticmethod
-    def backward(  # type: ignore[override]
-        ctx: FunctionCtx, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError(
                 "composite: expected backward without create_graph, the renderer has no second derivative"
@@ -146,14 +144,14 @@ class _Composite(torch.autograd.Function):
         spans, columns = ctx.spans, ctx.spans.grid[1]
         grads = _to_tiles(grad_sums, spans)
         behind = _to_tiles(grad_transmittance, spans).mul_(transmittance)
-        total: Tensor | float = 0.0
+        total = factors.new_zeros(spans.ids.shape[0], 6 + grads.shape[1])
         for begin, end in ctx.bands:
             band = ctx.kept
             if band is None:
                 band = ctx.make_band((begin, end))
                 band.forward(keep=True)
             tiles = slice(begin * columns, end * columns)
-            total = total + band.backward(grads[tiles], behind[tiles])
+            total += band.backward(grads[tiles], behind[tiles])
         ids = spans.ids
         used = factors.index_select(0, ids), opacities.index_select(0, ids)
         with torch.autocast(factors.device.type, enabled=False):

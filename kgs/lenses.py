@@ -80,7 +80,8 @@ def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
     camera = PinholeCamera(cameras.intrinsics[one], cameras.extrinsics[one], cameras.height[one], cameras.width[one])
     height, width = int(camera.height), int(camera.width)
     k = camera.intrinsics[0, :2, :2]
-    limits = _tangent_limits(*(camera.intrinsics[0, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))), height, width)
+    fx, fy, cx, cy = (camera.intrinsics[0, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    limits = _tangent_limits(fx, fy, cx, cy, height, width)
     return Lens(
         extrinsics=camera.extrinsics[0],
         project=lambda world, _: camera.project(world[None])[0],

@@ -171,7 +171,8 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
     if lens.parallel:
         return rotation[2].expand_as(means)
     offsets = means + rotation.T @ translation
-    return offsets / offsets.norm(dim=1, keepdim=True)
+    lengths: Tensor = torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
+    return offsets / lengths
 
 
 def _finite(gaussians: Gaussians) -> Tensor:

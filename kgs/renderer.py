@@ -113,7 +113,7 @@ class GaussianRenderer(nn.Module):
                 median_depth="median_depth" in wanted,
                 max_bytes=self.max_bytes,
             )
-            alpha = 1.0 - result.transmittance if {"alpha", "depth"} & wanted else None
+            alpha = 1.0 - result.transmittance
             image = depth = None
             if "image" in wanted:
                 image = result.features[:, :3]

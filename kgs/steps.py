@@ -85,7 +85,7 @@ class _Worker:
         flat = self.alpha.view(-1, band.pixels)
         torch.mm(table[:6].t(), band.monomials, out=flat)
         flat.clamp_(min=band.floor).exp_()
-        F.threshold_(flat, band.cut, 0.0)
+        F.threshold(flat, band.cut, 0.0, inplace=True)
         self.light[:, 0] = before
         return ux, uy, log_opacity
 
@@ -99,7 +99,7 @@ class _Worker:
         else:
             torch.mul(torch.cumprod(1 - alpha, 1), light[:, :1], out=light[:, 1:])
         if self.band.stop is not None:  # T never grows, so cutting afterwards is cutting at each layer
-            F.threshold_(light, self.band.stop, 0.0)
+            F.threshold(light, self.band.stop, 0.0, inplace=True)
 
 
 class Forward(_Worker):
@@ -200,7 +200,7 @@ class Backward(_Worker):
         clamped = float(log_opacity.max()) > math.log(ALPHA_MAX)
         if clamped:  # alphas whose derivative is their own value; 0 where the clamp holds
             self.slope.copy_(self.alpha)
-            F.threshold_(self.slope, ALPHA_MAX, 0.0)
+            F.threshold(self.slope, ALPHA_MAX, 0.0, inplace=True)
             torch.sub(self.alpha, self.slope, out=self.slope)
             self.alpha.clamp_(max=ALPHA_MAX)
         self.scan()

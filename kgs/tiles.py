@@ -146,7 +146,7 @@ def tile_spans(projected: ProjectedGaussians, tile_size: int, alpha_threshold: f
     def edge(sign: int) -> Tensor:
         dy = torch.minimum(torch.maximum(sign * rightmost, low), high)
         half = ((cut - dy * dy * inverse_yy).clamp_min_(0.0) * across).sqrt_()
-        return x + slope * dy + sign * half
+        return torch.addcmul(x, slope, dy).add_(half, alpha=sign)
 
     left = torch.where(everywhere, -torch.inf, edge(-1))
     right = torch.where(everywhere, torch.inf, edge(1))

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -188,17 +189,14 @@ def _read_points(path: Path) -> tuple[Tensor, Tensor]:
     if not path.is_file():
         raise DataError(path, "", "expected a point cloud or mesh, found no such file")
     try:
-        geometry = trimesh.load(path, process=False)
+        geometry: Any = trimesh.load(path, process=False)
         geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
         points = torch.tensor(geometry.vertices, dtype=torch.float32).reshape(-1, 3)
-    except Exception as error:  # trimesh's readers raise whatever their format's parser meets
+        values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
+    except Exception as error:  # each of trimesh's readers raises what its parser meets
         raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
     if not len(points) or not bool(points.isfinite().all()):
         raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
-    if isinstance(geometry, trimesh.PointCloud):
-        values = geometry.colors
-    else:
-        values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
     if len(values) != len(points):
         return points, torch.full_like(points, 0.5)
     return points, torch.tensor(values)[:, :3].float() / 255.0

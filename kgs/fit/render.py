@@ -12,7 +12,7 @@ from kgs.renderer import GaussianRenderer
 
 from .config import Recipe
 from .initialize import relative_near_plane
-from .report import write_png
+from .report import png_name, write_png
 from .trainer import move_camera
 
 __all__ = ["render_views"]
@@ -28,7 +28,7 @@ def render_views(ply: Path, scene: Scene, out: Path, device: str = "cpu") -> int
     """
     model = load_ply(ply)
     with torch.no_grad():
-        model.means -= scene.offset.to(model.means)
+        model.means.sub_(scene.offset.to(model.means))
     near_plane = Recipe().near_plane / 0.05 * relative_near_plane(scene.train, model.means.detach())
     renderer = GaussianRenderer(near_plane=near_plane).eval()
     out.mkdir(parents=True, exist_ok=True)
@@ -40,6 +40,6 @@ def render_views(ply: Path, scene: Scene, out: Path, device: str = "cpu") -> int
             camera = views.camera(i)
             with torch.no_grad():
                 image = renderer(model(), move_camera(camera, torch.device(device)), background).image[0]
-            write_png(out / f"{Path(name).stem}.png", image)
+            write_png(out / png_name(name), image)
             count += 1
     return count

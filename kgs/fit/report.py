@@ -7,7 +7,7 @@ import os
 import platform
 import resource
 import sys
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -24,6 +24,7 @@ from .trainer import Trainer
 
 __all__ = [
     "peak_rss_mb",
+    "png_name",
     "read_json",
     "run_metrics",
     "side_by_side",
@@ -94,6 +95,11 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
     return value
+
+
+def png_name(view: str) -> str:
+    """A file name for a render of a view: folders in the view's name become part of it."""
+    return str(PurePosixPath(view).with_suffix(".png")).replace("/", "_")
 
 
 def write_png(path: Path, image: Tensor) -> None:

@@ -21,7 +21,7 @@ from .config import FitConfig
 from .evaluate import evaluate
 from .initialize import FirstPoints, first_points
 from .lpips import Lpips
-from .report import run_metrics, write_curve, write_json, write_png
+from .report import png_name, run_metrics, write_curve, write_json, write_png
 from .trainer import Trainer
 
 __all__ = ["CHECKPOINT", "choose_points", "fit_scene", "measure", "train"]
@@ -84,7 +84,7 @@ def fit_scene(
     write_curve(out / "curve.png", {"": trainer.curve})
     (out / "test").mkdir(exist_ok=True)
     for i, name in enumerate(scene.test.names):
-        write_png(out / "test" / f"{Path(name).stem}.png", trainer.render(scene.test.camera(i))[0])
+        write_png(out / "test" / png_name(name), trainer.render(scene.test.camera(i))[0])
     metrics = measure(trainer, lpips)
     write_json(out / "metrics.json", metrics)
     return metrics, interrupted

@@ -59,7 +59,7 @@ def find_tracks(views: Views) -> Tracks:
         The tracks, in float64 on the CPU.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
-    features = [_detect(views, v, limit=min(max(30_000 // len(views), 1500), 4000)) for v in range(len(views))]
+    features = [_detect(views, v, limit=min(max(36_000 // len(views), 1500), 4000)) for v in range(len(views))]
     cameras = views.cameras
     projections = (cameras.intrinsics.double() @ cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
@@ -88,12 +88,15 @@ def _detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
         mask = None if mask is None else cv2.resize(mask, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
     # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(nfeatures=limit, nOctaveLayers=4, contrastThreshold=0.005, enable_precise_upscale=True)
+    sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # not in the stubs
+        nfeatures=limit, nOctaveLayers=4, contrastThreshold=0.005, enable_precise_upscale=True
+    )
     keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if not keypoints:
         return torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128)
-    places = (torch.from_numpy(cv2.KeyPoint_convert(keypoints)).double() + 0.5) / factor - 0.5
-    return places, torch.nn.functional.normalize(torch.from_numpy(descriptors), p=1.0, dim=1).sqrt()
+    places = torch.tensor([keypoint.pt for keypoint in keypoints], dtype=torch.float64)
+    descriptors = torch.nn.functional.normalize(torch.from_numpy(descriptors), p=1.0, dim=1).sqrt()
+    return (places + 0.5) / factor - 0.5, descriptors
 
 
 def _match(
@@ -132,7 +135,9 @@ def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
 
     SIFT gives a keypoint with several orientations once for each; all of them are one place.
     """
-    numbers, distinct, owners = [], [], []
+    numbers: list[Tensor] = []
+    distinct: list[Tensor] = []
+    owners: list[int] = []
     for view, all_places in enumerate(places):
         unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)
         numbers.append(inverse + len(owners))

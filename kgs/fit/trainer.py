@@ -150,7 +150,7 @@ class Trainer:
         """All Gaussians from one camera, `(1, 3, H, W)`; what `evaluate` wants."""
         self.renderer.eval()
         with torch.no_grad():
-            image = self.renderer(self.model(), move_camera(camera, self.device), self._background).image
+            image: Tensor = self.renderer(self.model(), move_camera(camera, self.device), self._background).image
         self.renderer.train()
         return image
 

@@ -37,7 +37,8 @@ def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
     equations = rays[..., :2, None] * projections[:, None, 2] - projections[:, :2]
     equations = (equations * tracks.seen[..., None, None]).flatten(1, 2)
     null = torch.linalg.svd(equations, full_matrices=False).Vh[:, -1]
-    return null[:, :3] / null[:, 3:] + origin
+    points: Tensor = null[:, :3] / null[:, 3:] + origin
+    return points
 
 
 def triangulate_certain(
@@ -72,7 +73,7 @@ def triangulate_certain(
 
 
 def project_all(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, in float64; pixels mean nothing at depth <= 0."""
+    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, float64; pixels mean nothing at depth <= 0."""
     intrinsics, extrinsics = _matrices(cameras)
     local = torch.einsum("vij,pj->pvi", extrinsics[:, :3, :3], points.double()) + extrinsics[:, :3, 3]
     image = torch.einsum("vij,pvj->pvi", intrinsics, local)
