@@ -25,7 +25,7 @@ from torch import Tensor
 
 from .types import Cameras, PosedCamera
 
-__all__ = ["Lens", "image_size", "lenses"]
+__all__ = ["Lens", "image_size", "intrinsics", "lenses"]
 
 _MARGIN = 0.15
 
@@ -66,6 +66,11 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
     if height < 1 or width < 1:
         raise ValueError(f"cameras: expected a positive image size, got {height}x{width}")
     return height, width
+
+
+def intrinsics(cameras: Cameras) -> Tensor:
+    """The tensor that describes the lenses: matrices, or parameters of a model."""
+    return cameras.intrinsics if isinstance(cameras, PinholeCamera) else cameras.model.params
 
 
 def lenses(cameras: Cameras) -> list[Lens]:
@@ -147,7 +152,7 @@ def _perspective_jacobian(k: Tensor, points: Tensor, limits: tuple[Tensor, ...])
 
 
 def _reverse_jacobian(pixels: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-    differentiable = torch.is_grad_enabled()
+    differentiable = torch.is_grad_enabled() and pixels(points[:1]).requires_grad
     with torch.inference_mode(False), torch.enable_grad():
         if not (differentiable and points.requires_grad):
             points = points.detach().clone().requires_grad_()

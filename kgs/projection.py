@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .covariance import footprint_factors, variances
 from .harmonics import evaluate_harmonics
-from .lenses import Lens, image_size, lenses
+from .lenses import Lens, image_size, intrinsics, lenses
 from .types import Cameras, Gaussians, ProjectedGaussians
 
 __all__ = ["cut_squared", "project"]
@@ -45,7 +45,8 @@ def project(
         colors: whether colours are wanted.
 
     Returns:
-        The visible pairs (camera, Gaussian): those whose 3-sigma circle or whose own cut touches the image.
+        The visible pairs (camera, Gaussian): those that would touch the image if their opacity were 2, or the largest
+        of all if that is more. (The opacity of each is left aside, so that a dropped Gaussian counts as seen.)
 
     Raises:
         TypeError: cameras of another kind, dtype or device.
@@ -53,12 +54,12 @@ def project(
     """
     size = image_size(cameras)
     means = gaussians.means
-    extrinsics = cameras.extrinsics
-    if extrinsics.dtype != means.dtype or extrinsics.device != means.device:
-        raise TypeError(
-            f"cameras: expected {means.dtype} on {means.device} as the Gaussians, "
-            f"got {extrinsics.dtype} on {extrinsics.device}"
-        )
+    for matrix in (cameras.extrinsics, intrinsics(cameras)):
+        if matrix.dtype != means.dtype or matrix.device != means.device:
+            raise TypeError(
+                f"cameras: expected {means.dtype} on {means.device} as the Gaussians, "
+                f"got {matrix.dtype} on {matrix.device}"
+            )
     views = lenses(cameras)
     if gaussians.opacities.ndim == 2 and gaussians.opacities.shape[0] != len(views):
         raise ValueError(
@@ -66,9 +67,9 @@ def project(
             f"cameras, got {tuple(gaussians.opacities.shape)}"
         )
     finite = _finite(gaussians)
+    reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), alpha_threshold)
     parts = [
-        _project_one(gaussians, c, lens, size, finite, near_plane, eps2d, alpha_threshold, colors)
-        for c, lens in enumerate(views)
+        _project_one(gaussians, c, lens, size, finite, near_plane, eps2d, reach, colors) for c, lens in enumerate(views)
     ]
     fields = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
     ids, means2d, factors, depths, radii, opacities, rgb = fields
@@ -109,25 +110,32 @@ def _project_one(
     finite: Tensor,
     near_plane: float,
     eps2d: float,
-    alpha_threshold: float,
+    reach: Tensor,
     colors: bool,
 ) -> tuple[Tensor, ...]:
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     with torch.no_grad():
         front = (gaussians.means @ rotation[2] + translation[2] > near_plane) & finite
         ids = front.nonzero()[:, 0]
-    means = _rows(gaussians.means, ids)
-    points = torch.addmm(translation, means, rotation.T)
-    means2d = lens.project(means, points)
-    rows = lens.jacobian(points) @ rotation
-    factors = footprint_factors(rows, _rows(gaussians.quats, ids), _rows(gaussians.scales, ids))
-    all_opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
-    opacities = _rows(all_opacities, ids)
+
+    def footprints(ids: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        means = _rows(gaussians.means, ids)
+        points = torch.addmm(translation, means, rotation.T)
+        rows = lens.jacobian(points) @ rotation
+        factors = footprint_factors(rows, _rows(gaussians.quats, ids), _rows(gaussians.scales, ids))
+        return means, points, lens.project(means, points), factors
+
+    means, points, means2d, factors = footprints(ids)
     with torch.no_grad():
-        seen, radii = _touches_image(means2d, factors, opacities, size, eps2d, alpha_threshold)
+        seen, radii, overflow = _touches_image(means2d, factors, size, eps2d, reach)
+        if bool(overflow.any()):  # these must not take part at all: their gradients would not be finite
+            ids, seen, radii = (_rows(x, (~overflow).nonzero()[:, 0]) for x in (ids, seen, radii))
+    if ids.shape[0] != means.shape[0]:
+        means, points, means2d, factors = footprints(ids)
+    with torch.no_grad():
         kept = seen.nonzero()[:, 0]
-        ids = _rows(ids, kept)
-        radii = _rows(radii, kept)
+    all_opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
+    ids, radii = _rows(ids, kept), _rows(radii, kept)
     if colors:
         rgb = _rows(gaussians.colors, ids)
         if rgb.ndim == 3:
@@ -140,29 +148,30 @@ def _project_one(
         _rows(factors, kept),
         _rows(points[:, 2], kept),
         radii,
-        _rows(opacities, kept),
+        _rows(all_opacities, ids),
         rgb,
     )
 
 
+def _reach(opacities: Tensor, alpha_threshold: float) -> Tensor:
+    """How many standard deviations wide a footprint counts as seen: one number for all, 0-d."""
+    largest = torch.cat([opacities.flatten(), opacities.new_tensor([2.0])]).amax()
+    return cut_squared(largest, alpha_threshold).clamp_min(9.0).sqrt()
+
+
 def _touches_image(
-    means2d: Tensor,
-    factors: Tensor,
-    opacities: Tensor,
-    size: tuple[int, int],
-    eps2d: float,
-    alpha_threshold: float,
-) -> tuple[Tensor, Tensor]:
-    """Which footprints reach the image, by the opacity-free radius or by their own cut; and that radius."""
+    means2d: Tensor, factors: Tensor, size: tuple[int, int], eps2d: float, reach: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which footprints, `reach` standard deviations wide, touch the image; their radii; which are not finite."""
     xx, xy, yy, det = variances(factors, eps2d)
     largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
     radii = torch.ceil(3.0 * largest.sqrt())
-    cut = cut_squared(opacities, alpha_threshold).clamp_min(0.0)
     x, y = means2d.unbind(1)
-    reach_x, reach_y = torch.maximum(radii, (cut * xx).sqrt()), torch.maximum(radii, (cut * yy).sqrt())
+    reach_x, reach_y = reach * xx.sqrt(), reach * yy.sqrt()
     height, width = size
     seen = (x + reach_x > -0.5) & (x - reach_x < width - 0.5) & (y + reach_y > -0.5) & (y - reach_y < height - 0.5)
-    return seen & (det > 0), radii
+    overflow = ~torch.isfinite(largest + det + x + y)
+    return seen & (det > 0), radii, overflow
 
 
 def _directions(means: Tensor, lens: Lens) -> Tensor:

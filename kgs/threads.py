@@ -14,7 +14,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 import torch
@@ -34,7 +34,7 @@ def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], No
         device: where the work runs; on anything but a CPU one thread does it all.
     """
     queue = deque(items)
-    threads = min(torch.get_num_threads(), len(queue)) if device.type == "cpu" else 1
+    threads = torch.get_num_threads() if device.type == "cpu" else 1
 
     inference = torch.is_inference_mode_enabled()
 
@@ -47,12 +47,18 @@ def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], No
                     item = queue.popleft()
                 except IndexError:
                     return
-                worker(item)
+                try:
+                    worker(item)
+                except BaseException:
+                    queue.clear()
+                    raise
 
-    if threads <= 1:
+    if threads == 1 or not queue:
         drain()
         return
-    for future in [_pool(threads).submit(drain) for _ in range(threads)]:
+    futures = [_pool(threads).submit(drain) for _ in range(min(threads, len(queue)))]
+    wait(futures)  # all of them, so that nothing runs on after an error
+    for future in futures:
         future.result()
 
 
@@ -62,6 +68,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
         started = threading.Barrier(threads + 1)
 
         def start() -> None:
+            torch.get_num_threads()  # a new thread takes over the default at its first use, which would undo the next
             torch.set_num_threads(1)
             started.wait()
 

@@ -247,6 +247,46 @@ def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds):
         assert_gradients_close(gradients, first_gradients, 5 * bound)
 
 
+def dense(means2d, factors, opacities, features, depths, size, eps2d):
+    """Every footprint at every pixel, with the default thresholds: sums of features and light, by autograd."""
+    order = depths.argsort(stable=True)
+    covariances = factors @ factors.mT + eps2d * torch.eye(2, dtype=factors.dtype)
+    d = torch.cartesian_prod(*map(torch.arange, size)).flip(1) - means2d[:, None]
+    squared = torch.einsum("npi,nij,npj->np", d, torch.linalg.inv(covariances), d)
+    alphas = (opacities[:, None] * torch.exp(-0.5 * squared)).clamp(max=0.99)[order]
+    alphas = torch.where(alphas >= TH, alphas, 0.0)
+    light = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
+    light = torch.where(light >= STOP, light, 0.0)
+    sums = torch.einsum("np,nf->fp", alphas * light[:-1], features[order])
+    return torch.cat([sums, light[-1:]]).view(1, -1, *size)
+
+
+@pytest.mark.parametrize("chunk_size", [1, 3, None])
+@pytest.mark.parametrize("max_bytes", [2**30, 160 * 2000])
+def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
+    # veils over all, and an opaque curtain for each column of tiles at another depth: tiles end one after the other
+    size, columns, veils = (20, 72), 9, 120
+    generator = torch.Generator().manual_seed(0)
+    walls = [(8 * c + 3.5, 10.0, 12.0 * (c * 4 % columns) + 0.5) for c in range(columns - 1)] * 8
+    centres = [(72 * x, 20 * y) for x, y in torch.rand(veils, 2, generator=generator).tolist()]
+    centres += [(x, y) for x, y, _ in walls]
+    curtain = torch.tensor([[5.0, 0, 0], [0, 60, 0]])
+    factors = torch.cat([25 * torch.eye(2, 3).expand(veils, 2, 3), curtain.expand(len(walls), 2, 3)])
+    factors = factors + torch.randn(factors.shape, generator=generator)
+    opacities = torch.cat([0.01 + 0.02 * torch.rand(veils, generator=generator), torch.full((len(walls),), 0.98)])
+    depths = torch.cat([torch.arange(veils), torch.tensor([z for *_, z in walls])])
+    projected = footprints(opacities, centres, factors, depths, size, eps2d=0.3)
+    colors = torch.rand(len(depths), 3, generator=generator, dtype=torch.float64)
+    weights = torch.randn(1, 4, *size, generator=generator, dtype=torch.float64)
+    image, gradients = loss_and_gradients(projected, colors, weights, chunk_size=chunk_size, max_bytes=max_bytes)
+    _, inputs = leaves(projected, colors)
+    expected = dense(*inputs, projected.depths, size, 0.3)
+    assert (expected[:, 3] == 0).double().mean() > 0.3
+    assert (expected[:, 3] > 0.05).double().mean() > 0.05
+    assert (image - expected).abs().max() <= 1e-12
+    assert_gradients_close(gradients, torch.autograd.grad((expected * weights).sum(), inputs), 1e-10)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_byte_budget_changes_nothing(dtype):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
@@ -325,6 +365,15 @@ def test_nothing_counts_behind_the_stop(dtype):
     expected = torch.tensor([0.9, 0.09, 0.009, 0.0, 0.0], dtype=dtype)
     assert (out.features[0, :, 0, 0] - expected).abs().max() <= 1e-7
     assert not out.transmittance.any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("stop", [0.02, 0.05, 0.5])
+def test_light_of_exactly_the_stop_is_the_border(stop, dtype):
+    for left, counts in ((stop * (1 - 1e-4), False), (stop * (1 + 1e-4), True)):
+        out = composite(footprints([1 - left, 0.5], dtype=dtype), torch.eye(2, dtype=dtype), transmittance_stop=stop)
+        assert (out.features[0, 1] - 0.5 * left * counts).abs().max() <= 1e-6
+        assert not out.transmittance.any()
 
 
 @pytest.mark.parametrize("stop", [1e-2, 1e-3, 1e-4])

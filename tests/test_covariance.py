@@ -85,9 +85,9 @@ def test_gradcheck_of_rotation_and_factors():
     rows, quats, scales = normal(4, 2, 3), normal(4, 4, seed=1), normal(4, 3, seed=2).exp()
     inputs = [value.requires_grad_() for value in (rows, quats, scales)]
     assert torch.autograd.gradcheck(footprint_factors, inputs)
-    assert torch.autograd.gradcheck(lambda *x: variances(footprint_factors(*x), EPS2D), inputs)
+    assert torch.autograd.gradcheck(lambda *x: torch.stack(variances(footprint_factors(*x), EPS2D)), inputs)
     assert torch.autograd.gradcheck(lambda *x: conics(footprint_factors(*x), EPS2D), inputs)
-    assert torch.autograd.gradcheck(lambda *x: whitening(*variances(footprint_factors(*x), EPS2D)), inputs)
+    assert torch.autograd.gradcheck(lambda *x: torch.stack(whitening(*variances(footprint_factors(*x), EPS2D))), inputs)
 
 
 # -- ordinary footprints -------------------------------------------------------------------------------------------
@@ -201,6 +201,25 @@ def test_float32_chain_on_needles_and_pancakes(shape, ratio, bound):
                 d = torch.tensor([float(offset[0]), float(offset[1])], dtype=torch.float64)
                 got = torch.exp(-(root[i] @ d).square().sum() / 2).item()
                 assert abs(got - exact) < bound
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-5, 1e-3, 1e-2])
+@pytest.mark.parametrize("along", [0, 1])
+def test_needles_nearly_along_an_axis(along, tilt):
+    """2000 px long, 0.02 px thin: the exponent must not be the difference of two large numbers."""
+    directions = torch.tensor(
+        [[math.cos(tilt), math.sin(tilt)], [-math.sin(tilt), math.cos(tilt)]], dtype=torch.float64
+    )
+    factors = torch.zeros(1, 2, 3)
+    factors[0, :, :2] = (directions.T * torch.tensor([2000.0, 0.02])).float()
+    factors = factors.flip(1) if along else factors
+    root = torch.stack(whitening(*variances(factors, EPS2D)), 1).double().reshape(2, 2)
+    exact = torch.linalg.inv(dense(factors.double()))[0]
+    for reach, side in itertools.product((-1500.0, 3.0, 800.0), (-0.5, 0.0, 0.7)):
+        d = (reach * directions[0] + side * directions[1]).float().double()
+        d = d.flip(0) if along else d
+        got, expected = torch.exp(-(root @ d).square().sum() / 2), torch.exp(-(d @ exact @ d) / 2)
+        assert abs(got - expected) < 1.5e-3
 
 
 @pytest.mark.parametrize("eps2d", [0.3, 1e-3])

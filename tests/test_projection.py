@@ -1,5 +1,7 @@
 """`project` against the covariance route in float64, against OpenCV, and against its own contract of what is listed."""
 
+import math
+
 import cv2
 import mpmath
 import numpy as np
@@ -229,13 +231,14 @@ def wide_scene(dtype=torch.float64):
     return replace(gaussians, means=means)
 
 
-def test_the_list_is_everything_in_front_whose_circle_or_cut_touches_the_image():
+REACH = math.sqrt(2 * math.log(2 * 255))  # standard deviations within which a footprint of opacity 2 is drawn
+
+
+def test_the_list_is_everything_in_front_that_would_be_drawn_at_opacity_two():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     got = project(gaussians, cameras)
     pixels, sigma, depths = sigma_route(gaussians, cameras)
-    circle = torch.ceil(3 * torch.linalg.eigvalsh(sigma)[:, 1].sqrt())
-    cut = (2 * torch.log(gaussians.opacities * 255)).clamp_min(0)
-    reach = torch.maximum(circle[:, None], (cut[:, None] * sigma.diagonal(dim1=1, dim2=2)).sqrt())
+    reach = REACH * sigma.diagonal(dim1=1, dim2=2).sqrt()
     size = torch.tensor([WIDTH, HEIGHT], dtype=torch.float64)
     distance = (torch.maximum(-0.5 - pixels, pixels - size + 0.5) - reach).amax(1)  # below 0: the image is touched
     clear = distance.abs() > 0.05
@@ -245,6 +248,20 @@ def test_the_list_is_everything_in_front_whose_circle_or_cut_touches_the_image()
     assert torch.equal(listed[clear], expected[clear])
     assert 50 < len(got) < 400
     assert clear.sum() > 580
+
+
+def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
+    reach = REACH * math.sqrt(0.3) + 0.5
+    places = []
+    for off in (-0.01, 0.01):
+        far = reach + off
+        places += [(-far, 20), (WIDTH - 1 + far, 20), (30, -far), (30, HEIGHT - 1 + far)]
+    camera = pinhole(HEIGHT, WIDTH, 1.0, (0.0, 0.0))
+    means = torch.cat([torch.tensor(places), torch.ones(8, 1)], 1).double()
+    quats, scales = torch.eye(4)[:1].expand(8, 4).double(), torch.full((8, 3), 1e-9).double()
+    got = project(Gaussians(means, quats, scales, torch.full((8,), 0.5).double(), means), camera)
+    assert got.gaussian_ids.tolist() == [0, 1, 2, 3]
+    assert got.radii.tolist() == [2.0] * 4
 
 
 def test_nothing_that_could_be_drawn_is_left_out():
@@ -293,14 +310,17 @@ def test_with_threshold_0_every_gaussian_in_front_is_listed():
     assert torch.equal(listed, (depths > 0.01).nonzero()[:, 0])
 
 
-def test_opacities_above_one_reach_farther():
-    mean = torch.tensor([[-1.0, 0.0, 4.0]], dtype=torch.float64)  # 3.2 px beyond the left border, sigma 1
+@pytest.mark.parametrize(("beyond", "listed"), [(3.2, [True] * 5), (3.5, [True] * 5), (3.6, [False] * 4 + [True])])
+def test_visibility_is_free_of_opacity(beyond, listed):
+    """A dot of variance 1 beside the image: the same for every opacity up to 2; above, the list only grows."""
+    mean = torch.tensor([[0.0, 0.0, 4.0]], dtype=torch.float64)
     one = Gaussians(mean, torch.eye(4)[:1].double(), torch.full((1, 3), 1e-9).double(), torch.ones(1).double(), mean)
-    camera = pinhole(HEIGHT, WIDTH, 4.0, centre=(-2.7, 24.0))
-    assert len(project(one, camera, eps2d=1.0)) == 1
-    camera = pinhole(HEIGHT, WIDTH, 4.0, centre=(-2.86, 24.0))  # 3.36 px: between the cuts of 1 and of 1.25
-    assert len(project(one, camera, eps2d=1.0)) == 0
-    assert len(project(replace(one, opacities=torch.tensor([1.25]).double()), camera, eps2d=1.0)) == 1
+    camera = pinhole(HEIGHT, WIDTH, 4.0, centre=(-0.5 - beyond, 24.0))
+    seen = [
+        len(project(replace(one, opacities=torch.tensor([opacity]).double()), camera, eps2d=1.0)) == 1
+        for opacity in (0.0, 0.2, 1.0, 1.25, 4.0)
+    ]
+    assert seen == listed
 
 
 @pytest.mark.parametrize("near", [0.01, 0.2, 1.0])
@@ -425,19 +445,46 @@ def test_nothing_visible_gives_empty_fields_and_zero_gradients(degree):
     assert all((grad == 0).all() for grad in grads.values())
 
 
+@pytest.mark.parametrize("degree", [None, 2])
+@pytest.mark.parametrize("opacity_rows", [None, 3])
+def test_no_gaussians_at_all(opacity_rows, degree):
+    gaussians, cameras = scene(0, degree, cameras=3)
+    if opacity_rows:
+        gaussians = replace(gaussians, opacities=torch.zeros(opacity_rows, 0, dtype=torch.float64))
+    got = project(gaussians, cameras)
+    assert (len(got), got.num_cameras, got.num_gaussians, got.num_nonfinite.item()) == (0, 3, 0, 0)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e6])
+def test_the_unit_of_length_does_not_matter(unit):
+    gaussians, cameras = scene(degree=2)
+    scaled = replace(gaussians, means=gaussians.means * unit, scales=gaussians.scales * unit)
+    extrinsics = cameras.extrinsics.clone()
+    extrinsics[:, :3, 3] *= unit
+    first = project(gaussians, cameras)
+    moved = PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
+    second = project(scaled, moved, near_plane=0.01 * unit)
+    assert torch.equal(first.gaussian_ids, second.gaussian_ids)
+    torch.testing.assert_close(first.depths, second.depths / unit, rtol=1e-12, atol=1e-12)
+    for name in ("means2d", "factors", "radii", "opacities", "colors"):
+        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=1e-11, atol=1e-11)
+
+
 # -- gradients -----------------------------------------------------------------------------------------------------
 
 
 def packed(gaussians, cameras):
+    """All outputs in one vector: gradcheck would skip an output that lost its graph."""
     got = project(gaussians, cameras)
-    return got.means2d, got.conics, got.depths, got.opacities, got.colors
+    fields = (got.means2d, got.conics, got.depths, got.opacities, got.colors)
+    return torch.cat([field.flatten() for field in fields])
 
 
 @pytest.mark.parametrize("degree", [None, 0, 3])
 def test_gradcheck_with_respect_to_the_gaussians(degree):
     gaussians, cameras = scene(2, degree, cameras=2)
     leaves = [getattr(gaussians, name).requires_grad_() for name in FIELDS]
-    assert len(project(gaussians, cameras)) == 4
+    assert len(project(gaussians, cameras)) == 3, "one of the pairs is not visible"
     assert torch.autograd.gradcheck(lambda *values: packed(Gaussians(*values), cameras), leaves, atol=1e-6)
 
 
@@ -479,7 +526,7 @@ def test_translating_the_world_and_the_camera_together_changes_nothing_so_their_
     values = packed(
         replace(gaussians, means=means), PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
     )
-    sum((v * torch.linspace(-1, 1, v.numel(), dtype=v.dtype).reshape(v.shape)).sum() for v in values).backward()
+    (values * torch.linspace(-1, 1, len(values), dtype=values.dtype)).sum().backward()
     rotation = cameras.extrinsics[0, :3, :3]
     torch.testing.assert_close(means.grad.sum(0), rotation.T @ extrinsics.grad[0, :3, 3], rtol=1e-9, atol=1e-9)
 

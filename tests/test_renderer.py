@@ -56,15 +56,18 @@ def test_each_output_alone_is_the_joint_one_and_the_others_are_none(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_alpha_and_depth_are_what_the_reference_weights_say(dtype):
-    gaussians, camera = random_gaussians(60, 1, dtype), random_camera(24, 32, 1, dtype)
+    gaussians, camera = random_gaussians(25, 1, dtype, image_size=160), random_camera(24, 32, 1, dtype)
     renderer = GaussianRenderer(alpha_threshold=0, transmittance_stop=0)
     out = renderer(gaussians, camera, outputs=("alpha", "depth", "median_depth"))
     layers = kgs.reference.layers(gaussians, camera, 0.0, 0.0)
     bound = 1e-5 if dtype == torch.float32 else 1e-11
     assert (out.alpha[0, 0] - (1 - layers.transmittance)).abs().max() <= bound
     weighted = torch.einsum("lhw,l->hw", layers.weights, layers.depths)
-    covered = 1 - layers.transmittance > 1e-2
-    assert ((out.depth[0, 0] - weighted / (1 - layers.transmittance)).abs() * covered).max() <= 30 * bound
+    alpha = 1 - layers.transmittance  # rounded near 1, which is what divides the sum
+    assert (alpha < 1e-3).any()
+    covered = alpha > 1.1e-6
+    assert ((out.depth[0, 0] * alpha - weighted).abs() * covered).max() <= 10 * bound
+    assert not out.depth[0, 0][alpha < 0.9e-6].any()
     light = 1 - torch.cumsum(layers.weights, 0)
     first = (light < 0.5).double().argmax(0)
     expected = torch.where((light < 0.5).any(0), layers.depths[first], 0.0)
@@ -142,29 +145,26 @@ def test_sixteen_cameras_at_once_are_sixteen_single_ones(dtype):
         assert largest(a, b) <= (1e-5 if dtype == torch.float32 else 1e-13) * b.abs().max()
 
 
-@pytest.mark.parametrize(("size", "views"), [((16, 4096), 1), ((64, 4096), 8)])
+# 512 tiles in a row; 2^15 tiles and a few more, with the last of them lit; far more than 16 bits can number
+@pytest.mark.parametrize(("size", "views"), [((16, 4096), 1), ((8, 131080), 2), ((64, 4096), 9)])
 def test_many_tiles_keep_their_numbers(size, views):
-    # 512 tiles in a row; 8 x 8 x 512 = 2^15 tiles are the first count that 16 bits do not hold
     height, width = size
-    focal = (2000.0, 2000.0)
     columns = torch.linspace(3, width - 4, 41, dtype=torch.float64).round()
-    means = torch.stack([(columns - (width - 1) / 2) / focal[0], torch.zeros(41), torch.ones(41)], 1) * 2
-    generator = torch.Generator().manual_seed(0)
+    means = torch.stack([(columns - (width - 1) / 2) / 2000, torch.zeros(41), torch.ones(41)], 1) * 2
     dots = Gaussians(
-        means=means.float(),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(41, 1),
-        scales=torch.full((41, 3), 1e-6),
-        opacities=torch.full((41,), 0.5),
-        colors=torch.rand(41, 3, generator=generator) + 0.1,
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(41, 1),
+        scales=torch.full((41, 3), 1e-9, dtype=torch.float64),
+        opacities=torch.full((41,), 0.5, dtype=torch.float64),
+        colors=torch.rand(41, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1,
     )
-    camera = pinhole(height, width, focal, dtype=torch.float32)
-    image = GaussianRenderer()(dots, batch([camera] * views)).image
+    image = GaussianRenderer()(dots, batch([pinhole(height, width, (2000.0, 2000.0))] * views)).image
     lit = image[:, :, (height - 1) // 2 : height // 2 + 1].sum(2)  # the two middle rows share each dot
     scale = 2 * 0.5 * math.exp(-0.5 * 0.25 / 0.3)
-    assert (lit[:, :, columns.long()] - scale * dots.colors.T).abs().max() <= 1e-4
+    assert (lit[:, :, columns.long()] - scale * dots.colors.T).abs().max() <= 1e-6
     dark = torch.ones(width, dtype=torch.bool)
     for shift in (-3, -2, -1, 0, 1, 2, 3):
-        dark[(columns.long() + shift)] = False
+        dark[columns.long() + shift] = False
     assert not image[..., dark].any()
 
 
@@ -187,7 +187,7 @@ def test_orthographic_camera_is_the_marginal_of_each_gaussian():
     covariance = local @ torch.diag(gaussians.scales[0] ** 2) @ local.T
     rotation, translation = turn[0, :3, :3], turn[0, :3, 3]
     view = torch.diag(torch.tensor([fx, fy])).double() @ (rotation @ covariance @ rotation.T)[:2, :2]
-    marginal = view @ torch.diag(torch.tensor([fx, fy])).double() + 0.3 * torch.eye(2)
+    marginal = view @ torch.diag(torch.tensor([fx, fy])).double() + 0.3 * torch.eye(2, dtype=torch.float64)
     centre = (rotation @ gaussians.means[0] + translation)[:2] * torch.tensor([fx, fy]) + torch.tensor([cx, cy])
     d = torch.cartesian_prod(torch.arange(24), torch.arange(32)).flip(1) - centre
     expected = gaussians.opacities[0] * torch.exp(-0.5 * (d * torch.linalg.solve(marginal, d.T).T).sum(1))
@@ -405,7 +405,7 @@ def test_results_have_the_dtype_of_the_gaussians(dtype):
 @pytest.mark.parametrize("backward_inside", [False, True])
 def test_autocast_changes_nothing(backward_inside):
     camera = random_camera(24, 32, 0, torch.float32)
-    gaussians, inputs = with_grad(random_gaussians(40, 0, torch.float32, 3))
+    gaussians, inputs = with_grad(random_gaussians(40, 0, torch.float32, None))
     image = GaussianRenderer()(gaussians, camera).image
     expected = [image, *torch.autograd.grad(image.square().sum(), inputs)]
     with torch.autocast("cpu", torch.bfloat16):
@@ -415,8 +415,10 @@ def test_autocast_changes_nothing(backward_inside):
             found = torch.autograd.grad(loss, inputs)
     if not backward_inside:
         found = torch.autograd.grad(loss, inputs)
-    for a, b in zip([image, *found], expected, strict=True):
-        assert largest(a, b) <= 1e-6 * b.abs().max()
+    for name, a, b in zip(("image", *FIELDS), [image, *found], expected, strict=True):
+        # torch itself rounds the matrix products of its own backward formulas there, as it warns: the projection's
+        rounded = backward_inside and name in ("means", "quats", "scales")
+        assert largest(a, b) <= (2e-2 if rounded else 1e-6) * b.abs().max(), name
 
 
 def test_matmul_precision_changes_nothing():

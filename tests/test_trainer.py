@@ -1,6 +1,7 @@
 """Trainer: determinism, resume, and that nothing depends on the test views."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -52,7 +53,7 @@ def test_it_learns(whole, scene):
     curve = whole.curve
     assert [point["step"] for point in curve] == [20, 40, 60]
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"] + 1
-    assert all(a["seconds"] < b["seconds"] for a, b in zip(curve, curve[1:], strict=False))
+    assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
 
 
 def test_gaussians_were_added_on_the_way(whole, points):

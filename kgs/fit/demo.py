@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from kgs.datasets.scene import Scene
-from kgs.datasets.synthetic import synthetic_scene
 
 from .config import FitConfig
 from .report import side_by_side, write_curve, write_json, write_png
@@ -21,23 +20,21 @@ DEMO = FitConfig(steps=1500, drop=0.2, max_gaussians=8000)
 
 
 def run_demo(
-    out: Path, config: FitConfig = DEMO, *, scene: Scene | None = None, say: Callable[[str], None] = print
+    scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable[[str], None] = print
 ) -> dict[str, Any]:
     """Fit the same scene twice and compare on views that neither fit has seen.
 
     Args:
+        scene: what to fit, with test views.
         out: folder for demo.png, curve.png and metrics.json.
         config: the fit with DropGaussian; the other has drop = 0 and is equal otherwise, the first points and the
             order of views included.
-        scene: another scene than the built-in one.
         say: where lines for the user go.
 
     Returns:
         What metrics.json holds: `{"without": run, "with": run}`.
     """
     out.mkdir(parents=True, exist_ok=True)
-    if scene is None:
-        scene = synthetic_scene(train_views=3, seed=config.seed)
     points = choose_points(scene, config)
     say(
         f"{len(scene.train)} training and {len(scene.test)} test views of "

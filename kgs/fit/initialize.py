@@ -16,8 +16,9 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
-from kgs.fit.tracks import find_tracks
-from kgs.fit.triangulate import camera_centers, project_all, triangulate_certain
+
+from .tracks import find_tracks
+from .triangulate import camera_centers, project_all, triangulate_certain
 
 __all__ = ["FirstPoints", "first_points", "relative_near_plane"]
 

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,10 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
         if len(scene.points) == 0:
             raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
-    return first_points(scene.train, kind, seed=config.seed, file=config.init_file)
+    found = first_points(scene.train, kind, seed=config.seed, file=config.init_file)
+    if kind == "file":  # in the world's coordinates, as the files that kgs writes
+        found = replace(found, points=(found.points.double() - scene.offset).float())
+    return found
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> bool:

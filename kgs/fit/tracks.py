@@ -22,10 +22,9 @@ __all__ = ["Tracks", "find_tracks"]
 
 SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
 MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
+CHUNK = 256  # keypoints matched at once: bounds the memory
 MAX_RATIO = 0.8  # of the best descriptor distance to the second best
-MAX_DISTANCE = (
-    0.4  # between descriptors of length 1: a match that has no rival on its epipolar line must still be alike
-)
+MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival must still be alike
 
 
 @dataclass(frozen=True)
@@ -107,13 +106,20 @@ def _match(
     fundamental = fundamental_from_projections(projection1[None], projection2[None])[0]
     lines = convert_points_to_homogeneous(places1) @ fundamental.T
     lines = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
-    off_line = lines @ convert_points_to_homogeneous(places2).float().T
-    rows, columns = (off_line.abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
-    # One candidate pair in about a hundred is left, so this is a tenth of the work of all distances.
-    distances = (descriptors1.index_select(0, rows) - descriptors2.index_select(0, columns)).square_().sum(1).sqrt_()
+    targets = convert_points_to_homogeneous(places2).float().T
+    candidates: list[tuple[Tensor, Tensor, Tensor]] = []
+    for start in range(0, len(lines), CHUNK):
+        near_line = (lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE
+        rows, columns = near_line.nonzero().unbind(1)
+        # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
+        differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
+        candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
+    if not candidates:
+        return torch.zeros(0), torch.zeros(0, 2, dtype=torch.int64)
+    rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
     nearest1, rival1 = _nearest(distances, rows, len(places1))
     nearest2, rival2 = _nearest(distances, columns, len(places2))
-    distinct = distances <= MAX_RATIO * torch.minimum(rival1, rival2)
+    distinct = distances < MAX_RATIO * torch.minimum(rival1, rival2)
     good = nearest1 & nearest2 & distinct & (distances < MAX_DISTANCE)
     return distances[good], torch.stack([rows[good], columns[good]], dim=1)
 

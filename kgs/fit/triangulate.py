@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kgs.fit.tracks import Tracks
+from .tracks import Tracks
 
 __all__ = ["camera_centers", "project_all", "triangulate", "triangulate_certain"]
 

@@ -1,0 +1,165 @@
+"""The command `kgs`, as a user types it."""
+
+import json
+import os
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import kgs
+from kgs.cli import main
+from kgs.datasets.synthetic import synthetic_scene
+
+STEPS = 30
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The synthetic orbit scene as a Blender folder."""
+    root = tmp_path_factory.mktemp("scene")
+    scene = synthetic_scene("orbit", train_views=4, test_views=2, size=(36, 40), seed=0)
+    for split, views in (("train", scene.train), ("test", scene.test)):
+        (root / split).mkdir()
+        frames = []
+        for i, image in enumerate(views.images):
+            pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
+            rgba = np.dstack([pixels[:, :, ::-1], np.full(pixels.shape[:2], 255, np.uint8)])
+            cv2.imwrite(str(root / split / f"r_{i}.png"), rgba)
+            pose = (
+                torch.linalg.inv(views.cameras.extrinsics[i].double())
+                @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+            )
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+        width, focal = views.images.shape[-1], float(views.cameras.fx[0])
+        content = {"camera_angle_x": 2 * float(np.arctan(width / 2 / focal)), "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    return stop.value.code
+
+
+@pytest.fixture(scope="module")
+def fitted(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    assert run("fit", folder, "-o", out, "--steps", STEPS, "--max-gaussians", 3000) == 0
+    return out
+
+
+def test_fit_writes_everything(fitted):
+    assert {"splat.ply", "metrics.json", "config.json", "curve.png", "checkpoint.pt", "test"} <= set(os.listdir(fitted))
+    assert sorted(os.listdir(fitted / "test")) == ["test_r_0.png", "test_r_1.png"]
+    assert cv2.imread(str(fitted / "test" / "test_r_0.png")).shape == (36, 40, 3)
+    assert cv2.imread(str(fitted / "curve.png")) is not None
+
+
+def test_metrics_have_the_agreed_keys(fitted):
+    metrics = json.loads((fitted / "metrics.json").read_text())
+    assert set(metrics) == {
+        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "steps", "seed", "drop", "init", "protocol",
+        "versions",
+    }  # fmt: skip
+    assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
+    assert metrics["test"]["lpips_vgg"] is None
+    assert set(metrics["curve"][-1]) == {"step", "seconds", "test_psnr", "train_psnr"}
+    assert metrics["curve"][-1]["test_psnr"] == pytest.approx(metrics["test"]["psnr"], abs=1e-3)
+    assert (metrics["steps"], metrics["drop"]) == (STEPS, 0.2)
+    assert metrics["init"] == {"kind": "random", "points": 10_000}
+
+
+def test_the_splat_is_the_model(fitted):
+    model = kgs.load_ply(fitted / "splat.ply")
+    assert len(model) == json.loads((fitted / "metrics.json").read_text())["gaussians"]
+    assert model.max_sh_degree == 3
+
+
+def test_config_says_what_happens_when(fitted):
+    config = json.loads((fitted / "config.json").read_text())
+    assert config["fit"]["steps"] == STEPS
+    assert config["timetable"]["densify"] == [10, 20]
+
+
+def test_render_gives_the_pictures_of_fit(fitted, folder, tmp_path):
+    assert run("render", fitted / "splat.ply", "--cameras", folder, "-o", tmp_path) == 0
+    assert len(os.listdir(tmp_path)) == 6
+    for name in os.listdir(fitted / "test"):
+        one, two = (cv2.imread(str(path / name)).astype(int) for path in (tmp_path, fitted / "test"))
+        assert np.abs(one - two).max() <= 1
+
+
+def test_eval_measures_the_same(fitted, capsys):
+    before = json.loads((fitted / "metrics.json").read_text())
+    assert run("eval", fitted) == 0
+    after = json.loads((fitted / "metrics.json").read_text())
+    assert after["test"] == before["test"]
+    assert "PSNR" in capsys.readouterr().out
+
+
+def test_resume_of_a_finished_fit_changes_nothing(fitted, folder):
+    before = (fitted / "splat.ply").read_bytes()
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--max-gaussians", 3000, "--resume") == 0
+    assert (fitted / "splat.ply").read_bytes() == before
+
+
+def test_resume_with_other_numbers_is_refused(fitted, folder, capsys):
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS + 1, "--max-gaussians", 3000, "--resume") == 2
+    assert "config.steps" in one_line(capsys)
+
+
+def one_line(capsys):
+    captured = capsys.readouterr().err.strip().splitlines()
+    assert len(captured) == 1, captured
+    assert captured[0].startswith("kgs: ")
+    return captured[0]
+
+
+def test_bare_photos_need_poses(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "a.png"), np.zeros((20, 20, 3), np.uint8))
+    assert run("fit", tmp_path / "photos", "-o", tmp_path / "out") == 2
+    assert "poses" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["fit", "{missing}", "-o", "{out}"], "missing"),
+        (["fit", "{scene}", "-o", "{out}", "--views", "99"], "train_views"),
+        (["fit", "{scene}", "-o", "{out}", "--drop", "1.0"], "drop"),
+        (["fit", "{scene}", "-o", "{out}", "--init", "file", "--init-file", "{missing}"], "missing"),
+        (["fit", "{scene}", "-o", "{out}", "--lpips-weights", "{missing}"], "missing"),
+        (["render", "{missing}", "--cameras", "{scene}", "-o", "{out}"], "missing"),
+        (["eval", "{missing}"], "config.json"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(folder, tmp_path, capsys, arguments, said):
+    places = {"missing": tmp_path / "missing", "scene": folder, "out": tmp_path / "out"}
+    assert run(*(argument.format(**places) for argument in arguments)) == 2
+    assert said in one_line(capsys)
+
+
+def test_a_missing_extra_is_named():
+    code = "import sys; sys.modules['tyro'] = None\nimport kgs.cli\nkgs.cli.main(['demo'])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 2
+    assert 'pip install "kgs-splat[app]"' in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_demo_compares_at_equal_starts(tmp_path, capsys):
+    assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40) == 0
+    runs = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(runs) == {"without", "with"}
+    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, 0.2)
+    assert runs["without"]["init"] == runs["with"]["init"]
+    gain = runs["with"]["test"]["psnr"] - runs["without"]["test"]["psnr"]
+    assert f"{gain:+.2f} dB" in capsys.readouterr().out
+    assert cv2.imread(str(tmp_path / "demo.png")) is not None
+    assert cv2.imread(str(tmp_path / "curve.png")) is not None
