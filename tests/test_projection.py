@@ -17,6 +17,10 @@ from kgs import DropGaussian, Gaussians, PosedCamera, project
 
 HEIGHT, WIDTH = 48, 64
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
+LENGTHS = {kind: 0 for kind in CameraModelType} | {  # of the distortion
+    CameraModelType.BROWN_CONRADY: 8,
+    CameraModelType.KANNALA_BRANDT_K3: 4,
+}
 PACKED = ("means2d", "factors", "depths", "radii", "opacities", "colors")
 
 
@@ -286,25 +290,20 @@ def test_the_list_is_ordered_by_camera_and_then_by_gaussian():
     assert got.camera_ids.dtype == got.gaussian_ids.dtype == torch.int64
 
 
-def test_dropped_gaussians_stay_listed_with_their_footprint():
-    gaussians, cameras = scene(200)
-    drop = DropGaussian(p=0.5, schedule="constant", seed=0)
-    full, dropped = (
-        project(gaussians, cameras),
-        project(replace(gaussians, opacities=drop(gaussians.opacities)), cameras),
-    )
-    in_image = ((full.means2d >= 0) & (full.means2d <= torch.tensor([WIDTH - 1, HEIGHT - 1]))).all(1)
-    assert set(full.gaussian_ids[in_image].tolist()) <= set(dropped.gaussian_ids.tolist())
-    assert 50 < (dropped.opacities == 0).sum() < 150
-    common = torch.isin(full.gaussian_ids, dropped.gaussian_ids)
-    back = torch.isin(dropped.gaussian_ids, full.gaussian_ids)
-    for name in ("means2d", "factors", "depths", "radii", "colors"):
-        assert torch.equal(getattr(full, name)[common], getattr(dropped, name)[back])
+@pytest.mark.parametrize("threshold", [1 / 255, 0.0])
+def test_dropped_gaussians_stay_listed_and_only_the_opacities_tell_them(threshold):
+    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
+    opacities = DropGaussian(p=0.45, schedule="constant", seed=0)(gaussians.opacities)
+    assert opacities.max() > 1
+    full = project(gaussians, cameras, alpha_threshold=threshold)
+    dropped = project(replace(gaussians, opacities=opacities), cameras, alpha_threshold=threshold)
+    assert (dropped.opacities == 0).sum() > 20
+    for name in ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "colors"):
+        assert torch.equal(getattr(full, name), getattr(dropped, name))
 
 
 def test_with_threshold_0_every_gaussian_in_front_is_listed():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
-    gaussians = replace(gaussians, opacities=gaussians.opacities.clamp_min(1e-6))
     depths = sigma_route(gaussians, cameras)[2]
     listed = project(gaussians, cameras, alpha_threshold=0.0).gaussian_ids
     assert torch.equal(listed, (depths > 0.01).nonzero()[:, 0])
@@ -403,6 +402,25 @@ def test_an_opacity_that_is_not_finite_for_one_camera_counts_once():
     assert 4 not in got.gaussian_ids.tolist()
 
 
+@pytest.mark.parametrize("log_scale", [-100.0, 44.0, 60.0, 88.0])
+def test_finite_scales_of_any_size_give_finite_values_and_gradients_and_harm_no_other(log_scale):
+    gaussians, cameras = scene(40, dtype=torch.float32)
+    victim = 7
+    others = torch.arange(40) != victim
+    expected, expected_grads = values_and_gradients(select(gaussians, others), cameras)
+    scales = gaussians.scales.clone()
+    scales[victim, 2] = math.exp(log_scale)
+    got, grads = values_and_gradients(replace(gaussians, scales=scales), cameras)
+    assert got.num_nonfinite.item() == 0
+    rest = got.gaussian_ids != victim
+    for name in PACKED:
+        assert torch.equal(getattr(got, name)[rest], getattr(expected, name))
+        assert getattr(got, name).isfinite().all()
+    for field in FIELDS:
+        torch.testing.assert_close(grads[field][others], expected_grads[field], rtol=1e-6, atol=0)
+        assert grads[field].isfinite().all()
+
+
 # -- batches -------------------------------------------------------------------------------------------------------
 
 
@@ -442,6 +460,19 @@ def test_nothing_visible_gives_empty_fields_and_zero_gradients(degree):
     shapes = [tuple(getattr(got, name).shape) for name in ("camera_ids", "gaussian_ids", *PACKED)]
     assert shapes == [(0,), (0,), (0, 2), (0, 2, 3), (0,), (0,), (0,), (0, 3)]
     assert got.conics.shape == (0, 3)
+    assert all((grad == 0).all() for grad in grads.values())
+
+
+@pytest.mark.parametrize("kind", list(CameraModelType))
+def test_other_camera_models_with_nothing_visible_or_no_gradient_asked_for(kind):
+    gaussians, cameras = scene(5)
+    params = torch.tensor([60.0, 60, 31, 24, *[0.01] * LENGTHS[kind]], dtype=torch.float64)
+    camera = posed(kind, params, cameras.extrinsics)
+    seen = project(gaussians, camera)
+    assert len(seen) > 0
+    assert not any(getattr(seen, name).requires_grad for name in PACKED)
+    got, grads = values_and_gradients(replace(gaussians, means=-gaussians.means), camera)
+    assert len(got) == 0
     assert all((grad == 0).all() for grad in grads.values())
 
 
@@ -508,9 +539,8 @@ def test_gradcheck_with_respect_to_extrinsics_and_intrinsics():
 )
 def test_gradcheck_through_other_camera_models(kind):
     gaussians, cameras = scene(2, 1)
-    distortion = {CameraModelType.BROWN_CONRADY: 8, CameraModelType.KANNALA_BRANDT_K3: 4}.get(kind, 0)
     focal = 8.0 if kind is CameraModelType.ORTHOGRAPHIC else 60.0
-    params = torch.tensor([focal, focal, 31, 24, *[0.01] * distortion], dtype=torch.float64, requires_grad=True)
+    params = torch.tensor([focal, focal, 31, 24, *[0.01] * LENGTHS[kind]], dtype=torch.float64, requires_grad=True)
     gaussians = inner(gaussians)
     leaves = [getattr(gaussians, name).requires_grad_() for name in FIELDS]
 
@@ -541,6 +571,19 @@ def test_dtype_and_device_of_cameras_and_gaussians_must_agree():
     elsewhere = Gaussians(*(getattr(gaussians, name).to("meta") for name in FIELDS))
     with pytest.raises(TypeError, match="cameras: expected torch.float64 on meta"):
         project(elsewhere, cameras)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_intrinsics_of_another_dtype_are_refused_too(dtype):
+    gaussians, cameras = scene(dtype=dtype)
+    other = torch.float32 if dtype == torch.float64 else torch.float64
+    mixed = PinholeCamera(cameras.intrinsics.to(other), cameras.extrinsics, cameras.height, cameras.width)
+    with pytest.raises(TypeError, match=f"cameras: expected {dtype} on cpu .* got {other} on cpu"):
+        project(gaussians, mixed)
+    for kind in CameraModelType:
+        params = torch.tensor([60.0, 60, 31, 24, *[0.0] * LENGTHS[kind]], dtype=other)
+        with pytest.raises(TypeError, match=f"cameras: expected {dtype} on cpu .* got {other} on cpu"):
+            project(gaussians, posed(kind, params, cameras.extrinsics))
 
 
 def test_camera_errors():

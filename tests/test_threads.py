@@ -100,6 +100,11 @@ def test_a_call_from_another_thread(threads):
     assert in_a_new_thread(lambda: collect(list(range(20)))[0]) == list(range(20))
 
 
+def test_a_call_from_a_piece(threads):
+    nested, _ = collect(list(range(6)), work=lambda item: collect([item] * 3)[0])
+    assert nested == [[item] * 3 for item in range(6)]
+
+
 def test_calls_at_the_same_time(threads):
     answers = [None] * 4
 
@@ -126,6 +131,25 @@ def test_errors_of_a_piece_reach_the_caller_and_the_next_call_works(threads, cul
         collect(list(range(20)), work=work)
     assert torch.get_num_threads() == threads
     assert collect(list(range(20)))[0] == list(range(20))
+
+
+def test_no_piece_is_under_way_and_few_were_begun_when_the_caller_sees_an_error(threads):
+    lock, begun, under_way = threading.Lock(), [], set()
+
+    def work(item):
+        with lock:
+            begun.append(item)
+            under_way.add(item)
+        if item == 0:
+            under_way.remove(item)
+            raise KeyError("first")
+        threading.Event().wait(0.005)
+        under_way.remove(item)
+
+    with pytest.raises(KeyError, match="first"):
+        collect(list(range(50)), work=work)
+    assert not under_way
+    assert len(begun) < 25
 
 
 def test_errors_of_making_a_worker_reach_the_caller(threads):

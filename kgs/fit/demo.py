@@ -16,7 +16,7 @@ from .trainer import Trainer
 
 __all__ = ["DEMO", "run_demo"]
 
-DEMO = FitConfig(steps=1500, drop=0.2, max_gaussians=8000)
+DEMO = FitConfig(steps=1200, drop=0.2, max_gaussians=6000)
 
 
 def run_demo(
