@@ -36,8 +36,6 @@ from .types import ProjectedGaussians
 
 __all__ = ["Composited", "composite"]
 
-_BYTES_PER_ENTRY = 160  # lists, sorting, saved transmittance and gradients, for 8 x 8 tiles
-
 
 @dataclass(frozen=True)
 class Composited:
@@ -83,15 +81,20 @@ def composite(
     Raises:
         ValueError: an option is out of range, or one row of tiles alone exceeds `max_bytes`.
     """
-    _check_options(tile_size, alpha_threshold, transmittance_stop, chunk_size)
+    check_options(tile_size, alpha_threshold, transmittance_stop, chunk_size)
     inputs = (projected.means2d, projected.factors, projected.opacities, features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
     rules = Rules(alpha_threshold, transmittance_stop, median_depth, chunk_size)
     with torch.no_grad():
         spans = tile_spans(projected, tile_size, alpha_threshold)
-    bands = spans.bands(max(1, max_bytes // _BYTES_PER_ENTRY))
+    bands = spans.bands(max(1, max_bytes // bytes_per_entry(features.shape[1], tile_size, features.dtype)))
     sums, transmittance, median = _Composite.apply(*inputs, projected, spans, bands, rules, keep)
     return Composited(sums, transmittance, median if median_depth else None)
+
+
+def bytes_per_entry(width: int, tile_size: int, dtype: torch.dtype) -> int:
+    """Working memory for one Gaussian in one tile: lists and sorting, gradients with their sum, and saved light."""
+    return 80 + (8 + 2 * width + tile_size**2 // 8) * dtype.itemsize
 
 
 class _Composite(torch.autograd.Function):
@@ -215,9 +218,10 @@ def _to_tiles(images: Tensor, spans: TileSpans) -> Tensor:
     return tiles.reshape(cameras * rows * columns, channels, size * size)
 
 
-def _check_options(tile_size: int, alpha_threshold: float, transmittance_stop: float, chunk_size: int | None) -> None:
-    if tile_size < 1:
-        raise ValueError(f"tile_size: expected at least 1, got {tile_size}")
+def check_options(tile_size: int, alpha_threshold: float, transmittance_stop: float, chunk_size: int | None) -> None:
+    """Raise a ValueError for an option of `composite` that is out of range."""
+    if not isinstance(tile_size, int) or tile_size < 1:
+        raise ValueError(f"tile_size: expected an integer >= 1, got {tile_size}")
     if chunk_size is not None and chunk_size < 1:
         raise ValueError(f"chunk_size: expected at least 1 or None, got {chunk_size}")
     for name, value in (("alpha_threshold", alpha_threshold), ("transmittance_stop", transmittance_stop)):

@@ -38,8 +38,8 @@ def project(
     Args:
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        near_plane: only centres with z > near_plane in the camera frame are kept; > 0 in world units for perspective
-            cameras.
+        near_plane: only centres with z > near_plane in the camera frame are kept; in world units, at least 1e-7 for
+            perspective cameras (Kornia does not divide by less than 1e-8).
         eps2d: variance in px^2 added to the diagonal of each footprint, >= 0.
         alpha_threshold: alphas below it are not drawn; with 0 every Gaussian in front of the camera is listed.
         colors: whether colours are wanted.
@@ -170,7 +170,7 @@ def _touches_image(
     reach_x, reach_y = reach * xx.sqrt(), reach * yy.sqrt()
     height, width = size
     seen = (x + reach_x > -0.5) & (x - reach_x < width - 0.5) & (y + reach_y > -0.5) & (y - reach_y < height - 0.5)
-    overflow = ~torch.isfinite(largest + det + x + y)
+    overflow = ~torch.isfinite(largest + x + y)
     return seen & (det > 0), radii, overflow
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from .compositing import composite
+from .compositing import check_options, composite
 from .projection import project
 from .types import Cameras, Gaussians, Rendering
 
@@ -30,6 +31,9 @@ class GaussianRenderer(nn.Module):
         alpha_threshold: alphas below it are skipped. The knob that trades accuracy for time: 0 is exact.
         transmittance_stop: a pixel is done when less light than this is left.
         max_bytes: bound for the working memory of one call.
+
+    Raises:
+        ValueError: an option is out of range.
 
     Example:
         >>> import torch, kgs
@@ -54,6 +58,10 @@ class GaussianRenderer(nn.Module):
         max_bytes: int = 2**30,
     ) -> None:
         super().__init__()
+        check_options(tile_size, alpha_threshold, transmittance_stop, None)
+        for name, value in (("near_plane", near_plane), ("eps2d", eps2d)):
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name}: expected a finite number >= 0, got {value}")
         self.opacity_layer = nn.Identity() if opacity_layer is None else opacity_layer
         self.tile_size = tile_size
         self.near_plane = near_plane

@@ -181,7 +181,7 @@ class TileBins:
         first_tile: number of the band's first tile among all tiles of all cameras.
         offsets: `(T + 1,)` int64; the entries of tile t are `offsets[t]:offsets[t + 1]`.
         entries: `(E,)` int32, position in `ids`, sorted by tile and then from front to back.
-        ids: `(n,)` int64, the rows of `ProjectedGaussians` that have an entry, in depth order.
+        ids: `(n,)` int64, the rows of `ProjectedGaussians` that may have entries, in depth order.
         by_gaussian: `(E,)` int64, the entries of `ids[0]`, then of `ids[1]`, ...
         gaussian_offsets: `(n,)` int64, where the entries of each of `ids` begin in `by_gaussian`.
     """

@@ -11,6 +11,7 @@ from oracles import near_threshold, pinhole, random_camera, random_gaussians, th
 
 import kgs.reference
 from kgs import GaussianRenderer, ProjectedGaussians, composite, project
+from kgs.compositing import bytes_per_entry
 from kgs.tiles import tile_spans
 
 TH, STOP = 1 / 255, 1e-4
@@ -262,7 +263,7 @@ def dense(means2d, factors, opacities, features, depths, size, eps2d):
 
 
 @pytest.mark.parametrize("chunk_size", [1, 3, None])
-@pytest.mark.parametrize("max_bytes", [2**30, 160 * 2000])
+@pytest.mark.parametrize("max_bytes", [2**30, 168 * 2000])
 def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
     # veils over all, and an opaque curtain for each column of tiles at another depth: tiles end one after the other
     size, columns, veils = (20, 72), 9, 120
@@ -291,9 +292,11 @@ def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
 def test_byte_budget_changes_nothing(dtype):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     largest = int(tile_spans(projected, 8, TH).entries_per_row.max())
-    assert len(tile_spans(projected, 8, TH).bands(largest)) >= 4  # 160 bytes an entry, as composite counts them
+    assert len(tile_spans(projected, 8, TH).bands(largest)) >= 4
     free, free_gradients = loss_and_gradients(projected, colors, weights)
-    tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=160 * largest)
+    tight, tight_gradients = loss_and_gradients(
+        projected, colors, weights, max_bytes=bytes_per_entry(3, 8, dtype) * largest
+    )
     assert torch.equal(tight, free)
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
 

@@ -509,3 +509,21 @@ def test_repr_says_the_options():
     assert "tile_size=16" in text
     assert "alpha_threshold=0.00392157" in text
     assert "DropGaussian" in text
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"near_plane": float("nan")},
+        {"near_plane": -1.0},
+        {"eps2d": -1.0},
+        {"eps2d": float("inf")},
+        {"tile_size": 0},
+        {"tile_size": 8.5},
+        {"alpha_threshold": 1.0},
+        {"transmittance_stop": -1e-9},
+    ],
+)
+def test_options_out_of_range_are_refused_when_the_renderer_is_made(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        GaussianRenderer(**option)

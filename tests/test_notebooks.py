@@ -1,0 +1,151 @@
+"""The notebooks run from top to bottom in a fresh kernel and show what they say; small here, in full with -m slow."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+pytest.importorskip("ipykernel")
+pytest.importorskip("matplotlib")
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+LIMIT_QUICK = 60  # seconds; meant to be under 15
+LIMIT_FULL = 120
+
+# What must be true in the kernel after the last cell: of any run, and of a full one.
+CLAIMS = {
+    "01_drop_gaussian_layer": (
+        """
+        assert drop.eval()(opacities) is opacities
+        counts, errors = curves[next(iter(curves))]
+        assert abs(errors[0] / errors[-1] / (counts[-1] / counts[0]) ** 0.5 - 1) < 0.3
+        """,
+        """
+        assert len(opacities) == 250 and 5e-4 < (full - target).abs().mean() < 0.03
+        assert curves["opacities as fitted"][1][-1] > errors[-1]
+        """,
+    ),
+    "02_camera_pose_by_gradient": (
+        """
+        assert history[-1][0] < history[0][0]
+        assert min(relative) < 1e-7
+        """,
+        """
+        assert history[0][0] > 5 and history[0][1] > 5
+        assert history[-1][0] < 0.05 and history[-1][1] < 0.1
+        assert (after - picture).abs().mean() < 0.02 * (before - picture).abs().mean()
+        """,
+    ),
+    "03_three_views": (
+        """
+        assert without.step == with_drop.step == STEPS
+        assert with_drop.drop.rate == 0.2 and without.drop is None
+        assert without.curve[-1]["train_psnr"] > without.curve[0]["train_psnr"]
+        """,
+        """
+        gaps = [trainer.curve[-1]["train_psnr"] - trainer.curve[-1]["test_psnr"] for trainer in (without, with_drop)]
+        assert gaps[0] > gaps[1] + 0.5 > 2.5
+        assert without.curve[-1]["test_psnr"] > 18
+        """,
+    ),
+}
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory):
+    """Kernels do not see the checkout as pytest does, so kgs has to be installed."""
+    probe = subprocess.run(
+        [sys.executable, "-c", "import kgs.losses, kgs.datasets"],
+        cwd=tmp_path_factory.mktemp("elsewhere"),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if probe.returncode:
+        pytest.skip(f"kgs is not installed for {sys.executable}: {probe.stderr.strip().splitlines()[-1]}")
+
+
+def execute(path, folder, quick):
+    """Run a notebook and its claims in a kernel of this very Python, whatever kernels the user has."""
+    from jupyter_client.kernelspec import KernelSpecManager
+    from jupyter_client.manager import AsyncKernelManager
+
+    notebook = nbformat.read(path, as_version=4)
+    for claims in CLAIMS[path.stem][: 1 if quick else 2]:
+        lines = [line.strip() for line in claims.strip().splitlines()]
+        notebook.cells.append(nbformat.v4.new_code_cell("\n".join(lines)))
+    environment = {key: value for key, value in os.environ.items() if key not in ("KGS_QUICK", "MPLBACKEND")}
+    environment["IPYTHONDIR"] = str(folder / "ipython")
+    # the tensors are small: on a busy machine a second thread costs far more than it brings
+    environment.setdefault("OMP_NUM_THREADS", "1")
+    if quick:
+        environment["KGS_QUICK"] = "1"
+    end = time.monotonic() + (LIMIT_QUICK if quick else LIMIT_FULL)
+    client = nbclient.NotebookClient(
+        notebook,
+        km=AsyncKernelManager(kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[])),
+        resources={"metadata": {"path": str(folder)}},
+        timeout_func=lambda cell: max(1, end - time.monotonic()),
+    )
+    client.execute(env=environment)
+    return notebook
+
+
+def pictures(notebook):
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    return sum(any(kind.startswith("image/") for kind in output.get("data", {})) for output in outputs)
+
+
+def test_each_notebook_has_claims():
+    assert [path.stem for path in NOTEBOOKS] == sorted(CLAIMS)
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_runs_quickly(path, tmp_path):
+    notebook = execute(path, tmp_path, quick=True)
+    assert pictures(notebook) == pictures(nbformat.read(path, as_version=4))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["ipython"], "a notebook leaves files behind"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_runs_in_full(path, tmp_path):
+    execute(path, tmp_path, quick=False)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_one_cell_near_the_top_sets_the_sizes(path):
+    cells = nbformat.read(path, as_version=4).cells
+    reading = [i for i, cell in enumerate(cells) if "KGS_QUICK" in cell.source]
+    assert reading == [1]
+    assert [i for i, cell in enumerate(cells) if "environ" in cell.source] == [1]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_is_stored_as_run_from_top_to_bottom(path):
+    notebook = nbformat.read(path, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    outputs = [output for cell in code for output in cell.outputs]
+    assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
+    assert pictures(notebook) >= 3
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_is_small_and_names_no_place_on_a_disk(path):
+    assert path.stat().st_size < 400_000
+    notebook = nbformat.read(path, as_version=4)
+    texts = [cell.source for cell in notebook.cells]
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            texts += [output.get("text", ""), *(v for k, v in output.get("data", {}).items() if k.startswith("text/"))]
+    absolute = re.compile(r"(?<![\w.:/<])(?:/|~/)[A-Za-z_][\w.-]*/|\b[A-Z]:\\")
+    assert not [found for text in texts for found in absolute.findall(text)]
