@@ -14,7 +14,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
-from kgs.fit.initialize import FirstPoints, first_points, relative_near_plane
+from kgs.fit.initialize import FirstPoints, first_points, typical_depths
 from kgs.fit.tracks import Tracks, find_tracks
 from kgs.fit.triangulate import triangulate, triangulate_certain
 
@@ -296,18 +296,18 @@ def test_wrong_arguments() -> None:
         first_points(views, "file")
 
 
-def test_near_plane_is_a_twentieth_of_the_first_percentile() -> None:
+def test_typical_depths_are_the_first_percentile_and_the_median() -> None:
     views = flat(cameras(np.zeros((1, 3)), turn=0.0, size=SMALL))
     points = torch.zeros(101, 3)
     points[:, 2] = torch.arange(2.0, 103.0)
-    assert relative_near_plane(views, points[torch.randperm(101)]) == pytest.approx(0.05 * 3.0, rel=1e-6)
+    assert typical_depths(views, points[torch.randperm(101)]) == pytest.approx((3.0, 52.0), rel=1e-6)
     behind_and_beside = torch.tensor([[0.0, 0.0, -5.0], [50.0, 0.0, 0.001]]).repeat(50, 1)
-    assert relative_near_plane(views, torch.cat([points, behind_and_beside])) == pytest.approx(0.15, rel=1e-6)
+    assert typical_depths(views, torch.cat([points, behind_and_beside])) == pytest.approx((3.0, 52.0), rel=1e-6)
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -1.0]])])
-def test_near_plane_without_points_before_a_camera(points: torch.Tensor) -> None:
-    assert relative_near_plane(flat(), points) == 0.01
+def test_typical_depths_without_points_before_a_camera(points: torch.Tensor) -> None:
+    assert typical_depths(flat(), points) == (1.0, 1.0)
 
 
 def exact_tracks(points: torch.Tensor) -> Tracks:

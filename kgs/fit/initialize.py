@@ -20,11 +20,10 @@ from kgs.errors import DataError
 from .tracks import find_tracks
 from .triangulate import camera_centers, project_all, triangulate_certain
 
-__all__ = ["FirstPoints", "first_points", "relative_near_plane"]
+__all__ = ["FirstPoints", "first_points", "typical_depths"]
 
 KINDS = ("sift", "random", "file")
 FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
-DEFAULT_NEAR_PLANE = 0.01
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def first_points(
             raise ValueError("file: expected a path for the kind 'file', got None")
         return FirstPoints(*_read_points(Path(file)), kind="file")
     points, tracks = triangulate_certain(find_tracks(views), views.cameras)
-    inside = _typical_depths(points, tracks.seen, views.cameras)
+    inside = _within_typical_depths(points, tracks.seen, views.cameras)
     points, pixels, seen = points[inside], tracks.pixels[inside], tracks.seen[inside]
     if kind == "sift" and len(points) >= FEWEST_POINTS:
         return FirstPoints(points.float(), _mean_colors(views, pixels, seen), kind="sift")
@@ -96,8 +95,8 @@ def first_points(
     return FirstPoints(points.float(), colors, kind="random")
 
 
-def relative_near_plane(views: Views, points: Tensor) -> float:
-    """Give the near plane that fits a scene's scale: 0.05 times the 1st percentile of the points' depths.
+def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
+    """The 1st percentile and the median of the points' depths: the scales of a scene.
 
     Convention:
         Depth is z in the camera's frame (OpenCV axes), in world units.
@@ -107,17 +106,16 @@ def relative_near_plane(views: Views, points: Tensor) -> float:
         points: `(P, 3)`; P may be 0.
 
     Returns:
-        The near plane; the depths are those of points inside an image, else of all points before a camera; 0.01 where
-        there are none.
+        Both over the depths of points inside an image, else of all points before a camera; 1.0 where there are none.
     """
     pixels, depths = project_all(points.detach().cpu(), views.cameras)
     before = depths[depths > 0]
     seen = depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
     depths = seen if len(seen) else before
-    return 0.05 * _quantile(depths, 0.01) if len(depths) else DEFAULT_NEAR_PLANE
+    return (_quantile(depths, 0.01), _quantile(depths, 0.5)) if len(depths) else (1.0, 1.0)
 
 
-def _typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
+def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
     """Whether points lie between half the 1st and twice the 99th percentile of all depths in all views that see them.
 
     The few false matches that satisfy the geometry by chance mostly lie right before a camera or far behind the scene.

@@ -11,7 +11,7 @@ from kgs.ply import load_ply
 from kgs.renderer import GaussianRenderer
 
 from .config import Recipe
-from .initialize import relative_near_plane
+from .initialize import typical_depths
 from .report import png_name, write_png
 from .trainer import move_camera
 
@@ -29,7 +29,7 @@ def render_views(ply: Path, scene: Scene, out: Path, device: str = "cpu") -> int
     model = load_ply(ply)
     with torch.no_grad():
         model.means.sub_(scene.offset.to(model.means))
-    near_plane = Recipe().near_plane / 0.05 * relative_near_plane(scene.train, model.means.detach())
+    near_plane = Recipe().near_plane * typical_depths(scene.train, model.means.detach())[0]
     renderer = GaussianRenderer(near_plane=near_plane).eval()
     out.mkdir(parents=True, exist_ok=True)
     model = model.to(device)

@@ -27,7 +27,7 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
-from .initialize import FirstPoints, relative_near_plane
+from .initialize import FirstPoints, typical_depths
 
 __all__ = ["Trainer", "move_camera"]
 
@@ -65,14 +65,13 @@ class Trainer:
         self.config = config
         self.init = {"kind": points.kind, "points": len(points.points)}
         self.device = torch.device(config.device)
-        depths = relative_near_plane(scene.train, points.points) / 0.05
-        near_plane = config.recipe.near_plane * depths
+        nearest, median = typical_depths(scene.train, points.points)
         # a rig without extent (one camera, or a pure rotation) still has to move its Gaussians
-        self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * depths)
+        self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)
         self.max_gaussians = config.max_gaussians or max(10 * config.steps, 4 * len(points.points))
         model = GaussianModel.from_points(points.points, points.colors, config.sh_degree)
         model.sh_degree = 0
-        self._build(model, near_plane)
+        self._build(model, config.recipe.near_plane * nearest)
         self.step = 0
         self.seconds = 0.0
         self.curve: list[dict[str, float | None]] = []
