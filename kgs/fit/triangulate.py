@@ -42,13 +42,13 @@ def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
 
 
 def triangulate_certain(
-    tracks: Tracks, cameras: PinholeCamera, max_error: float = 1.5, min_angle: float = 1.0
+    tracks: Tracks, cameras: PinholeCamera, max_error: float = 0.75, min_angle: float = 1.0
 ) -> tuple[Tensor, Tracks]:
     """Triangulate, leave out what contradicts it, and keep the points whose depth is certain.
 
-    An observation goes if its camera has the point behind it or `max_error` or more away from its pixel; the points
-    are then found once more without these, and a point that still has such an observation goes, as does one that
-    fewer than two views are left to see.
+    An observation goes if its camera has the point behind it or twice `max_error` or more away from its pixel; the
+    points are then found once more without these, and a point that has an observation `max_error` or more away goes,
+    as does one that fewer than two views are left to see.
 
     Args:
         tracks: T tracks in V views.
@@ -59,10 +59,10 @@ def triangulate_certain(
     Returns:
         Points `(P, 3)` in float64 and their tracks, P <= T.
     """
-    for _ in range(2):
+    for limit in (2.0 * max_error, max_error):
         points = triangulate(tracks, cameras)
         pixels, depths = project_all(points, cameras)
-        fits = (depths > 0) & ((pixels - tracks.pixels).norm(dim=-1) < max_error)
+        fits = (depths > 0) & ((pixels - tracks.pixels).norm(dim=-1) < limit)
         agreeing = (fits | ~tracks.seen).all(1)
         kept = tracks.seen & fits
         enough = kept.sum(1) >= 2
