@@ -12,11 +12,11 @@ import math
 import torch
 from torch import Tensor, nn
 
+from .harmonics import SH_C0
 from .types import SH_SIZES, Gaussians
 
 __all__ = ["GaussianModel"]
 
-SH_C0 = 0.28209479177387814  # the harmonic of degree 0, 1 / (2 sqrt(pi))
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
 MIN_RELATIVE_SPACING = 1e-3

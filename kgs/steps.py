@@ -62,10 +62,13 @@ class _Worker:
         self.alpha = self.memory[0][: n * k * p].view(n, k, p)
         self.light = self.memory[1][: n * (k + 1) * p].view(n, k + 1, p)
 
-    def positions(self, starts: Tensor, ends: Tensor, chunk: int) -> tuple[Tensor, Tensor]:
-        """Where the entries of a step are, `(n, K)`, and which are beyond their tile's list."""
-        positions = starts[:, None] + (self.band.slots + chunk * self.band.chunk_size)
-        return positions, positions >= ends[:, None]
+    def entries(self, starts: Tensor, ends: Tensor, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Where a step's entries are `(n, K)`, which are beyond their tile's list, and their Gaussians `(n K,)`."""
+        band = self.band
+        positions = starts[:, None] + (band.slots + chunk * band.chunk_size)
+        beyond = positions >= ends[:, None]
+        ids = band.entries.index_select(0, positions.view(-1)).masked_fill_(beyond.view(-1), band.features.shape[0] - 1)
+        return positions, beyond, ids
 
     def evaluate(self, ids: Tensor, tiles: Tensor, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Fill `alpha` with unclamped alphas; the Gaussians' offsets from the tiles' centres, and ln o."""
@@ -123,10 +126,7 @@ class Forward(_Worker):
             light, median, *sums = (x[:n] for x in state)
             if self.keep:
                 group.steps.append(Step(j, rows, n, light[:, 0].clone()))
-            positions, beyond = self.positions(starts[:n], ends[:n], j)
-            ids = band.entries.index_select(0, positions.view(-1)).masked_fill_(
-                beyond.view(-1), band.features.shape[0] - 1
-            )
+            _, _, ids = self.entries(starts[:n], ends[:n], j)
             self.evaluate(ids, tiles[:n], light[:, 0])
             self.alpha.clamp_(max=ALPHA_MAX)
             self.scan()
@@ -194,8 +194,7 @@ class Backward(_Worker):
     def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
         """Gradients of one step; `behind` becomes the light behind the step's first layer."""
         band, n, size = self.band, step.count, self.band.chunk_size
-        positions, beyond = self.positions(starts, ends, step.chunk)
-        ids = band.entries.index_select(0, positions.view(-1)).masked_fill_(beyond.view(-1), band.features.shape[0] - 1)
+        positions, beyond, ids = self.entries(starts, ends, step.chunk)
         ux, uy, log_opacity = self.evaluate(ids, tiles, step.transmittance)
         clamped = float(log_opacity.max()) > math.log(ALPHA_MAX)
         if clamped:  # alphas whose derivative is their own value; 0 where the clamp holds

@@ -111,8 +111,8 @@ class Trainer:
         """Train to the end.
 
         Args:
-            callback: called after each step with the trainer and the loss (every few steps; NaN in between); training
-                stops, in a valid state, when it returns True.
+            callback: called after each step with the trainer and the loss; training stops, in a valid state, when it
+                returns True.
 
         Raises:
             TrainingDiverged: a loss or gradient is not finite; the parameters are those before that step.
