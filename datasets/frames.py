@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ __all__ = [
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
+_FINE_PIXELS = 1_000_000  # of the images for the first points: twice the pixels a side halves the error of the depths
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,8 @@ def build_scene(
     offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)
     train_views = _views(train, offset, downscale, color)
     height, width = train_views.images.shape[-2:]
+    fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
+    is_finer = downscale is not None and fine_downscale < downscale
     return Scene(
         train=train_views,
         test=_views(test, offset, downscale, color, size=(height, width)),
@@ -166,6 +170,7 @@ def build_scene(
         offset=offset,
         background=color,
         root=root,
+        finer=_views(train, offset, fine_downscale, color) if is_finer else None,
     )
 
 

@@ -86,6 +86,8 @@ class Scene:
         offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
         background: `(3,)`, the colour behind the scene, in [0, 1].
         root: the folder the scene was read from.
+        finer: the training views in more pixels than `train` has, where the files have more; first points are found
+            in these. None where `train` is as fine as that.
     """
 
     train: Views
@@ -96,10 +98,13 @@ class Scene:
     offset: Tensor
     background: Tensor
     root: Path
+    finer: Views | None = None
 
     def __post_init__(self) -> None:
         if len(self.train) == 0:
             raise DataError(self.root, "train", "expected at least one training view, got none")
+        if self.finer is not None and self.finer.names != self.train.names:
+            raise ValueError(f"finer: expected the views {self.train.names} as train, got {self.finer.names}")
         if self.points.shape != self.point_colors.shape or self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(
                 f"points, point_colors: expected two of shape (P, 3), got {tuple(self.points.shape)} "

@@ -14,23 +14,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .steps import Backward, Forward, Group
+from .steps import ALPHA_MAX, Backward, Forward, Group
 from .threads import run_all
 from .types import TileBins
 
 __all__ = ["Band", "Rules"]
 
-_STEP_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers
+# Gaussian-pixel pairs of a step: few operator calls, small buffers; and the least number of groups, for the threads
+_STEPS = {"cpu": (2**19, 2), "cuda": (2**24, 1)}
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What counts as a layer; see `composite`."""
+    """What counts as a layer, see `composite`; and how much memory there is to keep alphas for the backward pass."""
 
     alpha_threshold: float
     transmittance_stop: float
     median_depth: bool
     chunk_size: int | None
+    alpha_bytes: int
 
 
 class Band:
@@ -65,6 +67,7 @@ class Band:
         self.floor = floor
         self.cut = _below(max(rules.alpha_threshold, 1.01 * math.exp(floor)), dtype)
         self.stop = _below(rules.transmittance_stop, dtype) if rules.transmittance_stop else None
+        self.clamps = bool((table[0] > math.log(ALPHA_MAX)).any())
         self.groups = self._make_groups(lengths)
 
     def forward(self, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -76,8 +79,11 @@ class Band:
         transmittance = like.new_ones(tiles, 1, self.pixels)
         median = like.new_zeros(tiles, 1 if self.depths is not None else 0, self.pixels)
 
+        slots = self.chunk_size * sum(sum(group.chunks) for group in self.groups)
+        keep_alphas = keep and slots * self.pixels * like.element_size() <= self.rules.alpha_bytes
+
         def worker() -> Forward:
-            return Forward(self, blocks, (transmittance, median, *sums), keep)
+            return Forward(self, blocks, (transmittance, median, *sums), keep, keep_alphas)
 
         run_all(self.groups, worker, like.device)
         return torch.cat(sums, 1), transmittance, median
@@ -108,24 +114,26 @@ class Band:
         chunks = torch.div(lengths + (self.chunk_size - 1), self.chunk_size, rounding_mode="floor")
         chunks, order = torch.sort(chunks, descending=True, stable=True)
         order = order[: int((chunks > 0).sum())]
-        elements = _STEP_ELEMENTS.get(self.table.device.type, 2**24)
+        elements, fewest = _STEPS.get(self.table.device.type, (2**24, 1))
         per_group = max(1, elements // (self.chunk_size * self.pixels))
         counts = chunks.tolist()
         starts, ends = self.bins.offsets[:-1].index_select(0, order), self.bins.offsets[1:].index_select(0, order)
-        groups = []
-        for begin in range(0, len(order), per_group):
-            part = slice(begin, min(begin + per_group, len(order)))
-            groups.append(Group(order[part], starts[part], ends[part], counts[part]))
+        most = -(-sum(counts) // fewest)
+        groups, begin, work = [], 0, 0
+        for i, count in enumerate([*counts[: len(order)], most]):
+            if i > begin and (i == len(order) or i - begin == per_group or work + count > most):
+                part = slice(begin, i)
+                groups.append(Group(order[part], starts[part], ends[part], counts[part]))
+                begin, work = i, 0
+            work += count
         return groups
 
 
 def _chunk_size(bins: TileBins) -> int:
-    """Short chunks waste little at the ends of lists; long ones need fewer operator calls, so few tiles want them."""
+    """Short chunks waste little at the ends of lists; long ones need fewer operator calls."""
     if bins.entries.device.type != "cpu":
         return 32
-    entries, tiles = bins.entries.shape[0], bins.num_tiles
-    few = tiles * bins.tile_size**2 < 2**15
-    return 16 if entries >= (32 if few else 256) * tiles else 8
+    return 16 if bins.entries.shape[0] >= 32 * bins.num_tiles else 8
 
 
 def _below(value: float, dtype: torch.dtype) -> float:

@@ -11,13 +11,15 @@ on each pixel and layer alone, so the image does not depend on tiles or chunks.
 How it is computed. K consecutive entries of a tile are a chunk; the same chunk of many tiles is a step. In coordinates
 relative to the tile's centre the exponent is a quadratic polynomial of the pixel, so a step is one matrix product of
 six coefficients an entry with six monomials a pixel, an exponential, a scan over K, and one product with the colours.
-Only T at the beginning of each step is kept. The backward pass visits the steps from back to front, recomputes their
-alphas, and carries U_k = sum_{j >= k} w_j (c_j . g) + T_end g_T, the light behind, which is a reverse cumulative sum:
+T at the beginning of each step is kept and, where memory allows, the alphas; else these are computed again. The
+backward pass visits the steps from back to front and carries V_k, the colour along g that shows from layer k on, as if
+no light had been lost before it:
 
-    dL/d ln alpha_k = w_k (c_k . g - U_{k+1} / T_{k+1})
+    V_k = alpha_k (c_k . g) + (1 - alpha_k) V_{k+1},   V_end = g_T,   dL/d ln alpha_k = w_k (c_k . g - V_{k+1})
 
-No difference of large numbers and no division by 1 - alpha. What a Gaussian gets from a tile are the six moments of
-that quantity over the pixels, again one matrix product; they are shifted to its centre and summed over its tiles.
+and V_{k+1} = 0 where layer k ends the light. V is a mean of colours: no sum grows large, nothing is divided by
+1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the pixels, again one matrix
+product; they are shifted to its centre and summed over its tiles.
 """
 
 from __future__ import annotations
@@ -84,10 +86,12 @@ def composite(
     check_options(tile_size, alpha_threshold, transmittance_stop, chunk_size)
     inputs = (projected.means2d, projected.factors, projected.opacities, features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    rules = Rules(alpha_threshold, transmittance_stop, median_depth, chunk_size)
     with torch.no_grad():
         spans = tile_spans(projected, tile_size, alpha_threshold)
-    bands = spans.bands(max(1, max_bytes // bytes_per_entry(features.shape[1], tile_size, features.dtype)))
+    per_entry = bytes_per_entry(features.shape[1], tile_size, features.dtype)
+    bands = spans.bands(max(1, max_bytes // per_entry))
+    left = max_bytes - per_entry * int(spans.entries_per_row.sum()) if len(bands) == 1 else 0
+    rules = Rules(alpha_threshold, transmittance_stop, median_depth, chunk_size, alpha_bytes=left)
     sums, transmittance, median = _Composite.apply(*inputs, projected, spans, bands, rules, keep)
     return Composited(sums, transmittance, median if median_depth else None)
 
@@ -131,7 +135,7 @@ class _Composite(torch.autograd.Function):
             if keep and len(bands) == 1:
                 kept = band
         sums, transmittance, median = (torch.cat(parts) for parts in zip(*outputs, strict=True))
-        ctx.save_for_backward(factors, opacities, transmittance)
+        ctx.save_for_backward(factors, opacities)
         ctx.projected, ctx.spans, ctx.bands, ctx.kept, ctx.make_band = projected, spans, bands, kept, make_band
         images = tuple(_to_images(x, projected, spans) for x in (sums, transmittance, median))
         ctx.mark_non_differentiable(images[2])
@@ -143,13 +147,13 @@ class _Composite(torch.autograd.Function):
             raise RuntimeError(
                 "composite: expected backward without create_graph, the renderer has no second derivative"
             )
-        factors, opacities, transmittance = ctx.saved_tensors
+        factors, opacities = ctx.saved_tensors
         spans, columns = ctx.spans, ctx.spans.grid[1]
         grads = _to_tiles(grad_sums, spans)
-        behind = _to_tiles(grad_transmittance, spans).mul_(transmittance)
+        behind = _to_tiles(grad_transmittance, spans)
         total = factors.new_zeros(spans.ids.shape[0], 6 + grads.shape[1])
         for begin, end in ctx.bands:
-            band = ctx.kept
+            band, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
             if band is None:
                 band = ctx.make_band((begin, end))
                 band.forward(keep=True)

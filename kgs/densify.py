@@ -12,9 +12,9 @@ import math
 from dataclasses import dataclass
 
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 
+from .covariance import rotation_matrices
 from .model import GaussianModel
 from .types import ProjectedGaussians
 
@@ -218,7 +218,7 @@ class Densifier:
         noise = torch.randn((len(ids), 3), generator=self.generator, device=self.generator.device, dtype=means.dtype)
         # a scale may overflow where its logarithm does not; the place has to stay finite
         scales = self.model.log_scales.index_select(0, ids).exp().clamp(max=math.sqrt(torch.finfo(means.dtype).max))
-        rotations = quaternion_to_rotation_matrix(self.model.quats.index_select(0, ids))
+        rotations = rotation_matrices(self.model.quats.index_select(0, ids))
         return torch.einsum("nij,nj->ni", rotations, scales * noise.to(means.device))
 
     def _replace(self, name: str, value: Tensor, kept: Tensor) -> None:

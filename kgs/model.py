@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from .harmonics import SH_C0
 from .types import SH_SIZES, Gaussians
 
-__all__ = ["GaussianModel"]
+__all__ = ["GaussianModel", "log_spacing"]
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
@@ -120,12 +120,12 @@ class GaussianModel(nn.Module):
             raise ValueError(f"sh_degree: expected an integer from 0 to {len(SH_SIZES) - 1}, got {sh_degree!r}")
         points = points.detach()
         n = len(points)
-        log_spacing = _log_spacing(points).to(points)
+        log_scales = log_spacing(points).to(points)
         dc = (colors.detach().to(points) - 0.5) / SH_C0
         return cls(
             means=points,
             quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            log_scales=log_spacing[:, None].repeat(1, 3),
+            log_scales=log_scales[:, None].repeat(1, 3),
             opacity_logits=points.new_full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
             sh_dc=dc[:, None, :],
             sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),
@@ -169,8 +169,15 @@ class GaussianModel(nn.Module):
         return f"{len(self)} Gaussians, sh_degree={self.sh_degree} of {self.max_sh_degree}, {self.means.dtype}"
 
 
-def _log_spacing(points: Tensor) -> Tensor:
-    """Logarithm of the root mean squared distance to the nearest points, float64 `(N,)`."""
+def log_spacing(points: Tensor) -> Tensor:
+    """Logarithm of the root mean squared distance to the three nearest points, float64 `(N,)`: the scale of a start.
+
+    Args:
+        points: `(N, 3)`, N >= 4.
+
+    Raises:
+        ValueError: all points are in one place.
+    """
     points = points.double()
     centred = points - points.mean(dim=0)
     size = centred.abs().amax()

@@ -5,7 +5,6 @@ The formulas are those of `compositing`, the arrangement that of `chunks`.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -30,6 +29,8 @@ class Step:
     rows: Tensor | None  # positions in the group of its tiles; None: the first ones
     count: int
     transmittance: Tensor  # before the step, (count, P)
+    alpha: Tensor | None  # (K, count, P), where there is memory to keep it
+    ended: bool  # whether the transmittance of a pixel fell to the stop
 
 
 @dataclass
@@ -44,73 +45,75 @@ class Group:
 
 
 class _Worker:
-    """Buffers of one thread, and the alphas of a step in them."""
+    """Buffers of one thread, and the alphas of a step in them.
+
+    Layer k of all tiles of a step is one contiguous slab: what goes from layer to layer runs over long vectors.
+    """
 
     def __init__(self, band: Band, buffers: int) -> None:
         self.band = band
         largest = max((len(group.chunks) for group in band.groups), default=0)
         size = largest * (band.chunk_size + 1) * band.pixels
         self.memory = [band.table.new_empty(size) for _ in range(buffers)]
-        self.count = 0
 
-    def shape_buffers(self, n: int) -> None:
-        """Views of the buffers for a step of n chunks: (n, K, P) for alpha, (n, K + 1, P) for T, and so on."""
-        if n == self.count:
-            return
-        self.count = n
-        k, p = self.band.chunk_size, self.band.pixels
-        self.alpha = self.memory[0][: n * k * p].view(n, k, p)
-        self.light = self.memory[1][: n * (k + 1) * p].view(n, k + 1, p)
+    def buffer(self, index: int, layers: int, n: int) -> Tensor:
+        """One of the buffers as `(layers, n, P)`."""
+        return self.memory[index][: layers * n * self.band.pixels].view(layers, n, self.band.pixels)
 
     def entries(self, starts: Tensor, ends: Tensor, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Where a step's entries are `(n, K)`, which are beyond their tile's list, and their Gaussians `(n K,)`."""
+        """Where a step's entries are `(K, n)`, which are beyond their tile's list, and their Gaussians `(K n,)`."""
         band = self.band
-        positions = starts[:, None] + (band.slots + chunk * band.chunk_size)
-        beyond = positions >= ends[:, None]
+        positions = starts + (band.slots + chunk * band.chunk_size)[:, None]
+        beyond = positions >= ends
         ids = band.entries.index_select(0, positions.view(-1)).masked_fill_(beyond.view(-1), band.features.shape[0] - 1)
         return positions, beyond, ids
 
-    def evaluate(self, ids: Tensor, tiles: Tensor, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Fill `alpha` with unclamped alphas; the Gaussians' offsets from the tiles' centres, and ln o."""
-        band, n = self.band, tiles.shape[0]
-        self.shape_buffers(n)
+    def offsets(self, places: Tensor, tiles: Tensor) -> tuple[Tensor, Tensor]:
+        """From the centres of n tiles to Gaussians at `places` `(2, K n)`."""
+        centres = self.band.centres.index_select(1, tiles)
+        ux, uy = (places.view(2, -1, tiles.shape[0]) - centres[:, None]).view(2, -1)
+        return ux, uy
+
+    def evaluate(self, ids: Tensor, tiles: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        """Fill `alpha` `(K, n, P)`; returns the offsets."""
+        band = self.band
         table = band.table.index_select(1, ids)
-        log_opacity = table[0].clone()
-        centres = band.centres.index_select(1, tiles)
-        ux = (table[1].view(n, -1) - centres[0][:, None]).view(-1)
-        uy = (table[2].view(n, -1) - centres[1][:, None]).view(-1)
+        ux, uy = self.offsets(table[1:3], tiles)
         ax, ay, bx, by = table[6], table[7], table[8], table[9]
         va = torch.mul(ax, ux).addcmul_(ay, uy)
         vb = torch.mul(bx, ux).addcmul_(by, uy)
         table[0].addcmul_(va, va, value=-0.5).addcmul_(vb, vb, value=-0.5)
         torch.mul(ax, va, out=table[1]).addcmul_(bx, vb)
         torch.mul(ay, va, out=table[2]).addcmul_(by, vb)
-        flat = self.alpha.view(-1, band.pixels)
+        flat = alpha.view(-1, band.pixels)
         torch.mm(table[:6].t(), band.monomials, out=flat)
         flat.clamp_(min=band.floor).exp_()
         F.threshold(flat, band.cut, 0.0, inplace=True)
-        self.light[:, 0] = before
-        return ux, uy, log_opacity
+        if band.clamps:
+            flat.clamp_(max=ALPHA_MAX)
+        return ux, uy
 
-    def scan(self) -> None:
-        """Fill `light` with the transmittance before each layer and after the last, from the clamped alphas."""
-        alpha, light = self.alpha, self.light
+    def scan(self, alpha: Tensor, before: Tensor) -> Tensor:
+        """The transmittance before each layer and after the last, `(K + 1, n, P)`, without the stop."""
+        light = self.buffer(0, alpha.shape[0] + 1, alpha.shape[1])
+        light[0] = before
         if alpha.device.type == "cpu":
-            layers = light.unbind(1)
-            for k, a in enumerate(alpha.unbind(1)):
+            layers = light.unbind(0)
+            for k, a in enumerate(alpha.unbind(0)):
                 torch.addcmul(layers[k], layers[k], a, value=-1, out=layers[k + 1])
         else:
-            torch.mul(torch.cumprod(1 - alpha, 1), light[:, :1], out=light[:, 1:])
-        if self.band.stop is not None:  # T never grows, so cutting afterwards is cutting at each layer
-            F.threshold(light, self.band.stop, 0.0, inplace=True)
+            torch.mul(torch.cumprod(1 - alpha, 0), light[:1], out=light[1:])
+        return light
 
 
 class Forward(_Worker):
     """Adds the layers of a group to the sums, front to back."""
 
-    def __init__(self, band: Band, blocks: tuple[Tensor, ...], outputs: tuple[Tensor, ...], keep: bool) -> None:
+    def __init__(
+        self, band: Band, blocks: tuple[Tensor, ...], outputs: tuple[Tensor, ...], keep: bool, keep_alphas: bool
+    ) -> None:
         super().__init__(band, buffers=2)
-        self.blocks, self.outputs, self.keep = blocks, outputs, keep
+        self.blocks, self.outputs, self.keep, self.keep_alphas = blocks, outputs, keep, keep_alphas
 
     def __call__(self, group: Group) -> None:
         """Composite a group."""
@@ -124,31 +127,40 @@ class Forward(_Worker):
             while chunks[n - 1] <= j:
                 n -= 1
             light, median, *sums = (x[:n] for x in state)
-            if self.keep:
-                group.steps.append(Step(j, rows, n, light[:, 0].clone()))
             _, _, ids = self.entries(starts[:n], ends[:n], j)
-            self.evaluate(ids, tiles[:n], light[:, 0])
-            self.alpha.clamp_(max=ALPHA_MAX)
-            self.scan()
+            buffer = self.buffer(1, size, n)
+            alpha = torch.empty_like(buffer) if self.keep_alphas else buffer
+            self.evaluate(ids, tiles[:n], alpha)
+            layers = self.scan(alpha, light[:, 0])
+            # T never grows, so cutting afterwards is cutting at each layer
+            ended = band.stop is not None and float(layers[-1].min()) <= band.stop
+            if ended:
+                F.threshold(layers, band.stop, 0.0, inplace=True)
+            if self.keep:
+                kept = alpha if self.keep_alphas else None
+                group.steps.append(Step(j, rows, n, light[:, 0].clone(), kept, ended))
             if band.depths is not None:
-                crossing = ((self.light[:, :-1] >= 0.5) & (self.light[:, 1:] < 0.5)).to(light.dtype)
-                median.baddbmm_(band.depths.index_select(0, ids).view(n, 1, size), crossing)
-            weights = self.alpha.mul_(self.light[:, :-1])
+                crossing = ((layers[:-1] >= 0.5) & (layers[1:] < 0.5)).to(light.dtype)
+                median.baddbmm_(
+                    band.depths.index_select(0, ids).view(size, n, 1).permute(1, 2, 0), crossing.transpose(0, 1)
+                )
+            weights = torch.mul(alpha, layers[:-1], out=buffer).transpose(0, 1)
             for block, total in zip(self.blocks, sums, strict=True):
-                total.baddbmm_(block.index_select(0, ids).view(n, size, -1).transpose(1, 2), weights)
-            light[:, 0] = self.light[:, -1]
-            live = light[:, 0].amax(1) > 0
-            live_count = int(live.sum())
-            if live_count == 0:
-                break
-            if live_count < _LIVE_SHARE * n:
-                self._write(tiles, state)
-                kept = live.nonzero()[:, 0]
-                tiles, starts, ends = (x.index_select(0, kept) for x in (tiles, starts, ends))
-                state = tuple(x.index_select(0, kept) for x in state)
-                rows = kept if rows is None else rows.index_select(0, kept)
-                chunks = [chunks[i] for i in kept.tolist()]
-                n = len(chunks)
+                total.baddbmm_(block.index_select(0, ids).view(size, n, -1).permute(1, 2, 0), weights)
+            light[:, 0] = layers[-1]
+            if ended:
+                live = light[:, 0].amax(1) > 0
+                live_count = int(live.sum())
+                if live_count == 0:
+                    break
+                if live_count < _LIVE_SHARE * n:
+                    self._write(tiles, state)
+                    kept = live.nonzero()[:, 0]
+                    tiles, starts, ends = (x.index_select(0, kept) for x in (tiles, starts, ends))
+                    state = tuple(x.index_select(0, kept) for x in state)
+                    rows = kept if rows is None else rows.index_select(0, kept)
+                    chunks = [chunks[i] for i in kept.tolist()]
+                    n = len(chunks)
             j += 1
         self._write(tiles, state)
 
@@ -163,17 +175,7 @@ class Backward(_Worker):
     def __init__(self, band: Band, grads: Tensor, behind: Tensor, rows: Tensor) -> None:
         super().__init__(band, buffers=5)
         self.grads, self.behind, self.rows = grads, behind, rows
-        self.tiny = torch.finfo(rows.dtype).tiny
-
-    def shape_buffers(self, n: int) -> None:
-        """The same for the colours along g, the light behind, and the derivative of alpha where it is clamped."""
-        changed = n != self.count
-        super().shape_buffers(n)
-        if changed:
-            k, p = self.band.chunk_size, self.band.pixels
-            self.value = self.memory[2][: n * k * p].view(n, k, p)
-            self.later = self.memory[3][: n * (k + 1) * p].view(n, k + 1, p)
-            self.slope = self.memory[4][: n * k * p].view(n, k, p)
+        self.features = band.features.t().contiguous()
 
     def __call__(self, group: Group) -> None:
         """Differentiate a group."""
@@ -192,37 +194,40 @@ class Backward(_Worker):
                 behind.index_copy_(0, rows, later)
 
     def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
-        """Gradients of one step; `behind` becomes the light behind the step's first layer."""
+        """Gradients of one step; `behind` becomes V before the step, see `compositing`."""
         band, n, size = self.band, step.count, self.band.chunk_size
         positions, beyond, ids = self.entries(starts, ends, step.chunk)
-        ux, uy, log_opacity = self.evaluate(ids, tiles, step.transmittance)
-        clamped = float(log_opacity.max()) > math.log(ALPHA_MAX)
-        if clamped:  # alphas whose derivative is their own value; 0 where the clamp holds
-            self.slope.copy_(self.alpha)
-            F.threshold(self.slope, ALPHA_MAX, 0.0, inplace=True)
-            torch.sub(self.alpha, self.slope, out=self.slope)
-            self.alpha.clamp_(max=ALPHA_MAX)
-        self.scan()
-        before, after = self.light[:, :-1], self.light[:, 1:]
-        weights = self.alpha.mul_(before)
-        features = band.features.index_select(0, ids).view(n, size, -1)
-        torch.bmm(features, grads, out=self.value)
-        self.later[:, -1] = behind
-        layers = self.later.unbind(1)
-        for k, (w, v) in reversed(list(enumerate(zip(weights.unbind(1), self.value.unbind(1), strict=True)))):
-            torch.addcmul(layers[k + 1], w, v, out=layers[k])
-        behind.copy_(layers[0])
-        d_features = torch.bmm(weights, grads.transpose(1, 2))
-        # where T behind a layer is 0, so is the light behind it
-        value = self.value.sub_(self.later[:, 1:].div_(after.clamp_(min=self.tiny)))
-        if clamped:
-            value.mul_(self.slope).mul_(before)
+        if step.alpha is None:
+            alpha = self.buffer(1, size, n)
+            ux, uy = self.evaluate(ids, tiles, alpha)
         else:
-            value.mul_(weights)
+            alpha = step.alpha
+            ux, uy = self.offsets(band.table[1:3].index_select(1, ids), tiles)
+        light = self.scan(alpha, step.transmittance)
+        if step.ended:
+            F.threshold(light, band.stop, 0.0, inplace=True)
+        weights = torch.mul(alpha, light[:-1], out=self.buffer(2, size, n))
+        value, later = self.buffer(3, size, n), self.buffer(4, size + 1, n)
+        colors = self.features.index_select(1, ids).view(-1, size, n, 1)
+        value.zero_()
+        for f in range(len(colors)):
+            value.addcmul_(colors[f], grads[:, f])
+        later[-1] = behind
+        values, alphas, layers = value.unbind(0), alpha.unbind(0), later.unbind(0)
+        reached = light[1:].sign_().unbind(0) if step.ended else None  # behind the last layer there is nothing
+        for k in reversed(range(size)):
+            if reached is not None:
+                layers[k + 1].mul_(reached[k])
+            torch.lerp(layers[k + 1], values[k], alphas[k], out=layers[k])
+        behind.copy_(later[0])
+        d_features = torch.bmm(weights.transpose(0, 1), grads.transpose(1, 2))
+        value.sub_(later[1:]).mul_(weights)
+        if band.clamps:  # no derivative where alpha is held at its maximum
+            value.mul_(torch.sub(ALPHA_MAX, alpha, out=self.buffer(0, size, n)).sign_())
         moments = torch.mm(band.monomials, value.view(-1, band.pixels).t())
-        rows = torch.empty(n * size, 6 + features.shape[2], dtype=moments.dtype, device=moments.device)
+        rows = torch.empty(n * size, 6 + d_features.shape[2], dtype=moments.dtype, device=moments.device)
         rows[:, :6] = _about_centre(moments, ux, uy).t()
-        rows[:, 6:] = d_features.view(n * size, -1)
+        rows[:, 6:] = d_features.transpose(0, 1).reshape(n * size, -1)
         positions.masked_fill_(beyond, self.rows.shape[0] - 1)
         self.rows.index_copy_(0, positions.view(-1), rows)
 

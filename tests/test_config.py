@@ -18,7 +18,7 @@ def test_short_fit_scales_counts():
     times = timetable(FitConfig(steps=2000))
     assert times.sh == (200, 400, 600)
     assert times.densify == tuple(range(200, 2000, 100))  # on as much evidence as the recipe, see timetable
-    assert times.reset == (600, 1200, 1800)
+    assert times.reset == (600, 1200)
     assert times.evaluate[-1] == 2000
 
 

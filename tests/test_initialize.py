@@ -362,6 +362,16 @@ def test_uncertain_points_go() -> None:
     assert kept.seen.tolist() == [[True, True, True], [True, False, True]]
 
 
+def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = torch.rand(80, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 5.0])
+    alone = torch.tensor([[0.2, 0.1, 3.2]])
+    monkeypatch.setattr("kgs.fit.initialize.find_tracks", lambda _: exact_tracks(torch.cat([wall, alone])))
+    posed = cameras()
+    found = first_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)))
+    assert found.kind == "sift"
+    torch.testing.assert_close(found.points, wall, rtol=1e-4, atol=1e-4)
+
+
 REAL = [
     ("llff/fern", 3, 391),
     pytest.param("llff/flower", 3, 1513, marks=pytest.mark.slow),

@@ -99,6 +99,25 @@ def test_sizes_are_rounded_and_never_empty(tmp_path: Path, downscale: float, siz
     assert float(scene.train.cameras.cx[0]) == pytest.approx((size[1] - 1) / 2, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("downscale", "fine_pixels", "finer"), [(2, 10**6, (4, 6)), (4, 6, (2, 3)), (2, 6, None), (None, 10**6, None)]
+)
+def test_first_points_have_the_training_views_in_more_pixels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, downscale: float | None, fine_pixels: int, finer: tuple | None
+) -> None:
+    monkeypatch.setattr("kgs.datasets.frames._FINE_PIXELS", fine_pixels)
+    photos(tmp_path / "images")
+    np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (3, 1)))
+    scene = load_scene(tmp_path, downscale=downscale)
+    if finer is None:
+        assert scene.finer is None
+    else:
+        assert scene.finer is not None
+        assert tuple(scene.finer.images.shape[-2:]) == finer
+        assert scene.finer.names == scene.train.names
+        assert torch.equal(scene.finer.cameras.extrinsics, scene.train.cameras.extrinsics)
+
+
 # an LLFF row for 6x4 images: axes down, right, backward, the centre, (height, width, focal), then two depths
 UPRIGHT = np.array([0, 1, 0, 0, 4, 1, 0, 0, 0, 6, 0, 0, -1, 0, 5, 1, 9], dtype=float)
 

@@ -61,7 +61,7 @@ class Recipe:
     prune_opacity: float = 0.005
     reset_interval: int = 3000
     reset_opacity: float = 0.01
-    reset_recovery: int = 200
+    reset_recovery: int = 300
     near_plane: float = 0.05
 
 

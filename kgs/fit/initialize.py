@@ -16,6 +16,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
+from kgs.model import log_spacing
 
 from .tracks import find_tracks
 from .triangulate import camera_centers, project_all, triangulate_certain
@@ -24,6 +25,7 @@ __all__ = ["FirstPoints", "first_points", "typical_depths"]
 
 KINDS = ("sift", "random", "file")
 FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
+MAX_SPACING = 4.0  # of a point, in medians of all
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,9 @@ def first_points(
     points, tracks = triangulate_certain(find_tracks(views), views.cameras)
     inside = _within_typical_depths(points, tracks.seen, views.cameras)
     points, pixels, seen = points[inside], tracks.pixels[inside], tracks.seen[inside]
+    if len(points) >= FEWEST_POINTS:
+        together = _in_company(points, seen, views.cameras)
+        points, pixels, seen = points[together], pixels[together], seen[together]
     if kind == "sift" and len(points) >= FEWEST_POINTS:
         return FirstPoints(points.float(), _mean_colors(views, pixels, seen), kind="sift")
     if kind == "sift":
@@ -125,6 +130,18 @@ def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera)
         return torch.zeros(len(points), dtype=torch.bool)
     least, most = 0.5 * _quantile(depths[seen], 0.01), 2.0 * _quantile(depths[seen], 0.99)
     return (((depths > least) & (depths < most)) | ~seen).all(1)
+
+
+def _in_company(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
+    """Whether points are as near to others as is usual: their spacing in the image is under `MAX_SPACING` medians.
+
+    A false match that satisfies the geometry lies alone, mostly before the scene, and would start as a Gaussian over
+    a good part of the images that the training views cannot tell from a right one.
+    """
+    _, depths = project_all(points, cameras)
+    focal = cameras.fx.double().cpu()
+    spacing = log_spacing(points).exp() * (focal / depths).masked_fill(~seen, 0.0).amax(1)
+    return spacing < MAX_SPACING * spacing.median()
 
 
 def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:

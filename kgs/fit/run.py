@@ -111,7 +111,8 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
         if len(scene.points) == 0:
             raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
-    found = first_points(scene.train, kind, seed=config.seed, file=config.init_file)
+    views = scene.train if scene.finer is None else scene.finer
+    found = first_points(views, kind, seed=config.seed, file=config.init_file)
     if kind == "file":  # in the world's coordinates, as the files that kgs writes
         found = replace(found, points=(found.points.double() - scene.offset).float())
     return found
