@@ -20,8 +20,8 @@ from .types import TileBins
 
 __all__ = ["Band", "Rules"]
 
-# Gaussian-pixel pairs of a step: few operator calls, small buffers; and the least number of groups, for the threads
-_STEPS = {"cpu": (2**19, 2), "cuda": (2**24, 1)}
+_STEP_PAIRS = {"cpu": 2**19, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers
+_PAIRS_TO_SHARE = 2**22  # from here on a CPU has work for two groups, so for two threads
 
 
 @dataclass(frozen=True)
@@ -114,26 +114,28 @@ class Band:
         chunks = torch.div(lengths + (self.chunk_size - 1), self.chunk_size, rounding_mode="floor")
         chunks, order = torch.sort(chunks, descending=True, stable=True)
         order = order[: int((chunks > 0).sum())]
-        elements, fewest = _STEPS.get(self.table.device.type, (2**24, 1))
-        per_group = max(1, elements // (self.chunk_size * self.pixels))
-        counts = chunks.tolist()
+        counts = chunks[: len(order)].tolist()
         starts, ends = self.bins.offsets[:-1].index_select(0, order), self.bins.offsets[1:].index_select(0, order)
-        most = -(-sum(counts) // fewest)
+        device, pairs = self.table.device.type, self.chunk_size * self.pixels
+        most_tiles = max(1, _STEP_PAIRS.get(device, 2**24) // pairs)
+        shared = device == "cpu" and sum(counts) * pairs >= _PAIRS_TO_SHARE
+        most_chunks = -(-sum(counts) // 2) if shared else sum(counts)
         groups, begin, work = [], 0, 0
-        for i, count in enumerate([*counts[: len(order)], most]):
-            if i > begin and (i == len(order) or i - begin == per_group or work + count > most):
-                part = slice(begin, i)
-                groups.append(Group(order[part], starts[part], ends[part], counts[part]))
+        for i, count in enumerate(counts):
+            if i - begin == most_tiles or (i > begin and work + count > most_chunks):
+                groups.append(slice(begin, i))
                 begin, work = i, 0
             work += count
-        return groups
+        groups.append(slice(begin, len(counts)))
+        return [Group(order[part], starts[part], ends[part], counts[part]) for part in groups if counts]
 
 
 def _chunk_size(bins: TileBins) -> int:
-    """Short chunks waste little at the ends of lists; long ones need fewer operator calls."""
+    """Short chunks waste little at the ends of lists; long ones need fewer operator calls, so few tiles want them."""
     if bins.entries.device.type != "cpu":
         return 32
-    return 16 if bins.entries.shape[0] >= 32 * bins.num_tiles else 8
+    mean, few = bins.entries.shape[0] / max(1, bins.num_tiles), bins.num_tiles * bins.tile_size**2 <= 2**13
+    return 8 if mean < 32 else 32 if few and mean >= 64 else 16
 
 
 def _below(value: float, dtype: torch.dtype) -> float:

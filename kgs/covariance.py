@@ -13,6 +13,9 @@ a c - b^2 is non-positive for half of those in float32.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
@@ -40,6 +43,11 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     """The 2x3 factors M = (J W) R S.
 
+    Differentiable once, in closed form over columns of numbers: products of as many tiny matrices are ten times slower.
+
+    Convention:
+        As in `rotation_matrices`.
+
     Args:
         rows: J W, the derivative of the pixel with respect to the world point, `(M, 2, 3)`.
         quats: `(M, 4)`.
@@ -48,7 +56,80 @@ def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     Returns:
         `(M, 2, 3)` in pixels.
     """
-    return torch.bmm(rows, rotation_matrices(quats)) * scales[:, None, :]
+    factors: Tensor = _FootprintFactors.apply(rows, quats, scales)
+    return factors
+
+
+class _FootprintFactors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+        a, s = _columns(rows), _columns(scales)
+        peak = quats.abs().amax(1)
+        q = _columns(quats).div_(torch.where(peak > 0, peak, 1.0))
+        norm = torch.linalg.vector_norm(q, dim=0)
+        q.div_(torch.where(norm > 0, norm, 1.0))
+        q[0].masked_fill_(norm == 0, 1.0)
+        inverse_norm = torch.where(norm > 0, 1.0 / (norm * peak), 0.0)
+        r = _rotation_columns(q)
+        turned = torch.stack([_dot(a[3 * i : 3 * i + 3], r[j::3]) for i in (0, 1) for j in (0, 1, 2)])
+        ctx.save_for_backward(a, q, inverse_norm, s, turned)
+        return (turned.unflatten(0, (2, 3)) * s).permute(2, 0, 1).contiguous()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
+        a, q, inverse_norm, s, turned = ctx.saved_tensors
+        d_rows = d_quats = d_scales = None
+        g = _columns(grad)
+        if ctx.needs_input_grad[2]:
+            d_scales = (turned * g).unflatten(0, (2, 3)).sum(0).t()
+        g = (g.unflatten(0, (2, 3)) * s).flatten(0, 1)
+        if ctx.needs_input_grad[0]:
+            r = _rotation_columns(q)
+            parts = [_dot(g[3 * i : 3 * i + 3], r[3 * k : 3 * k + 3]) for i in (0, 1) for k in (0, 1, 2)]
+            d_rows = torch.stack(parts, 1).unflatten(1, (2, 3))
+        if ctx.needs_input_grad[1]:
+            d_quats = (
+                _quaternion_gradient(q, (a.unflatten(0, (2, 3, 1)) * g.unflatten(0, (2, 1, 3))).sum(0))
+                .mul_(inverse_norm)
+                .t()
+            )
+        return d_rows, d_quats, d_scales
+
+
+def _columns(rows: Tensor) -> Tensor:
+    """`(M, ...)` as one contiguous column a number, `(numbers, M)`, in memory of its own."""
+    return rows.flatten(1).t().clone(memory_format=torch.contiguous_format)
+
+
+def _dot(u: Tensor, v: Sequence[Tensor] | Tensor) -> Tensor:
+    return torch.addcmul(torch.addcmul(u[0] * v[0], u[1], v[1]), u[2], v[2])
+
+
+def _rotation_columns(q: Tensor) -> list[Tensor]:
+    """The nine entries, row by row, of the rotations of unit quaternions `(4, M)`."""
+    w, x, y, z = q
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
+    return [1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy]
+
+
+def _quaternion_gradient(q: Tensor, d: Tensor) -> Tensor:
+    """From dL/dR `(3, 3, M)` to dL/dq `(4, M)` along the unit sphere, for q of norm 1."""
+    w, x, y, z = q
+    px, py, pz = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]
+    sxy, sxz, syz = d[0, 1] + d[1, 0], d[0, 2] + d[2, 0], d[1, 2] + d[2, 1]
+    dx, dy, dz = (2 * (d[i, i] - d[0, 0] - d[1, 1] - d[2, 2]) for i in (0, 1, 2))
+    found = torch.stack(
+        [
+            x * px + y * py + z * pz,
+            w * px + x * dx + y * sxy + z * sxz,
+            w * py + y * dy + x * sxy + z * syz,
+            w * pz + z * dz + x * sxz + y * syz,
+        ]
+    ).mul_(2)
+    return found.sub_(q * (q * found).sum(0))
 
 
 def variances(factors: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

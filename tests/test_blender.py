@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -211,10 +210,8 @@ def test_a_missing_test_file_is_named(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_real_scene() -> None:
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set: no real scenes")
-    scene = load_scene(Path(os.environ["KGS_DATA"]) / "blender" / "lego", 8)
+def test_real_scene(kgs_data: Path) -> None:
+    scene = load_scene(kgs_data / "blender" / "lego", 8)
     assert scene.train.names == tuple(f"train/r_{i}.png" for i in (2, 16, 26, 55, 73, 76, 86, 93))
     assert scene.train.images.shape == (8, 3, 400, 400)
     assert len(scene.test) == 25

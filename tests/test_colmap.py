@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -242,10 +241,8 @@ def test_poses_that_are_none(tmp_path: Path, pose: str) -> None:
         load_scene(tmp_path)
 
 
-def test_real_scene() -> None:
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set: no real scenes")
-    scene = load_scene(Path(os.environ["KGS_DATA"]) / "colmap" / "trex", 3, points="model-points")
+def test_real_scene(kgs_data: Path) -> None:
+    scene = load_scene(kgs_data / "colmap" / "trex", 3, points="model-points")
     assert scene.train.names == ("img002.jpg", "img029.jpg", "img055.jpg")
     assert len(scene.test) == 7
     assert scene.train.images.shape == (3, 3, 375, 501)

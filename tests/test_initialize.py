@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -388,24 +387,20 @@ REAL = [
 
 
 @pytest.mark.parametrize(("name", "train_views", "expected"), REAL)
-def test_real_scene_gives_enough_points(name: str, train_views: int, expected: int) -> None:
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set")
+def test_real_scene_gives_enough_points(kgs_data: Path, name: str, train_views: int, expected: int) -> None:
     from kgs.datasets import load_scene
 
-    views = load_scene(Path(os.environ["KGS_DATA"]) / name, train_views=train_views).train
+    views = load_scene(kgs_data / name, train_views=train_views).train
     assert len(first_points(views).points) >= 0.9 * expected
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "bound"), [("llff/fern", 0.02), ("llff/flower", 0.04), ("colmap/trex", 0.02)])
-def test_real_points_agree_with_the_full_model(name: str, bound: float) -> None:
+def test_real_points_agree_with_the_full_model(kgs_data: Path, name: str, bound: float) -> None:
     # Median relative difference in depth to the nearest projected point, within 2 px, of the model from all views.
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set")
     from kgs.datasets import load_scene
 
-    scene = load_scene(Path(os.environ["KGS_DATA"]) / name, train_views=3, points="model-points")
+    scene = load_scene(kgs_data / name, train_views=3, points="model-points")
     differences = []
     for i in range(3):
         pixels, depths = [], []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -215,10 +214,8 @@ def test_model_points_need_the_same_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "tests", "train"), [("fern", 3, (1, 10, 19)), ("flower", 5, (1, 17, 33))])
-def test_real_scenes(name: str, tests: int, train: tuple[int, ...]) -> None:
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set: no real scenes")
-    scene = load_scene(Path(os.environ["KGS_DATA"]) / "llff" / name, 3, points="model-points")
+def test_real_scenes(kgs_data: Path, name: str, tests: int, train: tuple[int, ...]) -> None:
+    scene = load_scene(kgs_data / "llff" / name, 3, points="model-points")
     assert scene.train.names == tuple(f"image{i:03d}.png" for i in train)
     assert len(scene.test) == tests
     assert scene.train.images.shape == (3, 3, 378, 504)

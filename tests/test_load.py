@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from pathlib import Path
 
 import cv2
@@ -147,11 +146,9 @@ def sampson_error(views: Views, first: int, second: int) -> float:
     ("name", "train_views"),
     [("llff/fern", 6), ("llff/flower", 6), ("colmap/trex", 9), ("nerfstudio/fox", 24), ("blender/lego", None)],
 )
-def test_matches_of_real_photos_lie_on_epipolar_lines(name: str, train_views: int | None) -> None:
+def test_matches_of_real_photos_lie_on_epipolar_lines(kgs_data: Path, name: str, train_views: int | None) -> None:
     """A wrong axis, a shifted pairing of images and poses or a wrong focal length gives tens of pixels."""
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set: no real scenes")
-    views = load_scene(Path(os.environ["KGS_DATA"]) / name, train_views).train
+    views = load_scene(kgs_data / name, train_views).train
     centers = -(views.cameras.extrinsics[:, :3, :3].mT @ views.cameras.extrinsics[:, :3, 3:])[..., 0]
     axes = views.cameras.extrinsics[:, 2, :3]
     pairs = list(itertools.combinations(range(len(views)), 2))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -183,10 +182,8 @@ def test_names_stay_in_the_folder(tmp_path: Path, name: str) -> None:
         load_scene(tmp_path)
 
 
-def test_real_scene() -> None:
-    if "KGS_DATA" not in os.environ:
-        pytest.skip("KGS_DATA is not set: no real scenes")
-    scene = load_scene(Path(os.environ["KGS_DATA"]) / "nerfstudio" / "fox", 12)
+def test_real_scene(kgs_data: Path) -> None:
+    scene = load_scene(kgs_data / "nerfstudio" / "fox", 12)
     assert len(scene.train) == 12
     assert len(scene.test) == 7
     assert scene.test.names[0] == "images/0001.jpg"
