@@ -66,7 +66,7 @@ class Band:
         floor = math.log(rules.alpha_threshold) - 20 if rules.alpha_threshold else math.log(torch.finfo(dtype).tiny) + 8
         self.floor = floor
         self.cut = _below(max(rules.alpha_threshold, 1.01 * math.exp(floor)), dtype)
-        self.stop = _below(rules.transmittance_stop, dtype) if rules.transmittance_stop else None
+        self.stop = _below(rules.transmittance_stop, dtype) if rules.transmittance_stop else -1.0
         self.clamps = bool((table[0] > math.log(ALPHA_MAX)).any())
         self.groups = self._make_groups(lengths)
 

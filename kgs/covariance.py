@@ -73,14 +73,17 @@ class _FootprintFactors(torch.autograd.Function):
         r = _rotation_columns(q)
         turned = torch.stack([_dot(a[3 * i : 3 * i + 3], r[j::3]) for i in (0, 1) for j in (0, 1, 2)])
         ctx.save_for_backward(a, q, inverse_norm, s, turned)
-        return (turned.unflatten(0, (2, 3)) * s).permute(2, 0, 1).contiguous()
+        factors: Tensor = (turned.unflatten(0, (2, 3)) * s).permute(2, 0, 1).contiguous()
+        return factors
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
         a, q, inverse_norm, s, turned = ctx.saved_tensors
-        d_rows = d_quats = d_scales = None
+        d_rows: Tensor | None = None
+        d_quats: Tensor | None = None
+        d_scales: Tensor | None = None
         g = _columns(grad)
         if ctx.needs_input_grad[2]:
             d_scales = (turned * g).unflatten(0, (2, 3)).sum(0).t()

@@ -133,7 +133,7 @@ class Forward(_Worker):
             self.evaluate(ids, tiles[:n], alpha)
             layers = self.scan(alpha, light[:, 0])
             # T never grows, so cutting afterwards is cutting at each layer
-            ended = band.stop is not None and float(layers[-1].min()) <= band.stop
+            ended = float(layers[-1].min()) <= band.stop
             if ended:
                 F.threshold(layers, band.stop, 0.0, inplace=True)
             if self.keep:

@@ -11,6 +11,7 @@ from oracles import near_threshold, pinhole, random_camera, random_gaussians, th
 
 import kgs.reference
 from kgs import GaussianRenderer, ProjectedGaussians, composite, project
+from kgs.chunks import Band
 from kgs.compositing import bytes_per_entry
 from kgs.tiles import tile_spans
 
@@ -299,6 +300,29 @@ def test_byte_budget_changes_nothing(dtype):
     )
     assert torch.equal(tight, free)
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_alphas_made_again_are_those_that_were_kept(dtype, monkeypatch):
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+    steps, forward = [], Band.forward
+
+    def noted(band, keep):
+        result = forward(band, keep)
+        steps.extend(step for group in band.groups for step in group.steps)
+        return result
+
+    monkeypatch.setattr(Band, "forward", noted)
+    kept, kept_gradients = loss_and_gradients(projected, colors, weights)
+    assert all(step.alpha is not None for step in steps)
+    steps.clear()
+    entries = int(tile_spans(projected, 8, TH).entries_per_row.sum())
+    lean, lean_gradients = loss_and_gradients(
+        projected, colors, weights, max_bytes=bytes_per_entry(3, 8, dtype) * entries
+    )
+    assert all(step.alpha is None for step in steps)
+    assert torch.equal(lean, kept)
+    assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
 
 
 @pytest.mark.parametrize("size", [(8, 8), (8, 24), (24, 8), (11, 5)])

@@ -90,6 +90,26 @@ def test_gradcheck_of_rotation_and_factors():
     assert torch.autograd.gradcheck(lambda *x: torch.stack(whitening(*variances(footprint_factors(*x), EPS2D))), inputs)
 
 
+@pytest.mark.parametrize("norm", [1e-30, 1e-3, 1.0, 1e30])
+def test_factors_have_the_gradients_of_kornias_rotation(norm):
+    inputs = [normal(9, 2, 3), normal(9, 4, seed=1) * norm, normal(9, 3, seed=2).exp()]
+    inputs = [value.requires_grad_() for value in inputs]
+    inputs[1].data[0] = 0.0  # the identity, with no gradient
+    rows, quats, scales = inputs
+    weights = normal(9, 2, 3, seed=3)
+    expected = torch.autograd.grad((rows @ rotation_matrices(quats) * scales[:, None] * weights).sum(), inputs)
+    got = torch.autograd.grad((footprint_factors(*inputs) * weights).sum(), inputs)
+    for one, other in zip(got, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-13 * float(other.abs().max()))
+    assert not got[1][0].any()
+
+
+def test_factors_have_no_second_derivative():
+    rows, quats, scales = normal(2, 2, 3), normal(2, 4, seed=1).requires_grad_(), normal(2, 3, seed=2).exp()
+    with pytest.raises(RuntimeError, match="second derivative"):
+        torch.autograd.grad(footprint_factors(rows, quats, scales).sum(), quats, create_graph=True)
+
+
 # -- ordinary footprints -------------------------------------------------------------------------------------------
 
 

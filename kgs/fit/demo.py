@@ -9,14 +9,23 @@ from typing import Any
 
 from kgs.datasets.scene import Scene
 
-from .config import FitConfig
+from .config import FitConfig, Recipe
 from .report import side_by_side, write_curve, write_json, write_png
 from .run import choose_points, measure, train
 from .trainer import Trainer
 
 __all__ = ["DEMO", "run_demo"]
 
-DEMO = FitConfig(steps=1200, drop=0.2, max_gaussians=6000)
+
+# Small pictures, many Gaussians and raised rates: a minute is then enough to overfit, which is what is to be shown.
+DEMO = FitConfig(
+    steps=1000,
+    drop=0.2,
+    max_gaussians=5000,
+    recipe=Recipe(
+        lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4
+    ),
+)
 
 
 def run_demo(

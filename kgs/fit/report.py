@@ -34,6 +34,8 @@ __all__ = [
     "write_png",
 ]
 
+LEGIBLE = 200  # pixels; narrower pictures are enlarged on a sheet
+
 
 def run_metrics(
     trainer: Trainer, test: dict[str, Any] | None, train: dict[str, Any] | None, protocol: dict[str, Any]
@@ -120,17 +122,17 @@ def side_by_side(views: Views, columns: dict[str, list[Tensor]], indices: list[i
         indices: the views to show.
 
     Returns:
-        `(3, H', W')`.
+        `(3, H', W')`; small pictures are enlarged by a whole factor.
     """
-    gap = 4
-    header = 18
-    rows = []
+    gap, header, rows = 4, 18, []
+    enlarge = max(1, -(-LEGIBLE // views.images.shape[-1]))
     for i in indices:
-        pictures = [views.images[i], *(renders[i].cpu().clamp(0, 1) for renders in columns.values())]
+        pictures = torch.stack([views.images[i], *(renders[i].cpu().clamp(0, 1) for renders in columns.values())])
+        pictures = torch.nn.functional.interpolate(pictures, scale_factor=enlarge, mode="nearest-exact")
         rows.append(torch.cat([torch.nn.functional.pad(p, (0, gap, 0, gap), value=1.0) for p in pictures], 2))
     sheet = torch.nn.functional.pad(torch.cat(rows, 1)[:, :-gap, :-gap], (0, 0, header, 0), value=1.0)
     canvas = np.ascontiguousarray((sheet.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
-    width = views.images.shape[-1] + gap
+    width = views.images.shape[-1] * enlarge + gap
     for k, title in enumerate(["photo, not used in training", *columns]):
         cv2.putText(canvas, title, (k * width + 2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
     return torch.from_numpy(canvas).permute(2, 0, 1) / 255

@@ -63,6 +63,8 @@ def fit_scene(
         trainer = Trainer.resume(scene, config, checkpoint)
         say(f"resumed at step {trainer.step}")
     else:
+        if checkpoint.exists():
+            say(f"{out}: replacing the results of an earlier fit (--resume would go on with it)")
         points = choose_points(scene, config)
         say(f"first points: {len(points.points)} ({points.kind})")
         trainer = Trainer(scene, config, points)

@@ -85,7 +85,7 @@ def _detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
     factor = 2 if grey.size < SMALL_IMAGE else 1
     if factor > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
-        mask = None if mask is None else cv2.resize(mask, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+        mask = None if mask is None else mask.repeat(factor, 0).repeat(factor, 1)
     # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
     sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # not in the stubs
         nfeatures=limit, nOctaveLayers=4, contrastThreshold=0.005, enable_precise_upscale=True
