@@ -42,7 +42,7 @@ def demo(
     *,
     out: Annotated[Path, _alias("-o")] = Path("demo"),
     steps: int | None = None,
-    size: tuple[int, int] = (66, 88),
+    size: tuple[int, int] = (54, 72),
     seed: int = 0,
 ) -> int:
     """Three views of a built-in scene, fitted without and with DropGaussian, compared on views not used.

@@ -128,7 +128,7 @@ def side_by_side(views: Views, columns: dict[str, list[Tensor]], indices: list[i
     enlarge = max(1, -(-LEGIBLE // views.images.shape[-1]))
     for i in indices:
         pictures = torch.stack([views.images[i], *(renders[i].cpu().clamp(0, 1) for renders in columns.values())])
-        pictures = torch.nn.functional.interpolate(pictures, scale_factor=enlarge, mode="nearest-exact")
+        pictures = torch.nn.functional.interpolate(pictures, scale_factor=enlarge, mode="bicubic").clamp(0, 1)
         rows.append(torch.cat([torch.nn.functional.pad(p, (0, gap, 0, gap), value=1.0) for p in pictures], 2))
     sheet = torch.nn.functional.pad(torch.cat(rows, 1)[:, :-gap, :-gap], (0, 0, header, 0), value=1.0)
     canvas = np.ascontiguousarray((sheet.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
