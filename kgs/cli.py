@@ -1,4 +1,4 @@
-"""The command `kgs`: demo, fit, render, eval."""
+"""The command `kgs`: demo, fit, render, eval, bench."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         import tyro
 
-        commands: dict[str, Any] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
+        commands: dict[str, Any] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate, "bench": bench}
         code: int = tyro.extras.subcommand_cli_from_dict(
             commands, prog="kgs", description=sys.modules[__package__].__doc__, args=arguments
         )
@@ -195,6 +195,23 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     metrics = read_json(out / "metrics.json") | measure(Trainer.resume(scene, config, out / CHECKPOINT), lpips)
     write_json(out / "metrics.json", metrics)
     _print_metrics(metrics)
+    return 0
+
+
+def bench(
+    what: Literal["speed"], /, *, out: Annotated[Path, _alias("-o")], quick: bool = False, device: str = "cpu"
+) -> int:
+    """Measure this machine and write the figures as tables, CSV, JSON and plots.
+
+    Args:
+        what: speed: time and memory of rendering and of training steps, beside what kgs is held to.
+        out: folder for the results.
+        quick: less of it, in under a minute.
+        device: cpu, cuda, ...
+    """
+    from .bench.speed import measure_speed
+
+    measure_speed(out, quick=quick, device=device)
     return 0
 
 

@@ -1,0 +1,343 @@
+"""Time and memory of the renderer and of a training step on this machine, and how they grow."""
+
+from __future__ import annotations
+
+import csv
+import math
+import multiprocessing
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.compositing import composite
+from kgs.fit.report import peak_rss_mb, versions, write_json
+from kgs.fit.trainer import move_camera
+from kgs.losses import photometric_loss, target_moments
+from kgs.model import GaussianModel
+from kgs.projection import project
+from kgs.renderer import GaussianRenderer
+from kgs.tiles import bin_to_tiles
+from kgs.types import Gaussians
+
+from .scenes import layered_scene
+from .timing import Times, calibrations, take_turns
+
+__all__ = ["SIZE", "TARGETS", "measure_speed"]
+
+SIZE = (378, 504)
+# What kgs is held to on two cores, by count of Gaussians: seconds, and MiB over what importing takes.
+TARGETS = {
+    "forward, no gradient": {10_000: 0.030, 50_000: 0.110, 200_000: 0.250},
+    "forward + backward": {10_000: 0.080, 50_000: 0.280, 200_000: 0.480},
+    "training step": {10_000: 0.125, 50_000: 0.330, 200_000: 0.540},
+    "peak memory": {10_000: 250.0, 50_000: 450.0, 200_000: 900.0},
+}
+_COLUMNS = (
+    *("table", "case", "gaussians", "height", "width", "pairs_millions"),
+    *("wall_s", "best_s", "worst_s", "cpu_s", "repeats", "target_s", "wall_in_exp_per_pair"),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the results.
+
+    Args:
+        table: "main", "stages", "left out" or "scaling".
+        case: what was done.
+        count: Gaussians.
+        size: height and width.
+        pairs: of pixel and Gaussian that were evaluated, in millions; nan where it was not counted.
+        times: wall clock and processor time.
+        target: seconds it is held to; nan where there is none.
+    """
+
+    table: str
+    case: str
+    count: int
+    size: tuple[int, int]
+    pairs: float
+    times: Times
+    target: float = math.nan
+
+
+def measure_speed(
+    out: Path, *, quick: bool = False, device: str = "cpu", say: Callable[[str], None] = print
+) -> dict[str, Any]:
+    """Measure, and write speed.csv, speed.json, speed.md and scaling.png.
+
+    Args:
+        out: folder for the results, made if it is not there.
+        quick: fewer Gaussians and repetitions: tens of seconds instead of minutes.
+        device: where to render.
+        say: where lines for the user go.
+
+    Returns:
+        What speed.json holds.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    where, repeats = torch.device(device), 3 if quick else 7
+    counts = (2_000, 10_000) if quick else (10_000, 50_000, 200_000)
+    rows: list[Row] = []
+    memory = {}
+    for count in counts:
+        say(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
+        cases = _Cases(count, SIZE, where)
+        rows += [
+            Row("main", name, count, SIZE, cases.pairs, times, TARGETS[name].get(count, math.nan))
+            for name, times in take_turns(cases.main(), repeats, where).items()
+        ]
+        rows += [
+            Row("stages", name, count, SIZE, cases.pairs, times)
+            for name, times in take_turns(cases.stages(), repeats, where).items()
+        ]
+        memory[count] = _memory_of_its_own(count) if where.type == "cpu" else math.nan
+    say("what is left out ...")
+    cases = _Cases(counts[min(1, len(counts) - 1)], SIZE, where)
+    rows += [
+        Row("left out", name, cases.count, SIZE, math.nan, times)
+        for name, times in take_turns(cases.savings(), repeats, where).items()
+    ]
+    say("scaling ...")
+    sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
+    scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
+    for count, size in scaled:
+        cases = _Cases(count, size, where)
+        times = take_turns({"forward + backward": cases.main()["forward + backward"]}, repeats, where)
+        rows.append(Row("scaling", "forward + backward", count, size, cases.pairs, times["forward + backward"]))
+    units = calibrations(where)
+    exponents = {
+        "count": _exponent([(r.count, r.times.wall) for r in rows if r.table == "scaling" and r.size == SIZE]),
+        "pairs": _exponent([(r.pairs, r.times.wall) for r in rows if r.table == "scaling" and r.size == SIZE]),
+        "pixels": _exponent(
+            [(math.prod(r.size), r.times.wall) for r in rows[-len(sizes) :] if r.table == "scaling"],
+        ),
+    }
+    result = {
+        "rows": [asdict(row) for row in rows],
+        "peak_memory_mb": memory,
+        "calibrations": units,
+        "exponents": exponents,
+        "threads": torch.get_num_threads(),
+        "device": device,
+        "versions": versions(),
+    }
+    _write_csv(out / "speed.csv", rows, units)
+    write_json(out / "speed.json", result)
+    table = _markdown(rows, memory, units, exponents)
+    (out / "speed.md").write_text(table)
+    _plot(out / "scaling.png", [row for row in rows if row.table == "scaling"])
+    say(table)
+    return result
+
+
+class _Cases:
+    """One scene, and what there is to time on it."""
+
+    def __init__(self, count: int, size: tuple[int, int], device: torch.device) -> None:
+        model, camera = layered_scene(count, size)
+        self.count, self.device = count, device
+        self.model: GaussianModel = model.to(device)
+        self.camera: PinholeCamera = move_camera(camera, device)
+        self.renderer = GaussianRenderer()
+        generator = torch.Generator().manual_seed(0)
+        self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
+        self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
+        self.moments = target_moments(self.photo)
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=0.0, fused=True)
+        with torch.no_grad():
+            bins = bin_to_tiles(project(self.model(), self.camera))
+        self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6
+
+    def main(self) -> dict[str, Callable[[], object]]:
+        return {
+            "forward, no gradient": self.forward,
+            "forward + backward": lambda: self.both(self.model()),
+            "training step": self.train,
+        }
+
+    def forward(self) -> Tensor | None:
+        with torch.no_grad():
+            return self.renderer(self.model(), self.camera).image
+
+    def both(self, gaussians: Gaussians, outputs: tuple[str, ...] = ("image",)) -> None:
+        rendering = self.renderer(gaussians, self.camera, outputs=outputs)
+        picture = rendering.image if rendering.image is not None else rendering.alpha
+        (picture * self.weights[:, : picture.shape[1]]).sum().backward()
+        self.model.zero_grad()
+
+    def train(self) -> None:
+        image = self.renderer(self.model(), self.camera).image
+        photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def stages(self) -> dict[str, Callable[[], object]]:
+        """The parts of a training step one by one; each keeps what the next one needs."""
+        kept: dict[str, Any] = {}
+
+        def projection() -> None:
+            kept["projected"] = project(self.model(), self.camera)
+            p = kept["projected"]
+            kept["inputs"] = [x.detach().requires_grad_() for x in (p.means2d, p.factors, p.opacities, p.colors)]
+
+        def binning() -> None:
+            bin_to_tiles(kept["projected"])
+
+        def forward() -> None:
+            names = ("means2d", "factors", "opacities", "colors")
+            loose = type(kept["projected"])(
+                **{**vars(kept["projected"]), **dict(zip(names, kept["inputs"], strict=True))}
+            )
+            kept["image"] = composite(loose, loose.colors).features
+
+        def loss() -> None:
+            image = kept["image"].detach().requires_grad_()
+            photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
+            kept["grad"] = image.grad
+
+        def backward() -> None:
+            kept["grads"] = torch.autograd.grad(kept["image"], kept["inputs"], kept["grad"])
+
+        def projection_backward() -> None:
+            p = kept["projected"]
+            torch.autograd.backward([p.means2d, p.factors, p.opacities, p.colors], kept["grads"])
+
+        def adam() -> None:
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+
+        return {
+            "projection, harmonics": projection,
+            "binning": binning,
+            "compositing, binning included": forward,
+            "loss, forward + backward": loss,
+            "compositing, backward": backward,
+            "projection, harmonics, backward": projection_backward,
+            "Adam": adam,
+        }
+
+    def savings(self) -> dict[str, Callable[[], object]]:
+        """Forward + backward with one thing less each time."""
+
+        def changed(**fields: Tensor) -> Gaussians:
+            return Gaussians(**{**vars(self.model()), **fields})
+
+        half = (torch.arange(self.count, device=self.device) % 2).float()
+        behind = torch.tensor([0.0, 0.0, -100.0], device=self.device)
+        return {
+            "everything": lambda: self.both(self.model()),
+            "no gradient at all": self.forward,
+            "colours frozen": lambda: self.both(changed(colors=self.model().colors.detach())),
+            "geometry frozen": lambda: self.both(
+                changed(
+                    means=self.model.means.detach(),
+                    quats=self.model.quats.detach(),
+                    scales=self.model.log_scales.detach().exp(),
+                )
+            ),
+            "harmonics of degree 0": lambda: self.both(changed(colors=self.model.sh_dc)),
+            "alpha only": lambda: self.both(self.model(), ("alpha",)),
+            "half of the Gaussians dropped": lambda: self.both(changed(opacities=self.model().opacities * half)),
+            "half of the Gaussians behind the camera": lambda: self.both(
+                changed(means=self.model.means + behind * (1 - half)[:, None])
+            ),
+        }
+
+
+def _memory_of_its_own(count: int) -> float:
+    """MiB that rendering forward and backward takes over importing, in a process that does nothing else."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_memory, (count,))
+
+
+def _memory(count: int) -> float:
+    before = peak_rss_mb()
+    cases = _Cases(count, SIZE, torch.device("cpu"))
+    for _ in range(3):
+        cases.both(cases.model())
+    return float(peak_rss_mb() - before)
+
+
+def _exponent(points: list[tuple[float, float]]) -> float:
+    """Slope of the line through the logarithms."""
+    x, y = np.log(np.array(points)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def _write_csv(path: Path, rows: list[Row], units: dict[str, float]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(_COLUMNS)
+        for row in rows:
+            t = row.times
+            per_pair = t.wall / (row.pairs * 1e6) / units["exp"]
+            times = (t.wall, t.best, t.worst, t.cpu, t.repeats)
+            writer.writerow([row.table, row.case, row.count, *row.size, row.pairs, *times, row.target, per_pair])
+
+
+def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float], exponents: dict[str, float]) -> str:
+    main = [row for row in rows if row.table == "main"]
+    counts = sorted({row.count for row in main})
+    lines = [
+        f"{SIZE[1]}x{SIZE[0]}, harmonics of degree 3: wall clock, median (least to largest); what it is held to",
+        "",
+        "| | " + " | ".join(f"{count // 1000}k" for count in counts) + " |",
+        "|---" * (len(counts) + 1) + "|",
+    ]
+    for name in dict.fromkeys(row.case for row in main):
+        cells = [_cell(row.times, row.target) for row in main if row.case == name]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    held = TARGETS["peak memory"]
+    cells = [f"{memory[count]:.0f} MiB" + (f"; {held[count]:.0f}" if count in held else "") for count in counts]
+    lines += [f"| peak memory over importing | {' | '.join(cells)} |", ""]
+    lines += ["Parts of a training step, ms:", ""]
+    lines += ["| | " + " | ".join(f"{count // 1000}k" for count in counts) + " |", "|---" * (len(counts) + 1) + "|"]
+    stages = [row for row in rows if row.table == "stages"]
+    for name in dict.fromkeys(row.case for row in stages):
+        lines.append(
+            f"| {name} | " + " | ".join(f"{row.times.wall * 1e3:.0f}" for row in stages if row.case == name) + " |"
+        )
+    savings = [row for row in rows if row.table == "left out"]
+    lines += ["", f"What is not asked for is not computed, {savings[0].count} Gaussians, forward + backward:", ""]
+    lines += ["| | ms | of everything |", "|---|---|---|"]
+    for row in savings:
+        lines.append(f"| {row.case} | {row.times.wall * 1e3:.0f} | {row.times.wall / savings[0].times.wall:.2f} |")
+    lines += [
+        "",
+        f"Time grows as count^{exponents['count']:.2f}, pairs^{exponents['pairs']:.2f}, "
+        f"pixels^{exponents['pixels']:.2f} (at a fixed count).",
+        f"Calibration: exp {units['exp'] * 1e9:.2f} ns an element, dense oracle (400 Gaussians, 48x64) "
+        f"{units['dense'] * 1e3:.0f} ms.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _cell(times: Times, target: float) -> str:
+    text = f"{times.wall * 1e3:.0f} ({times.best * 1e3:.0f} to {times.worst * 1e3:.0f}) ms"
+    return text if math.isnan(target) else f"{text}; {target * 1e3:.0f}"
+
+
+def _plot(path: Path, rows: list[Row]) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    by_count = sorted((row.count, row.times.wall) for row in rows if row.size == SIZE)
+    by_pairs = sorted((row.pairs, row.times.wall) for row in rows)
+    for axis, points, label in zip(axes, (by_count, by_pairs), ("Gaussians", "evaluated pairs [million]"), strict=True):
+        axis.loglog(*zip(*points, strict=True), "o-", markersize=4)
+        axis.set_xlabel(label)
+        axis.set_ylabel("forward + backward [s]")
+        axis.grid(alpha=0.3, which="both")
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
