@@ -53,9 +53,9 @@ class Row:
         case: what was done.
         count: Gaussians.
         size: height and width.
-        pairs: of pixel and Gaussian that were evaluated, in millions; nan where it was not counted.
+        pairs: of pixel and Gaussian in the tiles' lists, in millions.
         times: wall clock and processor time.
-        target: seconds it is held to; nan where there is none.
+        target: seconds it is held to, if it is.
     """
 
     table: str
@@ -64,7 +64,7 @@ class Row:
     size: tuple[int, int]
     pairs: float
     times: Times
-    target: float = math.nan
+    target: float | None = None
 
 
 def measure_speed(
@@ -90,18 +90,19 @@ def measure_speed(
         say(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
         cases = _Cases(count, SIZE, where)
         rows += [
-            Row("main", name, count, SIZE, cases.pairs, times, TARGETS[name].get(count, math.nan))
+            Row("main", name, count, SIZE, cases.pairs, times, TARGETS[name].get(count))
             for name, times in take_turns(cases.main(), repeats, where).items()
         ]
         rows += [
             Row("stages", name, count, SIZE, cases.pairs, times)
             for name, times in take_turns(cases.stages(), repeats, where).items()
         ]
-        memory[count] = _memory_of_its_own(count) if where.type == "cpu" else math.nan
+        if where.type == "cpu":
+            memory[count] = _memory_of_its_own(count)
     say("what is left out ...")
     cases = _Cases(counts[min(1, len(counts) - 1)], SIZE, where)
     rows += [
-        Row("left out", name, cases.count, SIZE, math.nan, times)
+        Row("left out", name, cases.count, SIZE, cases.pairs, times)
         for name, times in take_turns(cases.savings(), repeats, where).items()
     ]
     say("scaling ...")
@@ -295,8 +296,8 @@ def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float]
         cells = [_cell(row.times, row.target) for row in main if row.case == name]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     held = TARGETS["peak memory"]
-    cells = [f"{memory[count]:.0f} MiB" + (f"; {held[count]:.0f}" if count in held else "") for count in counts]
-    lines += [f"| peak memory over importing | {' | '.join(cells)} |", ""]
+    cells = [f"{mb:.0f} MiB" + (f"; {held[count]:.0f}" if count in held else "") for count, mb in memory.items()]
+    lines += [f"| peak memory over importing | {' | '.join(cells)} |", ""] if memory else [""]
     lines += ["Parts of a training step, ms:", ""]
     lines += ["| | " + " | ".join(f"{count // 1000}k" for count in counts) + " |", "|---" * (len(counts) + 1) + "|"]
     stages = [row for row in rows if row.table == "stages"]
@@ -320,9 +321,9 @@ def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float]
     return "\n".join(lines)
 
 
-def _cell(times: Times, target: float) -> str:
+def _cell(times: Times, target: float | None) -> str:
     text = f"{times.wall * 1e3:.0f} ({times.best * 1e3:.0f} to {times.worst * 1e3:.0f}) ms"
-    return text if math.isnan(target) else f"{text}; {target * 1e3:.0f}"
+    return text if target is None else f"{text}; {target * 1e3:.0f}"
 
 
 def _plot(path: Path, rows: list[Row]) -> None:
