@@ -66,7 +66,7 @@ class _FootprintFactors(torch.autograd.Function):
         a, s = _columns(rows), _columns(scales)
         peak = quats.abs().amax(1)
         q = _columns(quats).div_(torch.where(peak > 0, peak, 1.0))
-        norm = torch.linalg.vector_norm(q, dim=0)
+        norm = q.square().sum(0).sqrt()
         q.div_(torch.where(norm > 0, norm, 1.0))
         q[0].masked_fill_(norm == 0, 1.0)
         inverse_norm = torch.where(norm > 0, 1.0 / (norm * peak), 0.0)
@@ -106,7 +106,7 @@ def _columns(rows: Tensor) -> Tensor:
     return rows.flatten(1).t().clone(memory_format=torch.contiguous_format)
 
 
-def _dot(u: Tensor, v: Sequence[Tensor] | Tensor) -> Tensor:
+def _dot(u: Sequence[Tensor] | Tensor, v: Sequence[Tensor] | Tensor) -> Tensor:
     return torch.addcmul(torch.addcmul(u[0] * v[0], u[1], v[1]), u[2], v[2])
 
 
@@ -137,10 +137,10 @@ def _quaternion_gradient(q: Tensor, d: Tensor) -> Tensor:
 
 def variances(factors: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entries xx, xy, yy and determinant of M M^T + eps2d I, each `(M,)`."""
-    mx, my = factors.unbind(1)
-    xx, xy, yy = (mx * mx).sum(1), (mx * my).sum(1), (my * my).sum(1)
-    cross = torch.linalg.cross(mx, my)
-    det = (cross * cross).sum(1) + eps2d * (xx + yy) + eps2d**2
+    a, b = _columns(factors).unflatten(0, (2, 3))
+    xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
+    cross = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    det = _dot(cross, cross) + eps2d * (xx + yy) + eps2d**2
     return xx + eps2d, xy, yy + eps2d, det
 
 

@@ -96,8 +96,6 @@ class TileSpans:
         tiles = _arange(span) + ((rows - begin) * columns + first - start).index_select(0, span)
         ranks = ranks.index_select(0, span)
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
-        by_gaussian = torch.empty_like(order).scatter_(0, order, torch.arange(num_entries, device=order.device))
-        per_gaussian = torch.bincount(ranks, minlength=self.ids.shape[0])
         per_tile = torch.bincount(keys, minlength=num_tiles)
         return TileBins(
             tile_size=self.tile_size,
@@ -106,8 +104,7 @@ class TileSpans:
             offsets=torch.cat([per_tile.new_zeros(1), torch.cumsum(per_tile, 0)]),
             entries=ranks.index_select(0, order),
             ids=self.ids,
-            by_gaussian=by_gaussian,
-            gaussian_offsets=torch.cumsum(per_gaussian, 0) - per_gaussian,
+            order=order,
         )
 
 

@@ -182,8 +182,7 @@ class TileBins:
         offsets: `(T + 1,)` int64; the entries of tile t are `offsets[t]:offsets[t + 1]`.
         entries: `(E,)` int32, position in `ids`, sorted by tile and then from front to back.
         ids: `(n,)` int64, the rows of `ProjectedGaussians` that may have entries, in depth order.
-        by_gaussian: `(E,)` int64, the entries of `ids[0]`, then of `ids[1]`, ...
-        gaussian_offsets: `(n,)` int64, where the entries of each of `ids` begin in `by_gaussian`.
+        order: `(E,)` int64, which place each entry has if they are sorted by `ids` first and then by tile.
     """
 
     tile_size: int
@@ -192,13 +191,24 @@ class TileBins:
     offsets: Tensor
     entries: Tensor
     ids: Tensor
-    by_gaussian: Tensor
-    gaussian_offsets: Tensor
+    order: Tensor
 
     @property
     def num_tiles(self) -> int:
         """How many tiles the band has."""
         return self.offsets.shape[0] - 1
+
+    @property
+    def by_gaussian(self) -> Tensor:
+        """The entries of `ids[0]`, then of `ids[1]`, ..., `(E,)` int64; computed at each call."""
+        entries = torch.arange(self.order.shape[0], device=self.order.device)
+        return torch.empty_like(self.order).scatter_(0, self.order, entries)
+
+    @property
+    def gaussian_offsets(self) -> Tensor:
+        """Where the entries of each of `ids` begin in `by_gaussian`, `(n,)` int64; computed at each call."""
+        counts = torch.bincount(self.entries, minlength=self.ids.shape[0])
+        return torch.cumsum(counts, 0) - counts
 
 
 @dataclass(frozen=True)
