@@ -199,19 +199,33 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
 
 
 def bench(
-    what: Literal["speed"], /, *, out: Annotated[Path, _alias("-o")], quick: bool = False, device: str = "cpu"
+    what: Literal["speed", "training"],
+    /,
+    *,
+    out: Annotated[Path, _alias("-o")],
+    quick: bool = False,
+    device: str = "cpu",
+    processes: int | None = None,
 ) -> int:
     """Measure this machine and write the figures as tables, CSV, JSON and plots.
 
     Args:
-        what: speed: time and memory of rendering and of training steps, beside what kgs is held to.
+        what: speed: time and memory of rendering and of training steps, beside what kgs is held to. training: test
+            PSNR against time, one knob of the fit at a time, with KGS_DATA on fern too; hours, goes on where it
+            stopped.
         out: folder for the results.
-        quick: less of it, in under a minute.
-        device: cpu, cuda, ...
+        quick: less of it, in about a minute.
+        device: cpu, cuda, ... (speed).
+        processes: fits at a time; one a core unless given (training).
     """
-    from .bench.speed import measure_speed
+    if what == "speed":
+        from .bench.speed import measure_speed
 
-    measure_speed(out, quick=quick, device=device)
+        measure_speed(out, quick=quick, device=device)
+    else:
+        from .bench.training import measure_training
+
+        measure_training(out, quick=quick, processes=processes)
     return 0
 
 

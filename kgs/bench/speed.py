@@ -163,9 +163,10 @@ class _Cases:
             "training step": self.train,
         }
 
-    def forward(self) -> Tensor | None:
+    def forward(self) -> Tensor:
         with torch.no_grad():
-            return self.renderer(self.model(), self.camera).image
+            image: Tensor = self.renderer(self.model(), self.camera).image
+        return image
 
     def both(self, gaussians: Gaussians, outputs: tuple[str, ...] = ("image",)) -> None:
         rendering = self.renderer(gaussians, self.camera, outputs=outputs)
@@ -336,7 +337,8 @@ def _plot(path: Path, rows: list[Row]) -> None:
     by_count = sorted((row.count, row.times.wall) for row in rows if row.size == SIZE)
     by_pairs = sorted((row.pairs, row.times.wall) for row in rows)
     for axis, points, label in zip(axes, (by_count, by_pairs), ("Gaussians", "evaluated pairs [million]"), strict=True):
-        axis.loglog(*zip(*points, strict=True), "o-", markersize=4)
+        x, y = np.array(points).T
+        axis.loglog(x, y, "o-", markersize=4)
         axis.set_xlabel(label)
         axis.set_ylabel("forward + backward [s]")
         axis.grid(alpha=0.3, which="both")

@@ -1,0 +1,84 @@
+"""The benchmark of speed measures what it says; how fast anything is, is no test."""
+
+import math
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+import kgs
+from kgs.bench import speed
+from kgs.bench.scenes import layered_scene
+from kgs.bench.speed import _Cases, _exponent, measure_speed
+from kgs.bench.timing import take_turns
+
+
+def test_the_scene_keeps_its_footprints_and_pairs_per_gaussian():
+    sizes = []
+    for count, size in ((2000, (94, 126)), (2000, (189, 252)), (8000, (189, 252))):
+        model, camera = layered_scene(count, size)
+        assert isinstance(camera, PinholeCamera)
+        projected = kgs.project(model(), camera)
+        xx, _, yy, det = kgs.covariance.variances(projected.factors, 0.3)
+        sizes.append(float(det.detach().pow(0.25).median()))
+        inside = (projected.means2d > -0.5) & (projected.means2d < torch.tensor(size).flip(0) - 0.5)
+        assert 0.7 < int(inside.all(1).sum()) / count < 0.82
+        assert bool((xx > 0).all() and (yy > 0).all())
+    assert max(sizes) / min(sizes) < 1.1
+    assert sizes[0] == pytest.approx(2.3, abs=0.3)
+
+
+def test_the_same_seed_gives_the_same_scene():
+    one, other = layered_scene(50)[0].state_dict(), layered_scene(50)[0].state_dict()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert not torch.equal(layered_scene(50, seed=1)[0].means, one["means"])
+
+
+def test_cases_take_turns():
+    order = []
+    times = take_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, repeats=3)
+    assert order == ["a", "b"] * 4
+    assert times["a"].repeats == 3
+    assert times["a"].best <= times["a"].wall <= times["a"].worst
+
+
+def test_stages_are_those_of_a_whole_step():
+    cases = _Cases(300, (40, 56), torch.device("cpu"))
+    renderer = kgs.GaussianRenderer()
+    image = renderer(cases.model(), cases.camera).image
+    kgs.losses.photometric_loss(image.clamp(0, 1), cases.photo, 0.2).backward()
+    expected = {name: parameter.grad.clone() for name, parameter in cases.model.named_parameters()}
+    cases.model.zero_grad()
+    stages = cases.stages()
+    for name in list(stages)[:-1]:
+        stages[name]()
+    for name, parameter in cases.model.named_parameters():
+        torch.testing.assert_close(parameter.grad, expected[name], rtol=1e-4, atol=1e-5 * expected[name].abs().max())
+
+
+def test_savings_leave_the_image_alone():
+    cases = _Cases(300, (40, 56), torch.device("cpu"))
+    seen = []
+    cases.both = lambda gaussians, outputs=("image",): seen.append(gaussians)
+    savings = cases.savings()
+    whole = cases.forward()
+    for name in ("colours frozen", "geometry frozen"):
+        savings[name]()
+        image = cases.renderer(seen[-1], cases.camera).image
+        assert torch.equal(image, whole)
+    savings["half of the Gaussians behind the camera"]()
+    assert len(kgs.project(seen[-1], cases.camera)) < 0.6 * len(kgs.project(cases.model(), cases.camera))
+
+
+def test_the_exponent_of_a_power_law():
+    assert _exponent([(x, 3 * x**1.5) for x in (1.0, 2.0, 8.0)]) == pytest.approx(1.5)
+
+
+def test_the_files_are_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(speed, "SIZE", (36, 48))
+    monkeypatch.setattr(speed, "_memory_of_its_own", lambda _: 1.0)
+    result = measure_speed(tmp_path, quick=True, say=lambda _: None)
+    assert {path.name for path in tmp_path.iterdir()} == {"speed.csv", "speed.json", "speed.md", "scaling.png"}
+    assert {row["table"] for row in result["rows"]} == {"main", "stages", "left out", "scaling"}
+    assert all(math.isfinite(value) for value in result["exponents"].values())
+    assert "| forward + backward |" in (tmp_path / "speed.md").read_text()
