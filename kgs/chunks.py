@@ -67,6 +67,7 @@ class Band:
         self.floor = floor
         self.cut = _below(max(rules.alpha_threshold, 1.01 * math.exp(floor)), dtype)
         self.stop = _below(rules.transmittance_stop, dtype) if rules.transmittance_stop else -1.0
+        self.by_layer = device.type == "cpu"  # scans: a GPU wants few launches, a CPU few passes
         self.clamps = bool((table[0] > math.log(ALPHA_MAX)).any())
         self.groups = self._make_groups(lengths)
 

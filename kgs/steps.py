@@ -97,7 +97,7 @@ class _Worker:
         """The transmittance before each layer and after the last, `(K + 1, n, P)`, without the stop."""
         light = self.buffer(0, alpha.shape[0] + 1, alpha.shape[1])
         light[0] = before
-        if alpha.device.type == "cpu":
+        if self.band.by_layer:
             layers = light.unbind(0)
             for k, a in enumerate(alpha.unbind(0)):
                 torch.addcmul(layers[k], layers[k], a, value=-1, out=layers[k + 1])
@@ -193,6 +193,23 @@ class Backward(_Worker):
                 self._step(step, tiles, starts, ends, g, later)
                 behind.index_copy_(0, rows, later)
 
+    def scan_back(
+        self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor, ended: bool, later: Tensor
+    ) -> None:
+        """Fill `later` `(K + 1, n, P)` with V of each layer and behind the last; `light` is used up."""
+        if self.band.by_layer:
+            later[-1] = behind
+            values, alphas, layers = value.unbind(0), alpha.unbind(0), later.unbind(0)
+            reached = light[1:].sign_().unbind(0) if ended else None
+            for k in reversed(range(len(values))):
+                if reached is not None:
+                    layers[k + 1].mul_(reached[k])
+                torch.lerp(layers[k + 1], values[k], alphas[k], out=layers[k])
+        else:  # the light that comes from behind a layer over the light that gets there; both are 0 behind the end
+            torch.mul(weights, value, out=later[:-1])
+            torch.mul(light[-1], behind, out=later[-1])
+            torch.div(later.flip(0).cumsum(0).flip(0), light.clamp_(min=torch.finfo(light.dtype).tiny), out=later)
+
     def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
         """Gradients of one step; `behind` becomes V before the step, see `compositing`."""
         band, n, size = self.band, step.count, self.band.chunk_size
@@ -212,13 +229,7 @@ class Backward(_Worker):
         value.zero_()
         for f in range(len(colors)):
             value.addcmul_(colors[f], grads[:, f])
-        later[-1] = behind
-        values, alphas, layers = value.unbind(0), alpha.unbind(0), later.unbind(0)
-        reached = light[1:].sign_().unbind(0) if step.ended else None  # behind the last layer there is nothing
-        for k in reversed(range(size)):
-            if reached is not None:
-                layers[k + 1].mul_(reached[k])
-            torch.lerp(layers[k + 1], values[k], alphas[k], out=layers[k])
+        self.scan_back(alpha, light, weights, value, behind, step.ended, later)
         behind.copy_(later[0])
         d_features = torch.bmm(weights.transpose(0, 1), grads.transpose(1, 2))
         value.sub_(later[1:]).mul_(weights)

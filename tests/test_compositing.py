@@ -8,6 +8,7 @@ import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
 from oracles import near_threshold, pinhole, random_camera, random_gaussians, theta_mass
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import kgs.reference
 from kgs import GaussianRenderer, ProjectedGaussians, composite, project
@@ -323,6 +324,61 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, monkeypatch):
     assert all(step.alpha is None for step in steps)
     assert torch.equal(lean, kept)
     assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
+
+
+@pytest.fixture
+def as_on_a_gpu(monkeypatch):
+    """Scans and sizes of steps as a GPU gets them."""
+    made = Band.__init__
+
+    def init(band, *arguments):
+        made(band, *arguments)
+        band.by_layer = False
+
+    monkeypatch.setattr(Band, "__init__", init)
+    monkeypatch.setattr("kgs.chunks._STEP_PAIRS", {"cpu": 2**24})
+    monkeypatch.setattr("kgs.chunks._PAIRS_TO_SHARE", 2**60)
+    monkeypatch.setattr("kgs.chunks._chunk_size", lambda _: 32)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP), (TH, 0.1)])
+def test_the_scans_of_a_gpu_give_the_same(dtype, bound, thresholds, request):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+    image, gradients = loss_and_gradients(projected, colors, weights, **options)
+    request.getfixturevalue("as_on_a_gpu")
+    other, other_gradients = loss_and_gradients(projected, colors, weights, **options)
+    assert (other - image).abs().max() <= bound
+    assert_gradients_close(other_gradients, gradients, bound)
+
+
+class _Launches(TorchDispatchMode):
+    """Counts the operators that would be kernels on a GPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        self.count += not func.is_view
+        return result
+
+
+def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)  # the counter sees this thread alone
+
+    def launches(n, size):
+        projected, colors, weights = scene_footprints(n, 1, torch.float32, size, image_size=80)
+        with _Launches() as mode:
+            loss_and_gradients(projected, colors, weights)
+        return mode.count
+
+    few = launches(100, (40, 56))
+    assert few <= 500
+    assert launches(100, (160, 224)) <= few
+    assert launches(800, (160, 224)) <= few + 300  # lists longer than 32 take a second and a third step
 
 
 @pytest.mark.parametrize("size", [(8, 8), (8, 24), (24, 8), (11, 5)])
