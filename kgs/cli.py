@@ -199,7 +199,7 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
 
 
 def bench(
-    what: Literal["speed", "training"],
+    what: Literal["speed", "precision", "training"],
     /,
     *,
     out: Annotated[Path, _alias("-o")],
@@ -210,9 +210,9 @@ def bench(
     """Measure this machine and write the figures as tables, CSV, JSON and plots.
 
     Args:
-        what: speed: time and memory of rendering and of training steps, beside what kgs is held to. training: test
-            PSNR against time, one knob of the fit at a time, with KGS_DATA on fern too; hours, goes on where it
-            stopped.
+        what: speed: time and memory of rendering and of training steps, beside what kgs is held to. precision: errors
+            of images, gradients and footprints against time. training: test PSNR against time, one knob of the fit at
+            a time, with KGS_DATA on fern too; hours, goes on where it stopped.
         out: folder for the results.
         quick: less of it, in about a minute.
         device: cpu, cuda, ... (speed).
@@ -222,6 +222,10 @@ def bench(
         from .bench.speed import measure_speed
 
         measure_speed(out, quick=quick, device=device)
+    elif what == "precision":
+        from .bench.precision import measure_precision
+
+        measure_precision(out, quick=quick)
     else:
         from .bench.training import measure_training
 

@@ -25,7 +25,8 @@ class GaussianRenderer(nn.Module):
 
     Args:
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
-        tile_size: side of a tile in pixels; the speed depends on it, the image does not.
+        tile_size: side of a tile in pixels; the speed depends on it, the image only by rounding (float32: about 1e-6 at
+            16, growing with the square).
         near_plane: Gaussians with z <= near_plane are left out; in world units.
         eps2d: variance in px^2 added to each footprint, the low-pass filter of 3D Gaussian splatting.
         alpha_threshold: alphas below it are skipped. The knob that trades accuracy for time: 0 is exact.
