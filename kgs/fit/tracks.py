@@ -58,7 +58,7 @@ def find_tracks(views: Views) -> Tracks:
         The tracks, in float64 on the CPU.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
-    features = [_detect(views, v, limit=min(max(36_000 // len(views), 1500), 12_000)) for v in range(len(views))]
+    features = [_detect(views, v, limit=min(max(48_000 // len(views), 1500), 12_000)) for v in range(len(views))]
     cameras = views.cameras
     projections = (cameras.intrinsics.double() @ cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
