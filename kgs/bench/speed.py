@@ -108,7 +108,7 @@ def measure_speed(
     say("scaling ...")
     sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
-    for count, size in scaled:
+    for count, size in dict.fromkeys(scaled):
         cases = _Cases(count, size, where)
         times = take_turns({"forward + backward": cases.main()["forward + backward"]}, repeats, where)
         rows.append(Row("scaling", "forward + backward", count, size, cases.pairs, times["forward + backward"]))
@@ -117,7 +117,7 @@ def measure_speed(
         "count": _exponent([(r.count, r.times.wall) for r in rows if r.table == "scaling" and r.size == SIZE]),
         "pairs": _exponent([(r.pairs, r.times.wall) for r in rows if r.table == "scaling" and r.size == SIZE]),
         "pixels": _exponent(
-            [(math.prod(r.size), r.times.wall) for r in rows[-len(sizes) :] if r.table == "scaling"],
+            [(math.prod(r.size), r.times.wall) for r in rows if r.table == "scaling" and r.count == counts[0]]
         ),
     }
     result = {
@@ -331,16 +331,21 @@ def _plot(path: Path, rows: list[Row]) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    by_count = sorted((row.count, row.times.wall) for row in rows if row.size == SIZE)
-    by_pairs = sorted((row.pairs, row.times.wall) for row in rows)
-    for axis, points, label in zip(axes, (by_count, by_pairs), ("Gaussians", "evaluated pairs [million]"), strict=True):
-        x, y = np.array(points).T
-        axis.loglog(x, y, "o-", markersize=4)
+    fewest = min(row.count for row in rows if row.size != SIZE)
+    panels = {
+        "Gaussians": [(row.count, row.times.wall) for row in rows if row.size == SIZE],
+        f"pixels, {fewest} Gaussians": [(math.prod(row.size), row.times.wall) for row in rows if row.count == fewest],
+        "evaluated pairs [million]": [(row.pairs, row.times.wall) for row in rows],
+    }
+    figure, axes = pyplot.subplots(1, 3, figsize=(11, 3.4), sharey=True, layout="constrained")
+    for axis, (label, points) in zip(axes, panels.items(), strict=True):
+        x, y = np.array(sorted(points)).T
+        axis.loglog(x, y, "o" if label.startswith("evaluated") else "o-", markersize=4)
         axis.set_xlabel(label)
-        axis.set_ylabel("forward + backward [s]")
+        axis.xaxis.set_minor_formatter(ticker.NullFormatter())
         axis.grid(alpha=0.3, which="both")
+    axes[0].set_ylabel("forward + backward [s]")
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
