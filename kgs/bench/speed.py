@@ -334,7 +334,7 @@ def _plot(path: Path, rows: list[Row]) -> None:
     from matplotlib import pyplot, ticker
 
     fewest = min(row.count for row in rows if row.size != SIZE)
-    panels = {
+    panels: dict[str, list[tuple[float, float]]] = {
         "Gaussians": [(row.count, row.times.wall) for row in rows if row.size == SIZE],
         f"pixels, {fewest} Gaussians": [(math.prod(row.size), row.times.wall) for row in rows if row.count == fewest],
         "evaluated pairs [million]": [(row.pairs, row.times.wall) for row in rows],
