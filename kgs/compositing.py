@@ -72,7 +72,7 @@ def composite(
     Args:
         projected: M visible pairs (camera, Gaussian).
         features: what to accumulate, `(M, F)`: colours, depths, anything.
-        tile_size: side of the square tiles in pixels; changes the speed, not the image.
+        tile_size: side of the square tiles in pixels; changes the speed, and the image only by rounding.
         alpha_threshold: alphas below are skipped, in [0, 1); the error is at most the number of layers times it.
         transmittance_stop: T below counts as 0, in [0, 1); the error is at most it.
         median_depth: also find the depth at which T falls below one half.

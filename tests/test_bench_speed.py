@@ -8,8 +8,9 @@ from kornia.geometry.camera import PinholeCamera
 
 import kgs
 from kgs.bench import speed
+from kgs.bench.cases import Cases
 from kgs.bench.scenes import layered_scene
-from kgs.bench.speed import _Cases, _exponent, measure_speed
+from kgs.bench.speed import _exponent, measure_speed
 from kgs.bench.timing import take_turns
 
 
@@ -43,7 +44,7 @@ def test_cases_take_turns():
 
 
 def test_stages_are_those_of_a_whole_step():
-    cases = _Cases(300, (40, 56), torch.device("cpu"))
+    cases = Cases(300, (40, 56), torch.device("cpu"))
     renderer = kgs.GaussianRenderer()
     image = renderer(cases.model(), cases.camera).image
     kgs.losses.photometric_loss(image.clamp(0, 1), cases.photo, 0.2).backward()
@@ -57,7 +58,7 @@ def test_stages_are_those_of_a_whole_step():
 
 
 def test_savings_leave_the_image_alone():
-    cases = _Cases(300, (40, 56), torch.device("cpu"))
+    cases = Cases(300, (40, 56), torch.device("cpu"))
     seen = []
     cases.both = lambda gaussians, outputs=("image",): seen.append(gaussians)
     savings = cases.savings()

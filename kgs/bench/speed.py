@@ -12,20 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.geometry.camera import PinholeCamera
-from torch import Tensor
 
-from kgs.compositing import composite
 from kgs.fit.report import peak_rss_mb, versions, write_json
-from kgs.fit.trainer import move_camera
-from kgs.losses import photometric_loss, target_moments
-from kgs.model import GaussianModel
-from kgs.projection import project
-from kgs.renderer import GaussianRenderer
-from kgs.tiles import bin_to_tiles
-from kgs.types import Gaussians
 
-from .scenes import layered_scene
+from .cases import Cases
 from .timing import Times, calibrations, take_turns
 
 __all__ = ["SIZE", "TARGETS", "measure_speed"]
@@ -88,7 +78,7 @@ def measure_speed(
     memory = {}
     for count in counts:
         say(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
-        cases = _Cases(count, SIZE, where)
+        cases = Cases(count, SIZE, where)
         rows += [
             Row("main", name, count, SIZE, cases.pairs, times, TARGETS[name].get(count))
             for name, times in take_turns(cases.main(), repeats, where).items()
@@ -100,7 +90,7 @@ def measure_speed(
         if where.type == "cpu":
             memory[count] = _memory_of_its_own(count)
     say("what is left out ...")
-    cases = _Cases(counts[min(1, len(counts) - 1)], SIZE, where)
+    cases = Cases(counts[min(1, len(counts) - 1)], SIZE, where)
     rows += [
         Row("left out", name, cases.count, SIZE, cases.pairs, times)
         for name, times in take_turns(cases.savings(), repeats, where).items()
@@ -109,7 +99,7 @@ def measure_speed(
     sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
     for count, size in dict.fromkeys(scaled):
-        cases = _Cases(count, size, where)
+        cases = Cases(count, size, where)
         times = take_turns({"forward + backward": cases.main()["forward + backward"]}, repeats, where)
         rows.append(Row("scaling", "forward + backward", count, size, cases.pairs, times["forward + backward"]))
     units = calibrations(where)
@@ -138,121 +128,6 @@ def measure_speed(
     return result
 
 
-class _Cases:
-    """One scene, and what there is to time on it."""
-
-    def __init__(self, count: int, size: tuple[int, int], device: torch.device) -> None:
-        model, camera = layered_scene(count, size)
-        self.count, self.device = count, device
-        self.model: GaussianModel = model.to(device)
-        self.camera: PinholeCamera = move_camera(camera, device)
-        self.renderer = GaussianRenderer()
-        generator = torch.Generator().manual_seed(0)
-        self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
-        self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
-        self.moments = target_moments(self.photo)
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=0.0, fused=True)
-        with torch.no_grad():
-            bins = bin_to_tiles(project(self.model(), self.camera))
-        self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6
-
-    def main(self) -> dict[str, Callable[[], object]]:
-        return {
-            "forward, no gradient": self.forward,
-            "forward + backward": lambda: self.both(self.model()),
-            "training step": self.train,
-        }
-
-    def forward(self) -> Tensor:
-        with torch.no_grad():
-            image: Tensor = self.renderer(self.model(), self.camera).image
-        return image
-
-    def both(self, gaussians: Gaussians, outputs: tuple[str, ...] = ("image",)) -> None:
-        rendering = self.renderer(gaussians, self.camera, outputs=outputs)
-        picture = rendering.image if rendering.image is not None else rendering.alpha
-        (picture * self.weights[:, : picture.shape[1]]).sum().backward()
-        self.model.zero_grad()
-
-    def train(self) -> None:
-        image = self.renderer(self.model(), self.camera).image
-        photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-
-    def stages(self) -> dict[str, Callable[[], object]]:
-        """The parts of a training step one by one; each keeps what the next one needs."""
-        kept: dict[str, Any] = {}
-
-        def projection() -> None:
-            kept["projected"] = project(self.model(), self.camera)
-            p = kept["projected"]
-            kept["inputs"] = [x.detach().requires_grad_() for x in (p.means2d, p.factors, p.opacities, p.colors)]
-
-        def binning() -> None:
-            bin_to_tiles(kept["projected"])
-
-        def forward() -> None:
-            names = ("means2d", "factors", "opacities", "colors")
-            loose = type(kept["projected"])(
-                **{**vars(kept["projected"]), **dict(zip(names, kept["inputs"], strict=True))}
-            )
-            kept["image"] = composite(loose, loose.colors).features
-
-        def loss() -> None:
-            image = kept["image"].detach().requires_grad_()
-            photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
-            kept["grad"] = image.grad
-
-        def backward() -> None:
-            kept["grads"] = torch.autograd.grad(kept["image"], kept["inputs"], kept["grad"])
-
-        def projection_backward() -> None:
-            p = kept["projected"]
-            torch.autograd.backward([p.means2d, p.factors, p.opacities, p.colors], kept["grads"])
-
-        def adam() -> None:
-            self.optimizer.step()
-            self.optimizer.zero_grad(set_to_none=True)
-
-        return {
-            "projection, harmonics": projection,
-            "binning": binning,
-            "compositing, binning included": forward,
-            "loss, forward + backward": loss,
-            "compositing, backward": backward,
-            "projection, harmonics, backward": projection_backward,
-            "Adam": adam,
-        }
-
-    def savings(self) -> dict[str, Callable[[], object]]:
-        """Forward + backward with one thing less each time."""
-
-        def changed(**fields: Tensor) -> Gaussians:
-            return Gaussians(**{**vars(self.model()), **fields})
-
-        half = (torch.arange(self.count, device=self.device) % 2).float()
-        behind = torch.tensor([0.0, 0.0, -100.0], device=self.device)
-        return {
-            "everything": lambda: self.both(self.model()),
-            "no gradient at all": self.forward,
-            "colours frozen": lambda: self.both(changed(colors=self.model().colors.detach())),
-            "geometry frozen": lambda: self.both(
-                changed(
-                    means=self.model.means.detach(),
-                    quats=self.model.quats.detach(),
-                    scales=self.model.log_scales.detach().exp(),
-                )
-            ),
-            "harmonics of degree 0": lambda: self.both(changed(colors=self.model.sh_dc)),
-            "alpha only": lambda: self.both(self.model(), ("alpha",)),
-            "half of the Gaussians dropped": lambda: self.both(changed(opacities=self.model().opacities * half)),
-            "half of the Gaussians behind the camera": lambda: self.both(
-                changed(means=self.model.means + behind * (1 - half)[:, None])
-            ),
-        }
-
-
 def _memory_of_its_own(count: int) -> float:
     """MiB that rendering forward and backward takes over importing, in a process that does nothing else."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -261,7 +136,7 @@ def _memory_of_its_own(count: int) -> float:
 
 def _memory(count: int) -> float:
     before = peak_rss_mb()
-    cases = _Cases(count, SIZE, torch.device("cpu"))
+    cases = Cases(count, SIZE, torch.device("cpu"))
     for _ in range(3):
         cases.both(cases.model())
     return float(peak_rss_mb() - before)
