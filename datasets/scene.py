@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from kgs.errors import DataError
 
@@ -70,6 +71,26 @@ class Views:
             images=self.images[rows],
             names=tuple(self.names[i] for i in indices),
             masks=None if self.masks is None else self.masks[rows],
+        )
+
+    def halved(self) -> Views:
+        """The views in half the pixels a side: means of 2 x 2; an odd last row or column is left out.
+
+        Raises:
+            ValueError: the images have a single row or column.
+        """
+        height, width = self.images.shape[-2] // 2, self.images.shape[-1] // 2
+        if height == 0 or width == 0:
+            raise ValueError(f"images: expected 2 x 2 pixels or more to halve, got {tuple(self.images.shape[-2:])}")
+        intrinsics = self.cameras.intrinsics.clone()
+        intrinsics[:, :2, :3] *= 0.5
+        intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
+        sizes = (torch.full((len(self),), float(size)) for size in (height, width))
+        return Views(
+            cameras=PinholeCamera(intrinsics, self.cameras.extrinsics, *sizes),
+            images=avg_pool2d(self.images, 2),
+            names=self.names,
+            masks=None if self.masks is None else avg_pool2d(self.masks, 2),
         )
 
 

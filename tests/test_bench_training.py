@@ -21,7 +21,7 @@ def test_one_knob_is_turned_at_a_time():
 
 def test_summary_is_mean_and_deviation_over_seeds():
     def row(seed, psnr, **knobs):
-        result = {"psnr": psnr, "ssim": 0.5, "train_psnr": 30.0, "seconds": 10.0, "gaussians": 100}
+        result = {"psnr": psnr, "ssim": 0.5, "train_psnr": 30.0, "cpu_seconds": 10.0, "gaussians": 100}
         return {"cell": {"scene": "s", "seed": seed, **knobs}, "result": result}
 
     summary = summarize([row(0, 20.0), row(1, 22.0), row(0, 19.0, drop=0.0)])
@@ -45,7 +45,7 @@ def test_an_unknown_knob_is_named():
 
 def test_the_files_are_written(tmp_path, monkeypatch):
     monkeypatch.delenv("KGS_DATA", raising=False)
-    result = {"psnr": 20.0, "ssim": 0.5, "train_psnr": 30.0, "seconds": 10.0, "gaussians": 100}
+    result = {"psnr": 20.0, "ssim": 0.5, "train_psnr": 30.0, "cpu_seconds": 10.0, "gaussians": 100}
     monkeypatch.setattr(
         training, "run_grid", lambda cells, *_, **__: [{"cell": cell, "result": result} for cell in cells]
     )

@@ -48,3 +48,10 @@ def test_numbers_out_of_range_are_refused(wrong):
 def test_unknown_entry_is_refused():
     with pytest.raises(ValueError, match="FitConfig"):
         FitConfig.from_dict({"stepz": 3})
+
+
+def test_the_coarse_share_is_counted_in_steps():
+    assert timetable(FitConfig(steps=2000)).coarse == 0
+    assert timetable(FitConfig(steps=1000, coarse=0.5)).coarse == 500
+    with pytest.raises(ValueError, match="coarse"):
+        FitConfig(coarse=1.5)

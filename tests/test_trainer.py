@@ -159,3 +159,19 @@ def test_the_rate_follows_the_papers_schedule(scene, points):
     rates = []
     trainer.fit(lambda trainer, _: rates.append(trainer.drop.rate))
     assert rates == pytest.approx([0.3 * step / 60 for step in range(1, 61)])
+
+
+def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path):
+    config = replace(CONFIG, coarse=0.5)
+    trainer = Trainer(scene, config, points)
+    sizes = []
+    trainer.renderer.register_forward_hook(lambda *args: sizes.append(tuple(args[2].image.shape[-2:])))
+    trainer.fit(lambda trainer, _: trainer.step == 30)
+    assert set(sizes[:19]) == {(16, 20)}  # up to the first evaluation, after 20 steps
+    trainer.save(tmp_path / "half.pt")
+    resumed = Trainer.resume(scene, config, tmp_path / "half.pt")
+    trainer.fit()
+    resumed.fit()
+    assert sizes[-1] == (32, 40)
+    assert_same_bits(trainer, resumed)
+    assert not torch.equal(trainer.model.means, whole.model.means[: len(trainer.model)])

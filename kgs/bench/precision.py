@@ -7,9 +7,8 @@ moments of the perspective projection (M. Zwicker et al., "EWA Volume Splatting"
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +25,7 @@ from kgs.fit.report import versions, write_json
 from kgs.projection import project
 from kgs.types import Gaussians
 
+from .output import markdown_table, write_csv
 from .scenes import layered_scene
 from .timing import take_turns
 
@@ -90,10 +90,7 @@ def measure_precision(out: Path, *, quick: bool = False, say: Callable[[str], No
     result: dict[str, Any] = {"rows": rows, "flatness": flatness, "projection": projection}
     result |= {"threads": torch.get_num_threads(), "versions": versions()}
     for name, lines in (("precision", rows), ("projection", projection)):
-        with (out / f"{name}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(lines[0]))
-            writer.writeheader()
-            writer.writerows(lines)
+        write_csv(out / f"{name}.csv", lines)
     write_json(out / "precision.json", result)
     (out / "precision.md").write_text(table := _markdown(rows, flatness, projection))
     _plot_scenes(out / "render.png", rows, "max_error", "forward_s", "largest error of the image")
@@ -240,26 +237,25 @@ def _find(rows: list[dict[str, Any]], scene: str, setting: Setting) -> dict[str,
 
 
 def _markdown(rows: list[dict[str, Any]], flatness: dict[str, Any], projection: list[dict[str, float]]) -> str:
-    errors, angles = {}, {}
+    errors, angles = [], []
     for scene in flatness:
         found = [_find(rows, scene, setting) for setting in _COLUMNS.values()]
-        errors[scene] = [f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found]
-    flat = {scene: [f"{value:.1e}" for value in values.values()] for scene, values in flatness.items()}
+        errors.append([scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)])
+    flat = [[scene, *(f"{value:.1e}" for value in values.values())] for scene, values in flatness.items()]
     for angle in ANGLES:
-        angles[f"{angle}°"] = [f"{row['covariance_error']:.1e}" for row in projection if row["angle"] == angle]
+        found = [row for row in projection if row["angle"] == angle]
+        angles.append([f"{angle}°", *(f"{row['covariance_error']:.1e}" for row in found)])
     changes = [max(row["quadrature_change"] for row in projection if row["sigma_over_z"] == sigma) for sigma in SIGMAS]
-    angles[f"change with {NODES - 1} for {NODES} quadrature nodes"] = [f"{value:.0e}" for value in changes]
+    angles.append([f"change with {NODES - 1} for {NODES} quadrature nodes", *(f"{value:.0e}" for value in changes)])
     return (
-        _table("Largest error of the image / of a gradient, the latter over its largest value", _COLUMNS, errors)
-        + _table("Largest difference between float32 images", next(iter(flatness.values())), flat)
-        + _table("First-order footprint: relative error of the covariance by angle and sigma / z", SIGMAS, angles)
+        markdown_table(
+            "Largest error of the image / of a gradient, the latter over its largest value", _COLUMNS, errors
+        )
+        + markdown_table("Largest difference between float32 images", next(iter(flatness.values())), flat)
+        + markdown_table(
+            "First-order footprint: relative error of the covariance by angle and sigma / z", SIGMAS, angles
+        )
     )
-
-
-def _table(title: str, columns: Iterable[object], rows: dict[str, list[str]]) -> str:
-    cells = [["", *map(str, columns)], *([name, *row] for name, row in rows.items())]
-    cells.insert(1, ["---"] * len(cells[0]))
-    return "\n".join([f"{title}:", "", *(f"| {' | '.join(row)} |" for row in cells), "", ""])
 
 
 def _plot_scenes(path: Path, rows: list[dict[str, Any]], error: str, seconds: str, label: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import multiprocessing
 from collections.abc import Callable
@@ -16,6 +15,7 @@ import torch
 from kgs.fit.report import peak_rss_mb, versions, write_json
 
 from .cases import Cases
+from .output import markdown_table, write_csv
 from .timing import Times, calibrations, take_turns
 
 __all__ = ["SIZE", "TARGETS", "measure_speed"]
@@ -28,10 +28,6 @@ TARGETS = {
     "training step": {10_000: 0.125, 50_000: 0.330, 200_000: 0.540},
     "peak memory": {10_000: 250.0, 50_000: 450.0, 200_000: 900.0},
 }
-_COLUMNS = (
-    *("table", "case", "gaussians", "height", "width", "pairs_millions"),
-    *("wall_s", "best_s", "worst_s", "cpu_s", "repeats", "target_s", "wall_in_exp_per_pair"),
-)
 
 
 @dataclass(frozen=True)
@@ -119,7 +115,7 @@ def measure_speed(
         "device": device,
         "versions": versions(),
     }
-    _write_csv(out / "speed.csv", rows, units)
+    write_csv(out / "speed.csv", [_plain(row, units) for row in rows])
     write_json(out / "speed.json", result)
     table = _markdown(rows, memory, units, exponents)
     (out / "speed.md").write_text(table)
@@ -148,53 +144,54 @@ def _exponent(points: list[tuple[float, float]]) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def _write_csv(path: Path, rows: list[Row], units: dict[str, float]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(_COLUMNS)
-        for row in rows:
-            t = row.times
-            per_pair = t.wall / (row.pairs * 1e6) / units["exp"]
-            times = (t.wall, t.best, t.worst, t.cpu, t.repeats)
-            writer.writerow([row.table, row.case, row.count, *row.size, row.pairs, *times, row.target, per_pair])
+def _plain(row: Row, units: dict[str, float]) -> dict[str, Any]:
+    """A line of speed.csv."""
+    t = row.times
+    return {
+        "table": row.table,
+        "case": row.case,
+        "gaussians": row.count,
+        "height": row.size[0],
+        "width": row.size[1],
+        "pairs_millions": row.pairs,
+        "wall_s": t.wall,
+        "best_s": t.best,
+        "worst_s": t.worst,
+        "cpu_s": t.cpu,
+        "repeats": t.repeats,
+        "target_s": row.target,
+        "wall_in_exp_per_pair": t.wall / (row.pairs * 1e6) / units["exp"],
+    }
 
 
 def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float], exponents: dict[str, float]) -> str:
-    main = [row for row in rows if row.table == "main"]
-    counts = sorted({row.count for row in main})
-    lines = [
-        f"{SIZE[1]}x{SIZE[0]}, harmonics of degree 3: wall clock, median (least to largest); what it is held to",
-        "",
-        "| | " + " | ".join(f"{count // 1000}k" for count in counts) + " |",
-        "|---" * (len(counts) + 1) + "|",
-    ]
-    for name in dict.fromkeys(row.case for row in main):
-        cells = [_cell(row.times, row.target) for row in main if row.case == name]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    tables: dict[str, dict[str, list[Row]]] = {}
+    for row in rows:
+        tables.setdefault(row.table, {}).setdefault(row.case, []).append(row)
+    counts = [f"{row.count // 1000}k" for row in next(iter(tables["main"].values()))]
+    main = [[name, *(_cell(row.times, row.target) for row in found)] for name, found in tables["main"].items()]
     held = TARGETS["peak memory"]
-    cells = [f"{mb:.0f} MiB" + (f"; {held[count]:.0f}" if count in held else "") for count, mb in memory.items()]
-    lines += [f"| peak memory over importing | {' | '.join(cells)} |", ""] if memory else [""]
-    lines += ["Parts of a training step, ms:", ""]
-    lines += ["| | " + " | ".join(f"{count // 1000}k" for count in counts) + " |", "|---" * (len(counts) + 1) + "|"]
-    stages = [row for row in rows if row.table == "stages"]
-    for name in dict.fromkeys(row.case for row in stages):
-        lines.append(
-            f"| {name} | " + " | ".join(f"{row.times.wall * 1e3:.0f}" for row in stages if row.case == name) + " |"
+    if memory:
+        cells = [f"{mb:.0f} MiB" + (f"; {held[count]:.0f}" if count in held else "") for count, mb in memory.items()]
+        main.append(["peak memory over importing", *cells])
+    stages = [[name, *(f"{row.times.wall * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
+    savings = [row for found in tables["left out"].values() for row in found]
+    everything = savings[0].times.wall
+    left_out = [[row.case, f"{row.times.wall * 1e3:.0f}", f"{row.times.wall / everything:.2f}"] for row in savings]
+    size = f"{SIZE[1]}x{SIZE[0]}, harmonics of degree 3"
+    return (
+        markdown_table(f"{size}: wall clock, median (least to largest); what it is held to", counts, main)
+        + markdown_table("Parts of a training step, ms", counts, stages)
+        + markdown_table(
+            f"What is not asked for is not computed, {savings[0].count} Gaussians, forward + backward",
+            ["ms", "of everything"],
+            left_out,
         )
-    savings = [row for row in rows if row.table == "left out"]
-    lines += ["", f"What is not asked for is not computed, {savings[0].count} Gaussians, forward + backward:", ""]
-    lines += ["| | ms | of everything |", "|---|---|---|"]
-    for row in savings:
-        lines.append(f"| {row.case} | {row.times.wall * 1e3:.0f} | {row.times.wall / savings[0].times.wall:.2f} |")
-    lines += [
-        "",
-        f"Time grows as count^{exponents['count']:.2f}, pairs^{exponents['pairs']:.2f}, "
-        f"pixels^{exponents['pixels']:.2f} (at a fixed count).",
+        + f"Time grows as count^{exponents['count']:.2f}, pairs^{exponents['pairs']:.2f}, "
+        f"pixels^{exponents['pixels']:.2f} (at a fixed count).\n"
         f"Calibration: exp {units['exp'] * 1e9:.2f} ns an element, dense oracle (400 Gaussians, 48x64) "
-        f"{units['dense'] * 1e3:.0f} ms.",
-        "",
-    ]
-    return "\n".join(lines)
+        f"{units['dense'] * 1e3:.0f} ms.\n"
+    )
 
 
 def _cell(times: Times, target: float | None) -> str:
@@ -203,10 +200,8 @@ def _cell(times: Times, target: float | None) -> str:
 
 
 def _plot(path: Path, rows: list[Row]) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot, ticker
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     fewest = min(row.count for row in rows if row.size != SIZE)
     panels: dict[str, list[tuple[float, float]]] = {
@@ -214,13 +209,13 @@ def _plot(path: Path, rows: list[Row]) -> None:
         f"pixels, {fewest} Gaussians": [(math.prod(row.size), row.times.wall) for row in rows if row.count == fewest],
         "evaluated pairs [million]": [(row.pairs, row.times.wall) for row in rows],
     }
-    figure, axes = pyplot.subplots(1, 3, figsize=(11, 3.4), sharey=True, layout="constrained")
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
     for axis, (label, points) in zip(axes, panels.items(), strict=True):
         x, y = np.array(sorted(points)).T
         axis.loglog(x, y, "o" if label.startswith("evaluated") else "o-", markersize=4)
         axis.set_xlabel(label)
-        axis.xaxis.set_minor_formatter(ticker.NullFormatter())
+        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("forward + backward [s]")
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import statistics
+import time
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,19 @@ from kgs.fit.config import FitConfig
 from kgs.fit.report import versions
 
 from .grid import run_grid
+from .output import markdown_table
 
 __all__ = ["KNOBS", "fit_cell", "measure_training", "training_cells"]
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
 KNOBS: dict[str, tuple[Any, ...]] = {
     "steps": (500, 1000),
-    "sh_degree": (0, 1, 2),
-    "max_gaussians": (2_500, 5_000, 10_000),
+    "coarse": (0.5,),
+    "sh_degree": (0, 1),
+    "max_gaussians": (5_000, 10_000),
     "drop": (0.0, 0.1, 0.3),
 }
+_DECIMALS = {"psnr": 2, "ssim": 3, "train_psnr": 1, "cpu_seconds": 0, "gaussians": 0}  # of what the table shows
 SYNTHETIC = "synthetic"
 SIZE = (126, 168)  # of the synthetic pictures
 
@@ -45,23 +48,22 @@ def fit_cell(cell: dict[str, Any]) -> dict[str, Any]:
     from kgs.fit.run import choose_points, measure
     from kgs.fit.trainer import Trainer
 
-    settings = {key: value for key, value in cell.items() if key != "scene"}
-    unknown = settings.keys() - {field.name for field in fields(FitConfig)}
-    if unknown:
-        raise ValueError(f"cell: expected fields of FitConfig, got {sorted(unknown)}")
+    config = FitConfig.from_dict({key: value for key, value in cell.items() if key != "scene"})
     if cell["scene"] == SYNTHETIC:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
     else:
         scene = load_scene(Path(os.environ["KGS_DATA"]) / "llff" / cell["scene"], train_views=3, downscale=2)
-    config = FitConfig(**settings)
     trainer = Trainer(scene, config, choose_points(scene, config))
+    start = time.process_time()
     trainer.fit()
+    cpu_seconds = time.process_time() - start
     metrics = measure(trainer)
     return {
         "psnr": metrics["test"]["psnr"],
         "ssim": metrics["test"]["ssim"],
         "train_psnr": metrics["train"]["psnr"],
         "seconds": trainer.seconds,
+        "cpu_seconds": cpu_seconds,
         "gaussians": len(trainer.model),
         "curve": trainer.curve,
         "versions": versions(),
@@ -112,7 +114,7 @@ def summarize(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     summary = []
     for (scene, knob, value), results in groups.items():
         entry: dict[str, Any] = {"scene": scene, "knob": knob, "value": value, "n": len(results)}
-        for name in ("psnr", "ssim", "train_psnr", "seconds", "gaussians"):
+        for name in _DECIMALS:
             values = [result[name] for result in results]
             entry[name] = statistics.mean(values)
             entry[f"{name}_sd"] = statistics.stdev(values) if len(values) > 1 else 0.0
@@ -121,44 +123,36 @@ def summarize(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _markdown(summary: list[dict[str, Any]]) -> str:
-    lines = [
-        "Test views, mean (standard deviation over n seeds); seconds of training",
-        "",
-        "| scene | setting | n | PSNR [dB] | SSIM | PSNR of training views | seconds | Gaussians |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    columns = ("setting", "n", "PSNR [dB]", "SSIM", "PSNR of training views", "CPU seconds", "Gaussians")
+    rows = []
     for entry in sorted(summary, key=lambda e: (e["scene"], e["knob"] != "default", e["knob"])):
+        spread = {name: f"{entry[name]:.{d}f} ({entry[f'{name}_sd']:.{d}f})" for name, d in _DECIMALS.items()}
         setting = entry["knob"] if entry["value"] is None else f"{entry['knob']} {entry['value']}"
-        lines.append(
-            f"| {entry['scene']} | {setting} | {entry['n']} | {entry['psnr']:.2f} ({entry['psnr_sd']:.2f}) "
-            f"| {entry['ssim']:.3f} ({entry['ssim_sd']:.3f}) | {entry['train_psnr']:.1f} "
-            f"| {entry['seconds']:.0f} ({entry['seconds_sd']:.0f}) | {entry['gaussians']:.0f} |"
-        )
-    return "\n".join([*lines, ""])
+        rows.append([entry["scene"], setting, entry["n"], *spread.values()])
+    return markdown_table(
+        "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)", columns, rows, first="scene"
+    )
 
 
 def _plot(path: Path, summary: list[dict[str, Any]]) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(entry["scene"] for entry in summary))
-    figure, axes = pyplot.subplots(1, len(scenes), figsize=(5.5 * len(scenes), 4), squeeze=False, layout="constrained")
+    figure = Figure(figsize=(5.5 * len(scenes), 4), layout="constrained")
+    axes = figure.subplots(1, len(scenes), squeeze=False)
     for axis, scene in zip(axes[0], scenes, strict=True):
         entries = [entry for entry in summary if entry["scene"] == scene]
         default = [entry for entry in entries if entry["knob"] == "default"]
         for k, knob in enumerate(dict.fromkeys(e["knob"] for e in entries if e["knob"] != "default")):
-            line = sorted([e for e in entries if e["knob"] == knob] + default, key=lambda e: e["seconds"])
-            x, y, error = (np.array([e[key] for e in line]) for key in ("seconds", "psnr", "psnr_sd"))
+            line = sorted([e for e in entries if e["knob"] == knob] + default, key=lambda e: e["cpu_seconds"])
+            x, y, error = (np.array([e[key] for e in line]) for key in ("cpu_seconds", "psnr", "psnr_sd"))
             axis.errorbar(x, y, error, color=f"C{k}", marker="o", markersize=4, capsize=2, linewidth=1, label=knob)
         for entry in default:
-            axis.plot(entry["seconds"], entry["psnr"], "k*", markersize=12, label="default")
+            axis.plot(entry["cpu_seconds"], entry["psnr"], "k*", markersize=12, label="default")
         axis.set_xscale("log")
         axis.set_title(scene)
-        axis.set_xlabel("seconds of training")
+        axis.set_xlabel("CPU seconds of the fit")
         axis.set_ylabel("test PSNR [dB]")
         axis.grid(alpha=0.3, which="both")
         axis.legend(frameon=False)
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)

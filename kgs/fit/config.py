@@ -74,6 +74,7 @@ class FitConfig:
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: "linear" (the paper's) or "constant".
         sh_degree: degree of the harmonics, 0 to 3.
+        coarse: share of the steps, the first ones, that see the training views in half the pixels a side; in [0, 1].
         seed: views, splits, masks and random points are drawn from streams that derive from it.
         init: first points: "sift", "random", "model-points" (positions refined with test views), "file", or "auto",
             which is "sift" except where the layout itself prescribes random points (Blender).
@@ -88,6 +89,7 @@ class FitConfig:
     drop: float = 0.2
     drop_schedule: str = "linear"
     sh_degree: int = 3
+    coarse: float = 0.0
     seed: int = 0
     init: str = "auto"
     init_file: Path | None = None
@@ -102,6 +104,8 @@ class FitConfig:
                 raise ValueError(f"{name}: expected at least {low}, got {getattr(self, name)}")
         if not 0.0 <= self.drop < 1.0:
             raise ValueError(f"drop: expected a rate in [0, 1), got {self.drop}")
+        if not 0.0 <= self.coarse <= 1.0:
+            raise ValueError(f"coarse: expected a share in [0, 1], got {self.coarse}")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
 
@@ -140,12 +144,14 @@ class Timetable:
         densify: after these steps Gaussians are cloned, split and pruned.
         reset: after these steps all opacities are lowered.
         evaluate: after these steps the curve is measured (before a densification).
+        coarse: up to this step the training views are seen in half the pixels a side.
     """
 
     sh: tuple[int, ...]
     densify: tuple[int, ...]
     reset: tuple[int, ...]
     evaluate: tuple[int, ...]
+    coarse: int
 
 
 def timetable(config: FitConfig) -> Timetable:
@@ -165,4 +171,6 @@ def timetable(config: FitConfig) -> Timetable:
     reset = tuple(step for step, then in pairwise([*resets, steps]) if then - step >= recipe.reset_recovery)
     sh = [round(recipe.sh_interval * scale * k) for k in range(1, config.sh_degree + 1)]
     evaluate = {max(1, round(steps * k / config.evaluations)) for k in range(1, config.evaluations + 1)}
-    return Timetable(tuple(max(1, step) for step in sh), densify, reset, tuple(sorted(evaluate)))
+    return Timetable(
+        tuple(max(1, step) for step in sh), densify, reset, tuple(sorted(evaluate)), round(config.coarse * steps)
+    )

@@ -21,7 +21,7 @@ from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
 from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged
-from kgs.losses import photometric_loss, target_moments
+from kgs.losses import TargetMoments, photometric_loss, target_moments
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -101,11 +101,16 @@ class Trainer:
         )
         self._order = torch.Generator().manual_seed(_seed(config, 3))
         self._background = self.scene.background.to(self.device)
-        views = self.scene.train
-        self._views = []
+        self._views = self._targets(self.scene.train)
+        self._coarse_views = self._targets(self.scene.train.halved()) if self.times.coarse else []
+
+    def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
+        """What a step needs of each view: its camera, its image and what D-SSIM wants of that."""
+        targets = []
         for i in range(len(views)):
             image = views.images[i : i + 1].to(self.device)
-            self._views.append((move_camera(views.camera(i), self.device), image, target_moments(image)))
+            targets.append((move_camera(views.camera(i), self.device), image, target_moments(image)))
+        return targets
 
     def fit(self, callback: Callable[[Trainer, float], bool] | None = None) -> None:
         """Train to the end.
@@ -228,7 +233,8 @@ class Trainer:
         self.model.sh_degree = sum(self.step >= step for step in self.times.sh)
         if self.drop is not None:
             self.drop.progress = progress
-        camera, target, moments = self._views[self._next_view()]
+        views = self._coarse_views if self.step <= self.times.coarse else self._views
+        camera, target, moments = views[self._next_view()]
         out = self.renderer(self.model(), camera, self._background)
         loss = photometric_loss(out.image.clamp(0, 1), target, recipe.dssim_weight, moments=moments)
         value = float(loss.detach())
