@@ -78,7 +78,8 @@ def fit(
     out: Annotated[Path, _alias("-o")],
     views: int | None = None,
     downscale: float | None = None,
-    steps: int = 2000,
+    fast: bool = False,
+    steps: int | None = None,
     drop: float = 0.2,
     drop_schedule: Literal["linear", "constant"] = "linear",
     seed: int = 0,
@@ -98,7 +99,10 @@ def fit(
         out: folder for splat.ply, metrics.json, test/*.png, curve.png, config.json and the checkpoint.
         views: training views, spread over the views that are not held out; all of them unless given.
         downscale: shrink the images by this factor.
-        steps: iterations; the counts of the recipe (10 000 steps) are scaled to it.
+        fast: the same PSNR of test views in a third of the time, with a little less SSIM: half the steps, the first
+            800 on pictures of half the width.
+        steps: iterations, 2000 unless given (1000 with --fast); the counts of the recipe (10 000 steps) are scaled to
+            it.
         drop: final rate of DropGaussian; 0 leaves it out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         seed: everything random derives from it.
@@ -111,11 +115,13 @@ def fit(
         device: cpu, cuda, ...
         resume: continue from the checkpoint in the output folder.
     """
-    from .fit.config import FitConfig
+    from .fit.config import FAST, FitConfig
     from .fit.run import fit_scene
 
-    config = FitConfig(
-        steps=steps,
+    start = FAST if fast else FitConfig()
+    config = replace(
+        start,
+        steps=start.steps if steps is None else steps,
         drop=drop,
         drop_schedule=drop_schedule,
         sh_degree=sh_degree,
@@ -137,8 +143,8 @@ def fit(
     height, width = loaded.train.images.shape[-2:]
     print(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     if width * height > 1e6 and device == "cpu":
-        megapixels = width * height / 1e6
-        print(f"{megapixels:.1f} Mpx on a CPU: expect about {megapixels * steps / 1500:.0f} minutes; see --downscale")
+        megapixels, minutes = width * height / 1e6, width * height * config.steps / 1.5e9
+        print(f"{megapixels:.1f} Mpx on a CPU: expect about {minutes:.0f} minutes; see --downscale")
     metrics, interrupted = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
     _print_metrics(metrics)
     print(f"{out / 'splat.ply'}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")

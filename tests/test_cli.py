@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 import kgs
 from kgs.cli import main
 from kgs.datasets.synthetic import synthetic_scene
+from kgs.fit.config import FAST, FitConfig
 
 STEPS = 30
 
@@ -163,3 +165,16 @@ def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert f"{gain:+.2f} dB" in capsys.readouterr().out
     assert cv2.imread(str(tmp_path / "demo.png")) is not None
     assert cv2.imread(str(tmp_path / "curve.png")) is not None
+
+
+def test_fast_is_a_start_that_options_change(folder, tmp_path, monkeypatch):
+    seen = []
+
+    def fit_scene(scene, config, *args, **kwargs):
+        seen.append(config)
+        raise kgs.DataError(folder, "", "enough")
+
+    monkeypatch.setattr("kgs.fit.run.fit_scene", fit_scene)
+    for options in ([], ["--fast"], ["--fast", "--steps", 700], ["--steps", 700]):
+        assert run("fit", folder, "-o", tmp_path, *options) == 2
+    assert seen == [FitConfig(), FAST, replace(FAST, steps=700), FitConfig(steps=700)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import statistics
 import time
@@ -12,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from kgs.errors import DataError
-from kgs.fit.config import FitConfig
+from kgs.fit.config import FAST, FitConfig
 from kgs.fit.report import versions
 
 from .grid import run_grid
-from .output import markdown_table
+from .output import markdown_table, write_csv
 
 __all__ = ["KNOBS", "fit_cell", "measure_training", "training_cells"]
 
@@ -28,14 +29,15 @@ KNOBS: dict[str, tuple[Any, ...]] = {
     "max_gaussians": (5_000, 10_000),
     "drop": (0.0, 0.1, 0.3),
 }
-_DECIMALS = {"psnr": 2, "ssim": 3, "train_psnr": 1, "cpu_seconds": 0, "gaussians": 0}  # of what the table shows
+# What the table shows, and with how many decimals.
+_DECIMALS = {"psnr": 2, "gain": 2, "ssim": 3, "train_psnr": 1, "cpu_seconds": 0, "gaussians": 0}
 SYNTHETIC = "synthetic"
 SIZE = (126, 168)  # of the synthetic pictures
 
 
 def training_cells(scenes: list[str], seeds: int) -> list[dict[str, Any]]:
-    """The cells of the grid: the default and each other value of each knob, on each scene with each seed."""
-    settings: list[dict[str, Any]] = [{}]
+    """The cells of the grid: the default, `--fast`, and each other value of each knob, on each scene with each seed."""
+    settings: list[dict[str, Any]] = [{}, {"fast": True}]
     settings += [{knob: value} for knob, values in KNOBS.items() for value in values]
     return [
         {"scene": scene, "seed": seed, **setting} for seed in range(seeds) for setting in settings for scene in scenes
@@ -43,12 +45,19 @@ def training_cells(scenes: list[str], seeds: int) -> list[dict[str, Any]]:
 
 
 def fit_cell(cell: dict[str, Any]) -> dict[str, Any]:
-    """One fit: `scene` is "synthetic" or "fern" (found through KGS_DATA); what else the cell has goes to FitConfig."""
+    """One fit.
+
+    Args:
+        cell: `scene`, "synthetic" or "fern" (found through KGS_DATA); `fast` where the fit starts from that setting and
+            not from the default; the rest are fields of FitConfig.
+    """
     from kgs.datasets import load_scene, synthetic_scene
     from kgs.fit.run import choose_points, measure
     from kgs.fit.trainer import Trainer
 
-    config = FitConfig.from_dict({key: value for key, value in cell.items() if key != "scene"})
+    start = FAST if cell.get("fast") else FitConfig()
+    turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
+    config = FitConfig.from_dict(start.to_dict() | turned)
     if cell["scene"] == SYNTHETIC:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
     else:
@@ -73,7 +82,7 @@ def fit_cell(cell: dict[str, Any]) -> dict[str, Any]:
 def measure_training(
     out: Path, *, quick: bool = False, processes: int | None = None, say: Callable[[str], None] = print
 ) -> list[dict[str, Any]]:
-    """Run the grid or go on with it, and write training.jsonl, training.md and training.png.
+    """Run the grid or go on with it, and write training.jsonl, training.csv, training.md and training.png.
 
     Args:
         out: folder for the results; cells that its training.jsonl has are not repeated.
@@ -99,38 +108,48 @@ def measure_training(
     summary = summarize(rows)
     table = _markdown(summary)
     (out / "training.md").write_text(table, encoding="utf-8")
+    write_csv(out / "training.csv", summary)
     _plot(out / "training.png", summary)
     say(table)
     return rows
 
 
 def summarize(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean and standard deviation over seeds of every setting of every scene."""
-    groups: dict[tuple[str, str, Any], list[dict[str, Any]]] = {}
+    """Every setting of every scene: mean and standard deviation over seeds, and of the gain over the default.
+
+    The gain is in dB of test PSNR, from the seeds that both have; the two fits of a seed have the same first points.
+    """
+    groups: dict[tuple[str, str, Any], dict[int, dict[str, Any]]] = {}
     for row in rows:
         knobs = {key: value for key, value in row["cell"].items() if key not in ("scene", "seed")}
         knob, value = next(iter(knobs.items()), ("default", None))
-        groups.setdefault((row["cell"]["scene"], knob, value), []).append(row["result"])
+        groups.setdefault((row["cell"]["scene"], knob, value), {})[row["cell"]["seed"]] = row["result"]
     summary = []
     for (scene, knob, value), results in groups.items():
         entry: dict[str, Any] = {"scene": scene, "knob": knob, "value": value, "n": len(results)}
-        for name in _DECIMALS:
-            values = [result[name] for result in results]
-            entry[name] = statistics.mean(values)
-            entry[f"{name}_sd"] = statistics.stdev(values) if len(values) > 1 else 0.0
+        columns = {name: [result[name] for result in results.values()] for name in _DECIMALS if name != "gain"}
+        default = groups.get((scene, "default", None), {})
+        columns["gain"] = [results[seed]["psnr"] - default[seed]["psnr"] for seed in results.keys() & default.keys()]
+        for name, values in columns.items():
+            entry[name] = statistics.mean(values) if values else math.nan
+            entry[f"{name}_sd"] = statistics.stdev(values) if len(values) > 1 else math.nan
         summary.append(entry)
     return summary
 
 
 def _markdown(summary: list[dict[str, Any]]) -> str:
-    columns = ("setting", "n", "PSNR [dB]", "SSIM", "PSNR of training views", "CPU seconds", "Gaussians")
+    heads = ("PSNR [dB]", "over the default", "SSIM", "PSNR of training views", "CPU seconds", "Gaussians")
     rows = []
     for entry in sorted(summary, key=lambda e: (e["scene"], e["knob"] != "default", e["knob"])):
-        spread = {name: f"{entry[name]:.{d}f} ({entry[f'{name}_sd']:.{d}f})" for name, d in _DECIMALS.items()}
-        setting = entry["knob"] if entry["value"] is None else f"{entry['knob']} {entry['value']}"
-        rows.append([entry["scene"], setting, entry["n"], *spread.values()])
+        spread = [f"{entry[name]:.{d}f} ({entry[f'{name}_sd']:.{d}f})" for name, d in _DECIMALS.items()]
+        is_flag = entry["value"] is None or entry["value"] is True
+        setting = entry["knob"] if is_flag else f"{entry['knob']} {entry['value']}"
+        rows.append([entry["scene"], setting, entry["n"], *spread])
     return markdown_table(
-        "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)", columns, rows, first="scene"
+        "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)",
+        ("setting", "n", *heads),
+        rows,
+        first="scene",
     )
 
 
