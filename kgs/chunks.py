@@ -36,7 +36,7 @@ class Rules:
 
 
 class Band:
-    """A contiguous range of tiles with its lists.
+    """A contiguous range of tiles with lists of a range of depths.
 
     Args:
         table: `(10, n + 1)`, for each Gaussian ln o, x, y, the three quadratic coefficients of the exponent, and the
@@ -71,30 +71,37 @@ class Band:
         self.clamps = bool((table[0] > math.log(ALPHA_MAX)).any())
         self.groups = self._make_groups(lengths)
 
-    def forward(self, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Sums of features `(T, F, P)`, transmittance `(T, 1, P)` and median depth `(T, 1, P)` or `(T, 0, P)`."""
-        tiles, like = self.bins.num_tiles, self.table
-        # three columns at a time: what is asked for beside the image does not change its bits
-        blocks = self.features.split(3, dim=1)
-        sums = [like.new_zeros(tiles, block.shape[1], self.pixels) for block in blocks]
-        transmittance = like.new_ones(tiles, 1, self.pixels)
-        median = like.new_zeros(tiles, 1 if self.depths is not None else 0, self.pixels)
+    def blank(self) -> tuple[Tensor, ...]:
+        """Sums before the first layer: transmittance `(T, 1, P)`, median depth `(T, 1 or 0, P)`, features `(T, f, P)`.
 
+        The features are three at a time: what is asked for beside the image does not change its bits.
+        """
+        tiles, like = self.bins.num_tiles, self.table
+        return (
+            like.new_ones(tiles, 1, self.pixels),
+            like.new_zeros(tiles, 1 if self.depths is not None else 0, self.pixels),
+            *(like.new_zeros(tiles, block.shape[1], self.pixels) for block in self.features.split(3, dim=1)),
+        )
+
+    def forward(self, sums: tuple[Tensor, ...], keep: bool) -> int:
+        """Add this band's layers to sums that start as `blank`; returns the bytes of the alphas that are kept."""
         slots = self.chunk_size * sum(sum(group.chunks) for group in self.groups)
-        keep_alphas = keep and slots * self.pixels * like.element_size() <= self.rules.alpha_bytes
+        alpha_bytes = slots * self.pixels * self.table.element_size()
+        keep_alphas = keep and alpha_bytes <= self.rules.alpha_bytes
+        blocks = self.features.split(3, dim=1)
 
         def worker() -> Forward:
-            return Forward(self, blocks, (transmittance, median, *sums), keep, keep_alphas)
+            return Forward(self, blocks, sums, keep, keep_alphas)
 
-        run_all(self.groups, worker, like.device)
-        return torch.cat(sums, 1), transmittance, median
+        run_all(self.groups, worker, self.table.device)
+        return alpha_bytes if keep_alphas else 0
 
     def backward(self, grads: Tensor, behind: Tensor) -> Tensor:
         """What each Gaussian of the bins gets: six moments of dL/d ln alpha about its centre, and dL/d features.
 
         Args:
             grads: dL/d sums, `(T, F, P)`.
-            behind: T_end dL/dT_end, `(T, 1, P)`.
+            behind: V behind the last layer, `(T, 1, P)`, see `compositing`; becomes V before the first.
 
         Returns:
             `(n, 6 + F)`.

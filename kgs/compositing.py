@@ -20,11 +20,14 @@ no light had been lost before it:
 and V_{k+1} = 0 where layer k ends the light. V is a mean of colours: no sum grows large, nothing is divided by
 1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the pixels, again one matrix
 product; they are shifted to its centre and summed over its tiles.
+
+Where lists are long, the layers are taken in bands, nearest first: lists are made for the tiles alone that still have
+light, so that what is hidden is neither listed nor sorted.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -34,9 +37,12 @@ from torch import Tensor
 from .chunks import Band, Rules
 from .covariance import variances, whitening
 from .tiles import TileSpans, tile_spans
-from .types import ProjectedGaussians
+from .types import ProjectedGaussians, TileBins
 
 __all__ = ["Composited", "composite"]
+
+_LAYERS = 192  # Gaussians a tile in a band of layers: few see more before their light is gone
+Layers = tuple[tuple[int, int], Band]  # ranks, and the band of their lists
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,51 @@ def bytes_per_entry(width: int, tile_size: int, dtype: torch.dtype) -> int:
     return 80 + (8 + 2 * width + tile_size**2 // 8) * dtype.itemsize
 
 
+@dataclass(frozen=True)
+class _Passes:
+    """Both passes over a range of rows of tiles: a band of layers after the other, nearest first, while light is left.
+
+    Lists are made for the tiles alone that the bands before have left light in.
+    """
+
+    inputs: tuple[Tensor, ...]  # means2d, factors, opacities, features
+    projected: ProjectedGaussians
+    spans: TileSpans
+    rules: Rules
+
+    def forward(self, rows: tuple[int, int], keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], list[Layers]]:
+        """Sums, transmittance and median depth of the tiles, `(T, _, P)`; and what `backward` wants."""
+        sums: tuple[Tensor, ...] = ()
+        live, layers, rules = None, [], self.rules
+        for ranks in self.spans.depth_ranges(_LAYERS):
+            band = self._band(self.spans.bin(*rows, ranks, live), ranks, rules)
+            sums = sums or band.blank()
+            kept_bytes = band.forward(sums, keep)
+            rules = replace(rules, alpha_bytes=rules.alpha_bytes - kept_bytes)
+            if keep:
+                layers.append((ranks, band))
+            live = sums[0].amax((1, 2)) > 0
+            if ranks[1] < self.spans.ids.shape[0] and not bool(live.any()):
+                break
+        transmittance, median, *features = sums
+        return (torch.cat(features, 1), transmittance, median), layers
+
+    def backward(self, layers: list[Layers], grads: Tensor, behind: Tensor, total: Tensor) -> None:
+        """Add to `total` what each Gaussian gets, see `Band.backward`; `behind` is used up."""
+        for (begin, end), band in reversed(layers):
+            total[begin:end] += band.backward(grads, behind)
+
+    def _band(self, bins: TileBins, ranks: tuple[int, int], rules: Rules) -> Band:
+        """A band with what its steps need of each Gaussian, and a dummy at the end that has no effect."""
+        means2d, factors, opacities, features = (x.index_select(0, bins.ids) for x in self.inputs)
+        table = F.pad(_table(means2d, factors, opacities, self.projected.eps2d), (0, 1))
+        table[0, -1] = -torch.inf
+        depths: Tensor | None = None
+        if rules.median_depth:
+            depths = F.pad(self.projected.depths.detach().index_select(0, bins.ids), (0, 1))
+        return Band(table, F.pad(features, (0, 0, 0, 1)), depths, bins, rules)
+
+
 class _Composite(torch.autograd.Function):
     """All cameras at once; in bands of tile rows where the lists of all would exceed the byte budget.
 
@@ -120,24 +171,17 @@ class _Composite(torch.autograd.Function):
         rules: Rules,
         keep: bool,
     ) -> tuple[Tensor, ...]:
-        table = F.pad(_table(means2d, factors, opacities, projected.eps2d).index_select(1, spans.ids), (0, 1))
-        table[0, -1] = -torch.inf
-        colors = F.pad(features.index_select(0, spans.ids), (0, 0, 0, 1))
-        depths = F.pad(projected.depths.detach().index_select(0, spans.ids), (0, 1)) if rules.median_depth else None
-
-        def make_band(rows: tuple[int, int]) -> Band:
-            return Band(table, colors, depths, spans.bin(*rows), rules)
-
-        outputs, kept = [], None
+        inputs = (means2d, factors, opacities, features)
+        passes = _Passes(inputs, projected, spans, rules)
+        parts, kept = [], None
         for rows in bands:
-            band = make_band(rows)
-            outputs.append(band.forward(keep))
+            part, layers = passes.forward(rows, keep)
+            parts.append(part)
             if keep and len(bands) == 1:
-                kept = band
-        sums, transmittance, median = (torch.cat(parts) for parts in zip(*outputs, strict=True))
-        ctx.save_for_backward(factors, opacities)
-        ctx.projected, ctx.spans, ctx.bands, ctx.kept, ctx.make_band = projected, spans, bands, kept, make_band
-        images = tuple(_to_images(x, projected, spans) for x in (sums, transmittance, median))
+                kept = layers
+        ctx.save_for_backward(*inputs)
+        ctx.context, ctx.bands, ctx.kept = (projected, spans, rules), bands, kept
+        images = tuple(_to_images(torch.cat(x), projected, spans) for x in zip(*parts, strict=True))
         ctx.mark_non_differentiable(images[2])
         return images
 
@@ -147,22 +191,22 @@ class _Composite(torch.autograd.Function):
             raise RuntimeError(
                 "composite: expected backward without create_graph, the renderer has no second derivative"
             )
-        factors, opacities = ctx.saved_tensors
-        spans, columns = ctx.spans, ctx.spans.grid[1]
+        projected, spans, rules = ctx.context
+        passes, columns = _Passes(ctx.saved_tensors, projected, spans, rules), spans.grid[1]
+        _, factors, opacities, _ = passes.inputs
         grads = _to_tiles(grad_sums, spans)
         behind = _to_tiles(grad_transmittance, spans)
         total = factors.new_zeros(spans.ids.shape[0], 6 + grads.shape[1])
         for begin, end in ctx.bands:
-            band, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
-            if band is None:
-                band = ctx.make_band((begin, end))
-                band.forward(keep=True)
+            layers, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
+            if layers is None:
+                _, layers = passes.forward((begin, end), keep=True)
             tiles = slice(begin * columns, end * columns)
-            total += band.backward(grads[tiles], behind[tiles])
+            passes.backward(layers, grads[tiles], behind[tiles], total)
         ids = spans.ids
         used = factors.index_select(0, ids), opacities.index_select(0, ids)
         with torch.autocast(factors.device.type, enabled=False):
-            found = _to_inputs(total, *used, ctx.projected.eps2d)
+            found = _to_inputs(total, *used, projected.eps2d)
         rows = factors.shape[0]
         return (
             *(

@@ -192,6 +192,7 @@ class Backward(_Worker):
                 )
                 self._step(step, tiles, starts, ends, g, later)
                 behind.index_copy_(0, rows, later)
+        self.behind.index_copy_(0, group.tiles, behind[:, None])
 
     def scan_back(
         self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor, ended: bool, later: Tensor

@@ -9,8 +9,10 @@ Every tile of the span is touched, every other is not; no tile has to be tested.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from .covariance import variances
@@ -81,12 +83,41 @@ class TileSpans:
         bands.append((begin, self.entries_per_row.shape[0]))
         return bands
 
-    def bin(self, begin: int, end: int) -> TileBins:
-        """The lists of the tiles in rows `begin` to `end` (exclusive)."""
-        ranks, rows, first, counts = self.ranks, self.rows, self.first, self.counts
+    def depth_ranges(self, layers: int) -> list[tuple[int, int]]:
+        """Consecutive ranges of `ids`, nearest first, of about `layers` entries a tile each."""
+        total, tiles = int(self.entries_per_row.sum()), self.entries_per_row.shape[0] * self.grid[1]
+        count = max(1, round(total / max(1, layers * tiles)))
+        if count == 1:
+            return [(0, self.ids.shape[0])]
+        entries = torch.cumsum(self.counts, 0)
+        targets = torch.arange(1, count, device=entries.device) * (total // count)
+        cuts = self.ranks.index_select(0, torch.searchsorted(entries, targets)).unique().tolist()
+        bounds = [0, *(cut for cut in cuts if cut > 0), self.ids.shape[0]]
+        return list(pairwise(bounds))
+
+    def bin(self, begin: int, end: int, ranks: tuple[int, int] | None = None, live: Tensor | None = None) -> TileBins:
+        """The lists of the tiles in rows `begin` to `end` (exclusive).
+
+        Args:
+            begin: first row of tiles.
+            end: one past the last row.
+            ranks: range of `ids` to list; None: all.
+            live: which of these tiles want a list, `(T,)`; None: all.
+        """
+        spans: tuple[Tensor, ...] = (self.ranks, self.rows, self.first, self.counts)
+        low, high = ranks or (0, self.ids.shape[0])
+        if (low, high) != (0, self.ids.shape[0]):
+            cuts = torch.searchsorted(self.ranks, torch.tensor([low, high], device=self.ranks.device)).tolist()
+            spans = tuple(x[slice(*cuts)] for x in spans)
         if (begin, end) != (0, self.entries_per_row.shape[0]):
-            inside = ((rows >= begin) & (rows < end)).nonzero()[:, 0]
-            ranks, rows, first, counts = (x.index_select(0, inside) for x in (ranks, rows, first, counts))
+            inside = ((spans[1] >= begin) & (spans[1] < end)).nonzero()[:, 0]
+            spans = tuple(x.index_select(0, inside) for x in spans)
+        if live is not None:
+            alive = F.pad(torch.cumsum(live.int(), 0, dtype=torch.int32), (1, 0))
+            left = (spans[1] - begin) * self.grid[1] + spans[2]
+            inside = (alive.index_select(0, left + spans[3]) > alive.index_select(0, left)).nonzero()[:, 0]
+            spans = tuple(x.index_select(0, inside) for x in spans)
+        rank, rows, first, counts = spans
         columns = self.grid[1]
         num_tiles = (end - begin) * columns
         num_entries = int(counts.sum(dtype=torch.int64))
@@ -94,7 +125,10 @@ class TileSpans:
         start = torch.cumsum(counts, 0, dtype=torch.int32) - counts
         span = torch.repeat_interleave(_arange(counts), counts, output_size=num_entries)
         tiles = _arange(span) + ((rows - begin) * columns + first - start).index_select(0, span)
-        ranks = ranks.index_select(0, span)
+        entries = (rank - low).index_select(0, span)
+        if live is not None:
+            inside = live.index_select(0, tiles).nonzero()[:, 0]
+            tiles, entries = tiles.index_select(0, inside), entries.index_select(0, inside)
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
         per_tile = torch.bincount(keys, minlength=num_tiles)
         return TileBins(
@@ -102,8 +136,8 @@ class TileSpans:
             grid=self.grid,
             first_tile=begin * columns,
             offsets=torch.cat([per_tile.new_zeros(1), torch.cumsum(per_tile, 0)]),
-            entries=ranks.index_select(0, order),
-            ids=self.ids,
+            entries=entries.index_select(0, order),
+            ids=self.ids[low:high],
             order=order,
         )
 

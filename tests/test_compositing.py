@@ -10,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from oracles import near_threshold, pinhole, random_camera, random_gaussians, theta_mass
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import kgs
 import kgs.reference
 from kgs import GaussianRenderer, ProjectedGaussians, composite, project
 from kgs.chunks import Band
@@ -308,8 +309,8 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, monkeypatch):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     steps, forward = [], Band.forward
 
-    def noted(band, keep):
-        result = forward(band, keep)
+    def noted(band, sums, keep):
+        result = forward(band, sums, keep)
         steps.extend(step for group in band.groups for step in group.steps)
         return result
 
@@ -324,6 +325,36 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, monkeypatch):
     assert all(step.alpha is None for step in steps)
     assert torch.equal(lean, kept)
     assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP), (TH, 0.1)])
+@pytest.mark.parametrize("tight", [False, True])
+def test_bands_of_layers_change_nothing(dtype, bound, thresholds, tight, monkeypatch):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+    opacities = projected.opacities.sqrt()  # some tiles get dark before the last layer
+    projected = dataclasses.replace(projected, opacities=opacities)
+    image, gradients = loss_and_gradients(projected, colors, weights, **options)
+    median = composite(projected, colors, median_depth=True, **options).median_depth
+    if tight:  # and in bands of rows of tiles
+        largest = int(tile_spans(projected, 8, thresholds[0]).entries_per_row.max())
+        options["max_bytes"] = bytes_per_entry(3, 8, dtype) * largest
+    entries, init = [], Band.__init__
+
+    def noted(band, *arguments):
+        init(band, *arguments)
+        entries.append(band.bins.entries.shape[0])
+
+    monkeypatch.setattr(Band, "__init__", noted)
+    monkeypatch.setattr("kgs.compositing._LAYERS", 6)
+    layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
+    assert len(entries) > (6 if tight else 3)
+    if thresholds[1] == 0.1:  # what lies behind the end of the light is not listed
+        assert sum(entries) < 0.9 * (2 if tight else 1) * len(kgs.bin_to_tiles(projected).entries)
+    assert (layered - image).abs().max() <= bound
+    assert_gradients_close(layered_gradients, gradients, bound)
+    assert torch.equal(composite(projected, colors, median_depth=True, **options).median_depth, median)
 
 
 @pytest.fixture

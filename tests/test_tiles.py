@@ -339,6 +339,39 @@ def test_bands_cover_all_rows_within_the_budget_and_together_are_the_whole(share
     assert torch.equal(torch.cat([part.offsets.diff() for part in parts]), whole.offsets.diff())
 
 
+@pytest.mark.parametrize("layers", [1, 3, 10, 1000])
+def test_depth_ranges_cover_all_ranks_in_about_equal_parts(layers):
+    projected = scene(0, cameras=2)
+    spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)
+    ranges = spans.depth_ranges(layers)
+    assert [begin for begin, _ in ranges] == [0, *(end for _, end in ranges[:-1])]
+    assert ranges[-1][1] == len(whole.ids)
+    assert all(begin < end for begin, end in ranges)
+    entries = [len(spans.bin(0, 2 * whole.grid[0], ranks).entries) for ranks in ranges]
+    assert sum(entries) == len(whole.entries)
+    largest = int(torch.bincount(whole.entries).max())  # a range ends between two Gaussians
+    assert max(entries) <= max(len(whole.entries) / len(ranges), layers * whole.num_tiles) * 1.5 + 2 * largest
+
+
+@pytest.mark.parametrize("rows", [(0, 12), (3, 7)])
+@pytest.mark.parametrize("ranks", [None, (0, 40), (25, 31)])
+@pytest.mark.parametrize("share", [None, 0.0, 0.4, 1.0])
+def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, ranks, share):
+    projected = scene(0, cameras=2)
+    spans = tile_spans(projected, 8, THRESHOLD)
+    whole, low, high = spans.bin(*rows), *(ranks or (0, len(spans.ids)))
+    live = None if share is None else torch.rand(whole.num_tiles) < share
+    part = spans.bin(*rows, ranks, live)
+    check_structure(projected, part)
+    assert torch.equal(part.ids, whole.ids[low:high])
+    for t in range(whole.num_tiles):
+        expected = whole.entries[whole.offsets[t] : whole.offsets[t + 1]]
+        expected = expected[(expected >= low) & (expected < high)] - low
+        if live is not None and not live[t]:
+            expected = expected[:0]
+        assert torch.equal(part.entries[part.offsets[t] : part.offsets[t + 1]], expected)
+
+
 def test_entries_per_row_are_what_the_rows_hold():
     projected = scene(0, cameras=2)
     spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)

@@ -55,9 +55,9 @@ def fit_cell(cell: dict[str, Any]) -> dict[str, Any]:
     from kgs.fit.run import choose_points, measure
     from kgs.fit.trainer import Trainer
 
-    start = FAST if cell.get("fast") else FitConfig()
+    settings = FAST if cell.get("fast") else FitConfig()
     turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
-    config = FitConfig.from_dict(start.to_dict() | turned)
+    config = FitConfig.from_dict(settings.to_dict() | turned)
     if cell["scene"] == SYNTHETIC:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
     else:
