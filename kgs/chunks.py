@@ -96,23 +96,25 @@ class Band:
         run_all(self.groups, worker, self.table.device)
         return alpha_bytes if keep_alphas else 0
 
-    def backward(self, grads: Tensor, behind: Tensor) -> Tensor:
+    def backward(self, grads: Tensor, behind: Tensor, *, moments: bool, features: bool) -> Tensor:
         """What each Gaussian of the bins gets: six moments of dL/d ln alpha about its centre, and dL/d features.
 
         Args:
             grads: dL/d sums, `(T, F, P)`.
             behind: V behind the last layer, `(T, 1, P)`, see `compositing`; becomes V before the first.
+            moments: whether the moments are wanted.
+            features: whether dL/d features is wanted.
 
         Returns:
-            `(n, 6 + F)`.
+            `(n, 6 + F)`, without the columns that are not wanted.
         """
-        entries, columns = self.bins.entries.shape[0], 6 + self.features.shape[1]
+        entries, columns = self.bins.entries.shape[0], 6 * moments + self.features.shape[1] * features
         rows = self.table.new_zeros(entries + 1, columns)
         if entries == 0:
             return rows.new_zeros(self.bins.ids.shape[0], columns)
 
         def worker() -> Backward:
-            return Backward(self, grads, behind, rows)
+            return Backward(self, grads, behind, rows, moments, features)
 
         run_all(self.groups, worker, rows.device)
         # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics

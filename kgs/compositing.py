@@ -136,10 +136,12 @@ class _Passes:
         transmittance, median, *features = sums
         return (torch.cat(features, 1), transmittance, median), layers
 
-    def backward(self, layers: list[Layers], grads: Tensor, behind: Tensor, total: Tensor) -> None:
+    def backward(
+        self, layers: list[Layers], grads: Tensor, behind: Tensor, total: Tensor, *, moments: bool, features: bool
+    ) -> None:
         """Add to `total` what each Gaussian gets, see `Band.backward`; `behind` is used up."""
         for (begin, end), band in reversed(layers):
-            total[begin:end] += band.backward(grads, behind)
+            total[begin:end] += band.backward(grads, behind, moments=moments, features=features)
 
     def _band(self, bins: TileBins, ranks: tuple[int, int], rules: Rules) -> Band:
         """A band with what its steps need of each Gaussian, and a dummy at the end that has no effect."""
@@ -196,25 +198,26 @@ class _Composite(torch.autograd.Function):
         _, factors, opacities, _ = passes.inputs
         grads = _to_tiles(grad_sums, spans)
         behind = _to_tiles(grad_transmittance, spans)
-        total = factors.new_zeros(spans.ids.shape[0], 6 + grads.shape[1])
+        moments, width = any(ctx.needs_input_grad[:3]), grads.shape[1] if ctx.needs_input_grad[3] else 0
+        total = factors.new_zeros(spans.ids.shape[0], 6 * moments + width)
         for begin, end in ctx.bands:
             layers, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
             if layers is None:
-                _, layers = passes.forward((begin, end), keep=True)
+                layers = passes.forward((begin, end), keep=True)[1]
             tiles = slice(begin * columns, end * columns)
-            passes.backward(layers, grads[tiles], behind[tiles], total)
+            passes.backward(layers, grads[tiles], behind[tiles], total, moments=moments, features=width > 0)
         ids = spans.ids
-        used = factors.index_select(0, ids), opacities.index_select(0, ids)
-        with torch.autocast(factors.device.type, enabled=False):
-            found = _to_inputs(total, *used, projected.eps2d)
-        rows = factors.shape[0]
-        return (
-            *(
-                value.new_zeros(rows, *value.shape[1:]).index_copy_(0, ids, value) if needed else None
-                for value, needed in zip(found, ctx.needs_input_grad, strict=False)
-            ),
-            *[None] * 5,
-        )
+        found: tuple[Tensor | None, ...] = (None, None, None, total[:, total.shape[1] - width :])
+        if moments:
+            used = factors.index_select(0, ids), opacities.index_select(0, ids)
+            with torch.autocast(factors.device.type, enabled=False):
+                found = (*_from_moments(total[:, :6], *used, projected.eps2d), found[3])
+
+        def of_all(value: Tensor) -> Tensor:
+            return value.new_zeros(factors.shape[0], *value.shape[1:]).index_copy_(0, ids, value)
+
+        wanted = zip(found, ctx.needs_input_grad, strict=False)
+        return *(of_all(x) if needed and x is not None else None for x, needed in wanted), *[None] * 5
 
 
 def _table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
@@ -237,8 +240,8 @@ def _table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) ->
     )
 
 
-def _to_inputs(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, ...]:
-    """From moments s of dL/d ln alpha to gradients of means2d, factors, opacities and features.
+def _from_moments(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:
+    """From moments s of dL/d ln alpha, `(n, 6)`, to gradients of means2d, factors and opacities.
 
     With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 Q M.
     """
@@ -246,7 +249,7 @@ def _to_inputs(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -
     q = torch.stack([yy, -xy, -xy, xx], 1).div_(det[:, None]).view(-1, 2, 2)
     s0, s1, s2 = rows[:, 0], rows[:, 1:3], rows[:, [3, 4, 4, 5]].view(-1, 2, 2)
     d_means = (q @ s1[:, :, None])[:, :, 0]
-    return d_means, q @ s2 @ q @ factors, s0 / opacities, rows[:, 6:]
+    return d_means, q @ s2 @ q @ factors, s0 / opacities
 
 
 def _to_images(tiles: Tensor, projected: ProjectedGaussians, spans: TileSpans) -> Tensor:

@@ -170,12 +170,21 @@ class Forward(_Worker):
 
 
 class Backward(_Worker):
-    """Takes the kept steps of a group from back to front and writes the gradients of their entries."""
+    """Takes the kept steps of a group from back to front and writes the gradients of their entries.
 
-    def __init__(self, band: Band, grads: Tensor, behind: Tensor, rows: Tensor) -> None:
-        super().__init__(band, buffers=5)
-        self.grads, self.behind, self.rows = grads, behind, rows
-        self.features = band.features.t().contiguous()
+    Args:
+        band: with the steps of its forward pass.
+        grads: dL/d sums, `(T, F, P)`.
+        behind: V behind the last layer, `(T, 1, P)`; becomes V before the first.
+        rows: one a entry and a last one for nobody; six moments where `moments`, then F where `features`.
+        moments: whether geometry or opacities want a gradient.
+        features: whether the features want one.
+    """
+
+    def __init__(self, band: Band, grads: Tensor, behind: Tensor, rows: Tensor, moments: bool, features: bool) -> None:
+        super().__init__(band, buffers=5 if moments else 3)
+        self.grads, self.behind, self.rows, self.moments, self.features = grads, behind, rows, moments, features
+        self.colors = band.features.t().contiguous()
 
     def __call__(self, group: Group) -> None:
         """Differentiate a group."""
@@ -194,23 +203,6 @@ class Backward(_Worker):
                 behind.index_copy_(0, rows, later)
         self.behind.index_copy_(0, group.tiles, behind[:, None])
 
-    def scan_back(
-        self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor, ended: bool, later: Tensor
-    ) -> None:
-        """Fill `later` `(K + 1, n, P)` with V of each layer and behind the last; `light` is used up."""
-        if self.band.by_layer:
-            later[-1] = behind
-            values, alphas, layers = value.unbind(0), alpha.unbind(0), later.unbind(0)
-            reached = light[1:].sign_().unbind(0) if ended else None
-            for k in reversed(range(len(values))):
-                if reached is not None:
-                    layers[k + 1].mul_(reached[k])
-                torch.lerp(layers[k + 1], values[k], alphas[k], out=layers[k])
-        else:  # the light that comes from behind a layer over the light that gets there; both are 0 behind the end
-            torch.mul(weights, value, out=later[:-1])
-            torch.mul(light[-1], behind, out=later[-1])
-            torch.div(later.flip(0).cumsum(0).flip(0), light.clamp_(min=torch.finfo(light.dtype).tiny), out=later)
-
     def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
         """Gradients of one step; `behind` becomes V before the step, see `compositing`."""
         band, n, size = self.band, step.count, self.band.chunk_size
@@ -225,23 +217,42 @@ class Backward(_Worker):
         if step.ended:
             F.threshold(light, band.stop, 0.0, inplace=True)
         weights = torch.mul(alpha, light[:-1], out=self.buffer(2, size, n))
-        value, later = self.buffer(3, size, n), self.buffer(4, size + 1, n)
-        colors = self.features.index_select(1, ids).view(-1, size, n, 1)
-        value.zero_()
-        for f in range(len(colors)):
-            value.addcmul_(colors[f], grads[:, f])
-        self.scan_back(alpha, light, weights, value, behind, step.ended, later)
-        behind.copy_(later[0])
-        d_features = torch.bmm(weights.transpose(0, 1), grads.transpose(1, 2))
-        value.sub_(later[1:]).mul_(weights)
-        if band.clamps:  # no derivative where alpha is held at its maximum
-            value.mul_(torch.sub(ALPHA_MAX, alpha, out=self.buffer(0, size, n)).sign_())
-        moments = torch.mm(band.monomials, value.view(-1, band.pixels).t())
-        rows = torch.empty(n * size, 6 + d_features.shape[2], dtype=moments.dtype, device=moments.device)
-        rows[:, :6] = _about_centre(moments, ux, uy).t()
-        rows[:, 6:] = d_features.transpose(0, 1).reshape(n * size, -1)
+        rows = self.rows.new_empty(n * size, self.rows.shape[1])
+        if self.features:
+            d_features = torch.bmm(weights.transpose(0, 1), grads.transpose(1, 2))
+            rows[:, rows.shape[1] - d_features.shape[2] :] = d_features.transpose(0, 1).reshape(n * size, -1)
+        if self.moments:
+            value = self.buffer(3, size, n).zero_()
+            for color, grad in zip(self.colors.index_select(1, ids).view(-1, size, n, 1), grads.unbind(1), strict=True):
+                value.addcmul_(color, grad)
+            later = self._scan_back(alpha, light, weights, value, behind, step.ended)
+            behind.copy_(later[0])
+            value.sub_(later[1:]).mul_(weights)
+            if band.clamps:  # no derivative where alpha is held at its maximum
+                value.mul_(torch.sub(ALPHA_MAX, alpha, out=self.buffer(0, size, n)).sign_())
+            moments = torch.mm(band.monomials, value.view(-1, band.pixels).t())
+            rows[:, :6] = _about_centre(moments, ux, uy).t()
         positions.masked_fill_(beyond, self.rows.shape[0] - 1)
         self.rows.index_copy_(0, positions.view(-1), rows)
+
+    def _scan_back(
+        self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor, ended: bool
+    ) -> Tensor:
+        """V of each layer and behind the last, `(K + 1, n, P)`; `light` is used up."""
+        later = self.buffer(4, alpha.shape[0] + 1, alpha.shape[1])
+        if self.band.by_layer:
+            later[-1] = behind
+            values, alphas, layers = value.unbind(0), alpha.unbind(0), later.unbind(0)
+            reached = light[1:].sign_().unbind(0) if ended else None
+            for k in reversed(range(len(values))):
+                if reached is not None:
+                    layers[k + 1].mul_(reached[k])
+                torch.lerp(layers[k + 1], values[k], alphas[k], out=layers[k])
+        else:  # the light that comes from behind a layer over the light that gets there; both are 0 behind the end
+            torch.mul(weights, value, out=later[:-1])
+            torch.mul(light[-1], behind, out=later[-1])
+            torch.div(later.flip(0).cumsum(0).flip(0), light.clamp_(min=torch.finfo(light.dtype).tiny), out=later)
+        return later
 
 
 def _about_centre(moments: Tensor, ux: Tensor, uy: Tensor) -> Tensor:

@@ -133,6 +133,9 @@ class Cases:
                     scales=self.model.log_scales.detach().exp(),
                 )
             ),
+            "all but colours frozen": lambda: self.both(
+                Gaussians(**{name: x if name == "colors" else x.detach() for name, x in vars(self.model()).items()})
+            ),
             "harmonics of degree 0": lambda: self.both(changed(colors=self.model.sh_dc)),
             "alpha only": lambda: self.both(self.model(), ("alpha",)),
             "half of the Gaussians dropped": lambda: self.both(changed(opacities=self.model().opacities * half)),
