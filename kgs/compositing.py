@@ -35,7 +35,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .chunks import Band, Rules
-from .covariance import variances, whitening
+from .covariance import columns, variances, whitening
 from .tiles import TileSpans, tile_spans
 from .types import ProjectedGaussians, TileBins
 
@@ -243,13 +243,29 @@ def _table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) ->
 def _from_moments(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:
     """From moments s of dL/d ln alpha, `(n, 6)`, to gradients of means2d, factors and opacities.
 
-    With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 Q M.
+    With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 (Q M).
     """
+    s0, sx, sy, sxx, sxy, syy = columns(rows)
     xx, xy, yy, det = variances(factors, eps2d)
-    q = torch.stack([yy, -xy, -xy, xx], 1).div_(det[:, None]).view(-1, 2, 2)
-    s0, s1, s2 = rows[:, 0], rows[:, 1:3], rows[:, [3, 4, 4, 5]].view(-1, 2, 2)
-    d_means = (q @ s1[:, :, None])[:, :, 0]
-    return d_means, q @ s2 @ q @ factors, s0 / opacities
+
+    def conic(x: Tensor, y: Tensor) -> Tensor:
+        return torch.stack([yy * x - xy * y, xx * y - xy * x]).div_(det)
+
+    x, y = _whitened(factors, eps2d, det)
+    d_factors = conic(sxx * x + sxy * y, sxy * x + syy * y)
+    return conic(sx, sy).t(), d_factors.permute(2, 0, 1), s0 / opacities
+
+
+def _whitened(factors: Tensor, eps2d: float, det: Tensor) -> Tensor:
+    """Q M, `(2, 3, n)`, without the cancellation of a product: a needle's long axis is nearly in the kernel of Q.
+
+    With the rows a, b of M and w = a x b the rows of det Q M are e a + b x w and e b + w x a.
+    """
+    rows = columns(factors).unflatten(0, (2, 3))
+    a, b = rows
+    w = torch.linalg.cross(a, b, dim=0)
+    turned = torch.stack([torch.linalg.cross(b, w, dim=0), torch.linalg.cross(w, a, dim=0)])
+    return turned.add_(rows, alpha=eps2d).div_(det)
 
 
 def _to_images(tiles: Tensor, projected: ProjectedGaussians, spans: TileSpans) -> Tensor:

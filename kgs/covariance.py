@@ -20,7 +20,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
-__all__ = ["conics", "footprint_factors", "rotation_matrices", "variances", "whitening"]
+__all__ = ["columns", "conics", "footprint_factors", "rotation_matrices", "variances", "whitening"]
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -63,9 +63,9 @@ def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
 class _FootprintFactors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-        a, s = _columns(rows), _columns(scales)
+        a, s = columns(rows), columns(scales)
         peak = quats.abs().amax(1)
-        q = _columns(quats).div_(torch.where(peak > 0, peak, 1.0))
+        q = columns(quats).div_(torch.where(peak > 0, peak, 1.0))
         norm = q.square().sum(0).sqrt()
         q.div_(torch.where(norm > 0, norm, 1.0))
         q[0].masked_fill_(norm == 0, 1.0)
@@ -84,7 +84,7 @@ class _FootprintFactors(torch.autograd.Function):
         d_rows: Tensor | None = None
         d_quats: Tensor | None = None
         d_scales: Tensor | None = None
-        g = _columns(grad)
+        g = columns(grad)
         if ctx.needs_input_grad[2]:
             d_scales = (turned * g).unflatten(0, (2, 3)).sum(0).t()
         g = (g.unflatten(0, (2, 3)) * s).flatten(0, 1)
@@ -101,7 +101,7 @@ class _FootprintFactors(torch.autograd.Function):
         return d_rows, d_quats, d_scales
 
 
-def _columns(rows: Tensor) -> Tensor:
+def columns(rows: Tensor) -> Tensor:
     """`(M, ...)` as one contiguous column a number, `(numbers, M)`, in memory of its own."""
     return rows.flatten(1).t().clone(memory_format=torch.contiguous_format)
 
@@ -137,7 +137,7 @@ def _quaternion_gradient(q: Tensor, d: Tensor) -> Tensor:
 
 def variances(factors: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entries xx, xy, yy and determinant of M M^T + eps2d I, each `(M,)`."""
-    a, b = _columns(factors).unflatten(0, (2, 3))
+    a, b = columns(factors).unflatten(0, (2, 3))
     xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
     cross = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     det = _dot(cross, cross) + eps2d * (xx + yy) + eps2d**2
