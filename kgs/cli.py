@@ -99,9 +99,9 @@ def fit(
         out: folder for splat.ply, metrics.json, test/*.png, curve.png, config.json and the checkpoint.
         views: training views, spread over the views that are not held out; all of them unless given.
         downscale: shrink the images by this factor.
-        fast: the same PSNR of test views in a third of the time, with a little less SSIM: fewer steps at higher rates,
+        fast: the same PSNR of test views in a third of the time, with a little less SSIM: half the steps at higher rates,
             most of them on pictures of half the width.
-        steps: iterations, 2000 unless given (900 with --fast); the counts of the recipe (10 000 steps) are scaled to
+        steps: iterations, 2000 unless given (1000 with --fast); the counts of the recipe (10 000 steps) are scaled to
             it.
         drop: final rate of DropGaussian; 0 leaves it out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
