@@ -16,7 +16,7 @@ _EXTRA = {"tyro": "app", "tqdm": "app", "matplotlib": "app", "viser": "view", "p
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command; errors of the user are one line and exit code 2, an interrupted fit ends with 130."""
+    """Run one command; errors of the user are one line and exit code 2, a fit that a signal stopped has 128 + that."""
     try:
         import tyro
 
@@ -33,6 +33,8 @@ def main(arguments: list[str] | None = None) -> None:
         _fail(str(error))
     except TrainingDiverged as error:
         _fail(f"training diverged: {error}", 1)
+    except OSError as error:
+        _fail(str(error), 1)
     except KeyboardInterrupt:
         sys.exit(130)
     sys.exit(code)
@@ -145,10 +147,10 @@ def fit(
     if width * height > 1e6 and device == "cpu":
         megapixels, minutes = width * height / 1e6, width * height * config.steps / 1.5e9
         print(f"{megapixels:.1f} Mpx on a CPU: expect about {minutes:.0f} minutes; see --downscale")
-    metrics, interrupted = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
+    metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
     _print_metrics(metrics)
     print(f"{out / 'splat.ply'}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
-    return 130 if interrupted else 0
+    return 128 + stopped_by if stopped_by else 0
 
 
 def render(
@@ -205,7 +207,7 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
 
 
 def bench(
-    what: Literal["speed", "precision", "training"],
+    what: Literal["speed", "precision", "training", "extremes"],
     /,
     *,
     out: Annotated[Path, _alias("-o")],
@@ -218,7 +220,8 @@ def bench(
     Args:
         what: speed: time and memory of rendering and of training steps, beside what kgs is held to. precision: errors
             of images, gradients and footprints against time. training: test PSNR against time, one knob of the fit at
-            a time, with KGS_DATA on fern too; hours, goes on where it stopped.
+            a time, with KGS_DATA on fern too; hours, goes on where it stopped. extremes: errors, bounds and times of
+            stiff and extreme cases; exit code 1 where a bound is missed.
         out: folder for the results.
         quick: less of it, in about a minute.
         device: cpu, cuda, ... (speed).
@@ -232,6 +235,10 @@ def bench(
         from .bench.precision import measure_precision
 
         measure_precision(out, quick=quick)
+    elif what == "extremes":
+        from .bench.extremes import measure_extremes
+
+        return int(measure_extremes(out, quick=quick)["missed"] > 0)
     else:
         from .bench.training import measure_training
 

@@ -53,8 +53,7 @@ def run_demo(
     runs, renders, curves = {}, {}, {}
     for name, fit in (("without", replace(config, drop=0.0)), ("with", config)):
         trainer = Trainer(scene, fit, points)
-        interrupted = train(trainer, None, title=f"{name:>7} DropGaussian")
-        if interrupted:
+        if train(trainer, None, title=f"{name:>7} DropGaussian"):
             raise KeyboardInterrupt
         runs[name] = measure(trainer)
         renders[f"{name} DropGaussian"] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -17,6 +18,7 @@ from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.ply import save_ply
 
+from .checkpoint import previous
 from .config import FitConfig
 from .evaluate import evaluate
 from .initialize import FirstPoints, first_points
@@ -27,6 +29,7 @@ from .trainer import Trainer
 __all__ = ["CHECKPOINT", "choose_points", "fit_scene", "measure", "train"]
 
 CHECKPOINT = "checkpoint.pt"
+_SAVE_SECONDS = 60.0
 
 
 def fit_scene(
@@ -38,7 +41,7 @@ def fit_scene(
     lpips: Lpips | None = None,
     request: dict[str, Any] | None = None,
     say: Callable[[str], None] = print,
-) -> tuple[dict[str, Any], bool]:
+) -> tuple[dict[str, Any], int]:
     """Fit a scene and write splat.ply, metrics.json, config.json, curve.png, test/*.png and the checkpoint.
 
     Args:
@@ -51,15 +54,16 @@ def fit_scene(
         say: where lines for the user go.
 
     Returns:
-        What metrics.json holds, and whether the fit was interrupted (its results are valid all the same).
+        What metrics.json holds, and the signal that interrupted the fit or 0 (its results are valid all the same).
 
     Raises:
         DataError: the checkpoint is damaged or belongs to another fit.
         TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
+        OSError: a result cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     checkpoint = out / CHECKPOINT
-    if resume and checkpoint.exists():
+    if resume and (checkpoint.exists() or previous(checkpoint).exists()):
         trainer = Trainer.resume(scene, config, checkpoint)
         say(f"resumed at step {trainer.step}")
     else:
@@ -68,6 +72,8 @@ def fit_scene(
         points = choose_points(scene, config)
         say(f"first points: {len(points.points)} ({points.kind})")
         trainer = Trainer(scene, config, points)
+        for old in (checkpoint, previous(checkpoint)):
+            old.unlink(missing_ok=True)
     write_json(
         out / "config.json",
         {
@@ -79,7 +85,7 @@ def fit_scene(
             "extent": trainer.extent,
         },
     )
-    interrupted = train(trainer, checkpoint)
+    stopped_by = train(trainer, checkpoint)
     for note in trainer.notes:
         say(note)
     save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
@@ -89,7 +95,7 @@ def fit_scene(
         write_png(out / "test" / png_name(name), trainer.render(scene.test.camera(i))[0])
     metrics = measure(trainer, lpips)
     write_json(out / "metrics.json", metrics)
-    return metrics, interrupted
+    return metrics, stopped_by
 
 
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
@@ -120,25 +126,49 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
     return found
 
 
-def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> bool:
-    """Train to the end with a progress line; on Ctrl-C finish the step and stop. Returns whether that happened."""
-    total = trainer.config.steps
+def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
+    """Train to the end with a progress line and checkpoints, each minute and at evaluations.
+
+    On Ctrl-C or SIGTERM the step is finished and saved. A checkpoint that cannot be written (a full disk) stops
+    nothing: a note says so, and the next one is tried.
+
+    Returns:
+        The number of the signal that stopped it, 0 for none.
+    """
+    saved = time.monotonic()
+
+    def save() -> None:
+        nonlocal saved
+        saved = time.monotonic()
+        if checkpoint is None:
+            return
+        try:
+            trainer.save(checkpoint)
+        except OSError as error:
+            trainer.notes.append(f"step {trainer.step}: no checkpoint: {error}")
+
     with (
-        _interruptible() as interrupted,
-        tqdm(total=total, initial=trainer.step, desc=title, unit="step", mininterval=0.5, file=sys.stderr) as bar,
+        _interruptible() as stopped,
+        tqdm(
+            total=trainer.config.steps,
+            initial=trainer.step,
+            desc=title,
+            unit="step",
+            mininterval=0.5,
+            file=sys.stderr,
+        ) as bar,
     ):
 
         def after_step(trainer: Trainer, loss: float) -> bool:
             bar.set_postfix(loss=f"{loss:.4f}", gaussians=str(len(trainer.model)), refresh=False)
             bar.update()
-            if checkpoint is not None and trainer.step in trainer.times.evaluate:
-                trainer.save(checkpoint)
-            return interrupted.is_set()
+            if trainer.step in trainer.times.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
+                save()
+            return bool(stopped)
 
         trainer.fit(after_step)
-    if checkpoint is not None:
-        trainer.save(checkpoint)
-    return trainer.step < total
+        save()
+    return stopped[0] if stopped else 0
 
 
 def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
@@ -163,20 +193,22 @@ def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
 
 
 @contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets; a second Ctrl-C interrupts as usual."""
-    event = threading.Event()
+def _interruptible() -> Iterator[list[int]]:
+    """The signals that came: Ctrl-C and SIGTERM are only noted; a second one acts as usual."""
+    came: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield event
+        yield came
         return
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def stop(*_: object) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, before)
+    def note(number: int, _: object) -> None:
+        came.append(number)
+        signal.signal(number, before[signal.Signals(number)])
 
-    signal.signal(signal.SIGINT, stop)
+    for number in before:
+        signal.signal(number, note)
     try:
-        yield event
+        yield came
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

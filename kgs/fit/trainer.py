@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from kgs.losses import TargetMoments, photometric_loss, target_moments
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .checkpoint import load_checkpoint, save_checkpoint
+from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .initialize import FirstPoints, typical_depths
 
@@ -39,6 +39,7 @@ _GROUPS = {
     "sh_dc": "lr_sh_dc",
     "sh_rest": "lr_sh_rest",
 }
+_LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
 
 
 class Trainer:
@@ -58,6 +59,7 @@ class Trainer:
         curve: dicts of step, seconds of training, test_psnr and train_psnr.
         seconds: time spent in training steps; evaluations are not counted.
         notes: lines that a user should read (a capped count, for instance).
+        saved: the last checkpoint that was written or read, in words; "" before the first.
     """
 
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
@@ -76,6 +78,7 @@ class Trainer:
         self.seconds = 0.0
         self.curve: list[dict[str, float | None]] = []
         self.notes: list[str] = []
+        self.saved = ""
         self._stack: list[int] = []
 
     def _build(self, model: GaussianModel, near_plane: float) -> None:
@@ -120,7 +123,8 @@ class Trainer:
                 returns True.
 
         Raises:
-            TrainingDiverged: a loss or gradient is not finite; the parameters are those before that step.
+            TrainingDiverged: a loss, gradient or parameter is not finite, or a scale explodes; no parameter has been
+                changed by that step, and the error names the last good checkpoint.
         """
         while self.step < self.config.steps:
             start = time.perf_counter()
@@ -138,6 +142,7 @@ class Trainer:
                 )
             start = time.perf_counter()
             if step in self.times.densify:
+                self._check_scales()
                 capped = self.densifier.step().capped
                 if capped and not any("max_gaussians" in note for note in self.notes):
                     self.notes.append(
@@ -167,7 +172,11 @@ class Trainer:
         return round(sum(values) / len(values), 4) if values else None
 
     def save(self, path: Path) -> None:
-        """Write everything that the rest of the fit depends on."""
+        """Write everything that the rest of the fit depends on.
+
+        Raises:
+            OSError: the file cannot be written; earlier ones are untouched.
+        """
         save_checkpoint(
             path,
             {
@@ -190,15 +199,18 @@ class Trainer:
                 "drop": None if self.drop is None else self.drop.get_rng_state(),
             },
         )
+        self.saved = f"{path} of step {self.step}"
 
     @classmethod
     def resume(cls, scene: Scene, config: FitConfig, path: Path) -> Trainer:
         """Continue from a checkpoint, bit for bit as if there had been no interruption.
 
+        Where the file is damaged the previous one is taken, and `notes` says so.
+
         Raises:
-            DataError: the file is damaged, or belongs to another scene or configuration.
+            DataError: both files are damaged, or they belong to another scene or configuration.
         """
-        state = load_checkpoint(path)
+        state, damage = newest_checkpoint(path)
         try:
             _check_same(path, "config", state["config"], config.to_dict())
             _check_same(path, "scene", state["scene"], _fingerprint(scene))
@@ -219,6 +231,9 @@ class Trainer:
                 trainer.drop.set_rng_state(state["drop"], trainer.device)
             trainer.step, trainer.seconds = state["step"], state["seconds"]
             trainer.curve, trainer.notes = state["curve"], state["notes"]
+            trainer.saved = f"{path} of step {trainer.step}"
+            if damage:
+                trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         except KeyError as error:
             raise DataError(path, str(error.args[0]), "expected this entry in the checkpoint, got none") from error
         return trainer
@@ -238,8 +253,10 @@ class Trainer:
         out = self.renderer(self.model(), camera, self._background)
         loss = photometric_loss(out.image.clamp(0, 1), target, recipe.dssim_weight, moments=moments)
         value = float(loss.detach())
+        if int(out.projected.num_nonfinite):
+            raise self._diverged("finite parameters", *self._spoilt(self.model.named_parameters()))
         if not math.isfinite(value):
-            raise TrainingDiverged(f"step {self.step}: expected a finite loss, got {value}")
+            raise self._diverged("a finite loss", str(value))
         if loss.requires_grad:
             loss.backward()
             self._check_gradients()
@@ -251,14 +268,32 @@ class Trainer:
         return value
 
     def _check_gradients(self) -> None:
+        """Adam keeps the square of a gradient: one above 1e19 would freeze its parameter for ever."""
         for name, parameter in self.model.named_parameters():
-            if parameter.grad is not None and not math.isfinite(float(parameter.grad.sum())):
-                bad = ~torch.isfinite(parameter.grad).reshape(len(self.model), -1).all(1)
-                if bool(bad.any()):
-                    raise TrainingDiverged(
-                        f"step {self.step}: expected finite gradients, got others for {name} of Gaussian "
-                        f"{int(bad.nonzero()[0, 0])}"
-                    )
+            if parameter.grad is not None and not math.isfinite(float(parameter.grad.square().sum())):
+                squares = {name: parameter.grad.square()}
+                raise self._diverged("gradients below 1e19", *self._spoilt(squares.items()))
+
+    def _check_scales(self) -> None:
+        largest, axis = self.model.log_scales.detach().max(dim=0).values.max(dim=0)
+        if float(largest) > math.log(_LARGEST * self.extent):
+            row = int(self.model.log_scales.detach()[:, int(axis)].argmax())
+            raise self._diverged(
+                f"scales below {_LARGEST:g} times the extent", f"e^{float(largest):.1f} in log_scales of Gaussian {row}"
+            )
+
+    def _spoilt(self, values: Iterable[tuple[str, Tensor]]) -> Iterator[str]:
+        """Where the first number is that is not finite, or overflows when it is activated."""
+        for name, value in values:
+            value = value.detach().exp() if name == "log_scales" else value.detach()
+            rows = (~torch.isfinite(value)).reshape(len(self.model), -1).any(1).nonzero()
+            if len(rows):
+                yield f"others in {name} of Gaussian {int(rows[0, 0])}"
+                return
+
+    def _diverged(self, expected: str, got: str = "others") -> TrainingDiverged:
+        last = f"the last good checkpoint is {self.saved}" if self.saved else "there is no checkpoint yet"
+        return TrainingDiverged(f"step {self.step}: expected {expected}, got {got}; {last}")
 
     def _next_view(self) -> int:
         if not self._stack:
