@@ -5,7 +5,6 @@ Source: Mildenhall et al., NeRF (ECCV 2020); the eight training frames are those
 
 from __future__ import annotations
 
-import math
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -13,10 +12,10 @@ import torch
 from kgs.errors import DataError
 
 from .frames import Frame, PointCloud, build_scene, check_unique, path_inside
-from .images import Intrinsics, read_image
+from .images import Intrinsics, read_size
 from .scene import Scene
 from .splits import BLENDER_TRAIN_FRAMES, select_evenly
-from .transforms import opencv_pose, read_frames, read_number, read_text
+from .transforms import opencv_pose, read_focal, read_frames, read_text
 
 __all__ = ["load_blender"]
 
@@ -60,14 +59,11 @@ def load_blender(
 def _frames(root: Path, split: str) -> list[Frame]:
     source = root / f"transforms_{split}.json"
     data, entries = read_frames(source)
-    angle = read_number(source, "camera_angle_x", data)
-    if not 0 < angle < math.pi:
-        raise DataError(source, "camera_angle_x", f"expected an angle between 0 and pi, got {angle:g}")
     names = [str(PurePosixPath(read_text(source, "file_path", entry))) for entry in entries]
     names = [name if PurePosixPath(name).suffix == ".png" else f"{name}.png" for name in names]
     paths = [path_inside(source, root, name) for name in names]
-    height, width = next((read_image(path).shape[:2] for path in paths if path.is_file()), (1, 1))
-    focal = width / (2 * math.tan(angle / 2))
+    width, height = next((read_size(path) for path in paths if path.is_file()), (1, 1))
+    focal = read_focal(source, width, data)
     lens = Intrinsics(width, height, focal, focal, width / 2, height / 2)
     frames = [
         Frame(source, name, path, lens, opencv_pose(source, entry))

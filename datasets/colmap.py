@@ -53,9 +53,9 @@ def load_colmap(
     for image in images.values():
         if image.camera_id not in cameras:
             raise DataError(images_file, image.name, f"has camera {image.camera_id}, which {cameras_file.name} lacks")
-        path = path_inside(images_file, photos or root, image.name)
+        path = path_inside(images_file, root, image.name, photos)
         if not path.is_file() and (root / image.name).is_file():
-            path = root / image.name
+            path = path_inside(images_file, root, image.name)
         lens = _intrinsics(cameras[image.camera_id])
         frames.append(Frame(images_file, image.name, path, lens, camera_to_world(image)))
     train, test = split_frames(root, frames, train_views)

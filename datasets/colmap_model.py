@@ -160,12 +160,12 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
             _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, _integers))
             if len(image_ids.intersection(track[::2])) >= 2:
                 rows.append(tuple(row))
-    points, colors = np.array([row[:3] for row in rows], np.float64), np.array([row[3:] for row in rows], np.int64)
+    points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")
-    if colors.size and (colors.min() < 0 or colors.max() > 255):
+    if any(not 0 <= value <= 255 for row in rows for value in row[3:]):  # integers of a text have no limit
         raise DataError(path, "", "expected colours from 0 to 255, got others")
-    return points.reshape(-1, 3), colors.reshape(-1, 3).astype(np.uint8)
+    return points, np.array([row[3:] for row in rows], np.uint8).reshape(-1, 3)
 
 
 class _Binary:
@@ -173,7 +173,7 @@ class _Binary:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._data = path.read_bytes()
+        self._data = _read_bytes(path)
         self._at = 0
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
@@ -214,10 +214,17 @@ class _Binary:
             raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
 
 
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+
+
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text model without its comments, stripped; empty ones included."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = _read_bytes(path).decode("utf-8")
     except UnicodeDecodeError as error:
         raise DataError(path, "", "expected text in UTF-8") from error
     return (line.strip() for line in text.split("\n") if not line.startswith("#"))

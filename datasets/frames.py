@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ __all__ = [
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
+_LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares of them are finite in float32
 _FINE_PIXELS = 1_000_000  # of the images for the first points: twice the pixels a side halves the error of the depths
 
 
@@ -51,7 +53,7 @@ class Frame:
         pose: `(4, 4)` float64.
 
     Raises:
-        DataError: a number is not finite, a size or focal length not positive, or the pose no rotation.
+        DataError: a number is not finite or beyond 1e15, a size or focal length not positive, or the pose no rotation.
     """
 
     source: Path
@@ -61,10 +63,11 @@ class Frame:
     pose: Tensor
 
     def __post_init__(self) -> None:
-        lens = self.intrinsics
-        if not np.isfinite((lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)).all():
+        lens, center = self.intrinsics, self.pose[:3, 3]
+        numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+        if not np.isfinite(numbers).all():
             raise DataError(self.source, self.name, "expected finite intrinsics, got NaN or infinity")
-        if not (lens.fx > 0 and lens.fy > 0 and lens.width > 0 and lens.height > 0):
+        if not (min(lens.fx, lens.fy) * _LARGEST >= 1 and lens.width >= 1 and lens.height >= 1):
             raise DataError(
                 self.source,
                 self.name,
@@ -73,9 +76,11 @@ class Frame:
             )
         if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
             raise DataError(self.source, self.name, "expected a finite 4x4 pose")
+        if max(lens.width, lens.height, *map(abs, numbers), float(center.abs().max())) > _LARGEST:
+            raise DataError(self.source, self.name, f"expected intrinsics and a camera centre up to {_LARGEST:g}")
         rotation = self.pose[:3, :3]
         error = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
-        if error > 1e-3 or float(torch.linalg.det(rotation)) < 0:
+        if not (error <= 1e-3 and float(torch.linalg.det(rotation)) > 0):  # the products may be NaN
             raise DataError(self.source, self.name, "expected a pose with a right-handed rotation, got another matrix")
 
 
@@ -97,30 +102,49 @@ class PointCloud:
 NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), "none")
 
 
-def path_inside(source: Path, root: Path, name: str) -> Path:
+def path_inside(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:
     """The path of a file that a description names, which must not lead out of the scene's folder.
 
+    Args:
+        source: the description; errors name it.
+        root: the scene's folder.
+        name: relative to `folder`.
+        folder: inside `root`; None is `root` itself.
+
     Raises:
-        DataError: the name is empty, absolute, or has a part "..".
+        DataError: the name is empty, absolute, has a part "..", or passes through a link that leads out of `root`.
     """
     given = PureWindowsPath(name)  # knows both separators and drives
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
-        raise DataError(source, repr(name), "expected the name of a file inside the scene's folder")
-    return root / name
+        raise DataError(source, repr(name[:200]), "expected the name of a file inside the scene's folder")
+    path = (folder or root) / name
+    try:
+        path.is_file()
+        target = Path(os.path.realpath(path))
+    except (OSError, ValueError) as error:  # too long, or not to be written in the file system's encoding
+        raise DataError(
+            source, repr(name[:200]), f"expected the name of a file, got an impossible one ({error})"
+        ) from error
+    if not target.is_relative_to(os.path.realpath(root)):
+        raise DataError(
+            source, repr(name[:200]), "expected a file inside the scene's folder, got a link that leads out"
+        )
+    return path
 
 
 def check_unique(frames: Sequence[Frame]) -> None:
-    """Raise a DataError where two frames have one name."""
-    name, times = Counter(frame.name for frame in frames).most_common(1)[0]
+    """Raise a DataError where two frames have one photo."""
+    path, times = Counter(frame.path for frame in frames).most_common(1)[0]
     if times > 1:
-        raise DataError(frames[0].source, name, f"expected each image once, got it {times} times")
+        twice = next(frame for frame in frames if frame.path == path)
+        raise DataError(twice.source, twice.name, f"expected each image once, got it {times} times")
 
 
 def split_frames(root: Path, frames: Sequence[Frame], train_views: int | None) -> tuple[list[int], list[int]]:
     """Positions of the training and of the test frames: see `split_by_name`.
 
     Raises:
-        DataError: there are fewer than two frames, or two of one name.
+        DataError: there are fewer than two frames, or two of one photo.
         ValueError: train_views is out of range.
     """
     if len(frames) < 2:
@@ -151,12 +175,14 @@ def build_scene(
         cloud: the layout's own points.
 
     Raises:
-        DataError: photos are missing, unreadable or of several sizes, or a photo does not have the aspect of its
-            intrinsics.
+        DataError: photos are missing, unreadable or of several sizes, a photo does not have the aspect of its
+            intrinsics, or a point is out of range.
     """
     _check_present(root, [frame.path for frame in (*train, *test)])
     color = torch.tensor(BACKGROUNDS[background])
     offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)
+    if not bool((cloud.points.abs() <= _LARGEST).all()):
+        raise DataError(root, "points", f"expected positions up to {_LARGEST:g}, got others")
     train_views = _views(train, offset, downscale, color)
     height, width = train_views.images.shape[-2:]
     fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))

@@ -11,11 +11,25 @@ from numpy.typing import NDArray
 
 from kgs.errors import DataError
 
-__all__ = ["IMAGE_SUFFIXES", "Intrinsics", "image_folder", "list_images", "read_image", "resize", "undistort"]
+from .image_size import image_size
+
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "Intrinsics",
+    "image_folder",
+    "list_images",
+    "read_image",
+    "read_size",
+    "resize",
+    "undistort",
+]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 Image = NDArray[np.float32]
+
+_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+_LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
 
 
 @dataclass(frozen=True)
@@ -77,37 +91,47 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: p.name)
 
 
+def read_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image, from its header alone.
+
+    Raises:
+        DataError: as in :func:`image_size`, or the file cannot be read.
+    """
+    return image_size(path, _read_bytes(path))
+
+
 def read_image(path: Path) -> Image:
     """Read an 8 or 16 bit image as it is stored: a rotation noted in its metadata is not applied.
 
     Args:
-        path: any format that OpenCV reads.
+        path: a PNG, JPEG, WebP, BMP or TIFF image.
 
     Returns:
         RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
 
     Raises:
-        DataError: the file cannot be read, is truncated or holds other numbers than 8 or 16 bit integers.
+        DataError: the file cannot be read, is of another format, truncated or a decompression bomb, or holds other
+            numbers than 8 or 16 bit integers.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+    data = _read_bytes(path)
+    size = image_size(path, data)
     # A JPEG cut short decodes, with its rest in grey: its last scan then has no end marker behind it.
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise DataError(path, "", "the JPEG ends before its image does (a truncated file?)")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise DataError(path, "", f"OpenCV cannot decode this image ({error.err})") from error
     if image is None:
         raise DataError(path, "", "OpenCV cannot decode this as an image (truncated, or no image?)")
     if image.dtype not in (np.uint8, np.uint16):
         raise DataError(path, "", f"expected 8 or 16 bit integers, got {image.dtype}")
-    if image.ndim == 2:
-        image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
-    else:
-        image = cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+    channels = image.shape[2] if image.ndim == 3 else 1
+    if image.shape[1::-1] != size or channels not in _TO_RGB:
+        raise DataError(
+            path, "", f"expected {size} pixels of 1, 3 or 4 channels, got {image.shape[1::-1]} of {channels}"
+        )
+    image = cv2.cvtColor(image, _TO_RGB[channels])
     return np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
 
 
@@ -143,10 +167,12 @@ def undistort(image: Image, intrinsics: Intrinsics) -> tuple[Image, Intrinsics]:
         The pinhole's image and intrinsics; the arguments themselves where there is no distortion.
 
     Raises:
-        ValueError: the coefficients fold the image or map it outside itself.
+        ValueError: the coefficients fold the image or map it outside itself, or the image is too long for OpenCV.
     """
     if not intrinsics.fisheye and not any(intrinsics.distortion):
         return image, replace(intrinsics, distortion=())
+    if max(intrinsics.width, intrinsics.height) > _LONGEST_REMAPPED:
+        raise ValueError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels a side, the image has more")
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
     width, height = intrinsics.width, intrinsics.height
@@ -183,3 +209,10 @@ def _covering_zoom(intrinsics: Intrinsics) -> float:
         middle = (low + high) / 2
         low, high = (low, middle) if covered(middle) else (middle, high)
     return high
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error

@@ -15,7 +15,7 @@ from kgs.errors import DataError
 
 from .colmap import camera_to_world, track_points
 from .colmap_model import find_model, model_file, read_images
-from .frames import NO_POINTS, Frame, PointCloud, build_scene, split_frames
+from .frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
 from .images import Intrinsics, image_folder, list_images
 from .scene import Scene
 
@@ -53,7 +53,7 @@ def load_llff(
     rows = _read_rows(source)
     if folder is None:
         raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")
-    paths = list_images(folder)
+    paths = [path_inside(source, root, path.name, folder) for path in list_images(folder)]
     if len(paths) != len(rows):
         raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")
     frames = [_frame(source, path, row) for path, row in zip(paths, rows, strict=True)]

@@ -5,16 +5,15 @@ Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from kgs.errors import DataError
 
 from .frames import Frame, build_scene, path_inside, split_frames
-from .images import Intrinsics, read_image
+from .images import Intrinsics, read_size
 from .scene import Scene
-from .transforms import opencv_pose, read_frames, read_number, read_text
+from .transforms import opencv_pose, read_focal, read_frames, read_number, read_text
 
 __all__ = ["load_nerfstudio"]
 
@@ -53,7 +52,7 @@ def load_nerfstudio(
     data, entries = read_frames(source)
     names = [str(PurePosixPath(read_text(source, "file_path", entry))) for entry in entries]
     paths = [path_inside(source, root, name) for name in names]
-    size = next((read_image(path).shape[1::-1] for path in paths if path.is_file()), (1, 1))
+    size = next((read_size(path) for path in paths if path.is_file()), (1, 1))
     frames = [
         Frame(source, name, path, _intrinsics(source, entry, data, size), opencv_pose(source, entry))
         for name, path, entry in zip(names, paths, entries, strict=True)
@@ -75,13 +74,8 @@ def _intrinsics(source: Path, frame: dict[str, Any], data: dict[str, Any], size:
     width, height = number("w", size[0]), number("h", size[1])
     if not (width.is_integer() and height.is_integer()):
         raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
-    if any("fl_x" in item for item in (frame, data)):
-        fx = number("fl_x")
-    else:
-        angle = number("camera_angle_x")
-        if not 0 < angle < math.pi:
-            raise DataError(source, "camera_angle_x", f"expected an angle between 0 and pi, got {angle:g}")
-        fx = width / (2 * math.tan(angle / 2))
+    has_focal = any("fl_x" in item for item in (frame, data))
+    fx = number("fl_x") if has_focal else read_focal(source, width, frame, data)
     fisheye = model == _FISHEYE
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     return Intrinsics(

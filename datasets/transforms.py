@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
+import math
 from pathlib import Path
-from typing import Any, NoReturn, TypeGuard
+from typing import Any, TypeGuard
 
 import kornia.geometry as kg
 import torch
 from torch import Tensor
 
 from kgs.errors import DataError
+from kgs.json_files import read_json
 
-__all__ = ["opencv_pose", "read_frames", "read_number", "read_text"]
-
-_MOST_BYTES = 256 * 2**20
+__all__ = ["opencv_pose", "read_focal", "read_frames", "read_number", "read_text"]
 
 
 def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -24,21 +23,10 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         The whole object, and its list of frames, not empty.
 
     Raises:
-        DataError: the file is missing, too large, no JSON (NaN and Infinity are none), or has no list of frames.
+        DataError: the file cannot be read, see :func:`kgs.json_files.read_json`, or has no list of frames.
     """
-
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"{constant} is not a number of JSON")
-
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
-        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(path, "", f"is no JSON that can be read ({error})") from error
-    frames = data.get("frames") if isinstance(data, dict) else None
+    data = read_json(path)
+    frames = data.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(path, "frames", "expected a list of objects, not empty")
     return data, frames
@@ -68,19 +56,31 @@ def read_text(path: Path, key: str, *objects: dict[str, Any], default: str | Non
     return value
 
 
+def read_focal(path: Path, width: float, *objects: dict[str, Any]) -> float:
+    """The focal length in pixels that `camera_angle_x`, the horizontal field of view, gives images of a width.
+
+    Raises:
+        DataError: there is no angle between 0 and pi.
+    """
+    angle = read_number(path, "camera_angle_x", *objects)
+    if not 0 < angle / 2 < math.pi / 2:
+        raise DataError(path, "camera_angle_x", f"expected an angle between 0 and pi, got {angle:g}")
+    return width / (2 * math.tan(angle / 2))
+
+
 def opencv_pose(path: Path, frame: dict[str, Any]) -> Tensor:
     """A frame's `transform_matrix`, given with OpenGL axes, as camera-to-world with OpenCV axes, `(4, 4)` float64.
 
     Raises:
         DataError: it is no 4x4 matrix of finite numbers with the last row 0, 0, 0, 1.
     """
-    rows, name = frame.get("transform_matrix"), f"transform_matrix of {frame.get('file_path')}"
-    numbers = [x for row in rows if isinstance(row, list) for x in row] if isinstance(rows, list) else []
-    if len(numbers) != 16 or len(rows or ()) != 4 or not all(_is_finite(x) for x in numbers):
+    rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
+    rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
+    if len(rows) != 4 or not all(_is_finite(x) for row in rows for x in row):
         raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
-    matrix = torch.tensor(numbers, dtype=torch.float64).reshape(1, 4, 4)
+    matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
     if matrix[0, 3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {numbers[12:]}")
+        raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {matrix[0, 3].tolist()}")
     return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -26,6 +27,7 @@ __all__ = ["load_ply", "save_ply"]
 
 MAX_HEADER = 1 << 16
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_SPACE, _PART = re.compile(rb"\s"), 1 << 16
 SCALARS = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
@@ -214,21 +216,41 @@ def _read_columns(path: Path, header: _Header, vertex: _Element, body: bytes) ->
     before = header.elements[: header.elements.index(vertex)]
     if vertex.has_list or any(element.has_list for element in before):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
-    ascii_words = body.split() if header.order == "ascii" else None
-    available = len(body) if ascii_words is None else len(ascii_words)
+    available = len(body) if header.order != "ascii" else sum(map(len, _words(body)))
     start = sum(element.count * element.width(header.order) for element in before)
     end = start + vertex.count * vertex.width(header.order)
     rest = header.elements[len(before) + 1 :]
     total = end + sum(element.count * element.width(header.order) for element in rest)
     if available < end or (available != total and not any(element.has_list for element in rest)):
-        unit = "bytes" if ascii_words is None else "numbers"
+        unit = "numbers" if header.order == "ascii" else "bytes"
         raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
-    if ascii_words is None:
-        record = vertex.dtype(header.order)
-        rows = np.ndarray(vertex.count, record, buffer=body, offset=start)
-        return {name: rows[name] for name in vertex.properties}
-    try:
-        numbers = np.fromiter(map(float, ascii_words[start:end]), np.float64, end - start)
-    except ValueError as error:
-        raise DataError(path, "vertex", str(error)) from error
-    return dict(zip(vertex.properties, numbers.reshape(vertex.count, len(vertex.properties)).T, strict=True))
+    if header.order == "ascii":
+        table = _numbers(path, body, start, end).reshape(vertex.count, len(vertex.properties))
+        return dict(zip(vertex.properties, table.T, strict=True))
+    rows = np.ndarray(vertex.count, vertex.dtype(header.order), buffer=body, offset=start)
+    return {name: rows[name] for name in vertex.properties}
+
+
+def _words(body: bytes) -> Iterator[list[bytes]]:
+    """The words of a text, a part at a time: a list of all would take many times the memory of the text."""
+    begin = 0
+    while begin < len(body):
+        match = _SPACE.search(body, begin + _PART)
+        end = match.start() if match else len(body)
+        yield body[begin:end].split()
+        begin = end
+
+
+def _numbers(path: Path, body: bytes, start: int, end: int) -> NDArray[np.float32]:
+    """The words from `start` to `end` as numbers."""
+    numbers, at = np.empty(end - start, np.float32), 0
+    for words in _words(body):
+        first, last = max(start, at), min(end, at + len(words))
+        try:
+            with np.errstate(over="ignore"):
+                if first < last:
+                    numbers[first - start : last - start] = [float(word) for word in words[first - at : last - at]]
+        except ValueError as error:
+            raise DataError(path, "vertex", str(error)[:200]) from error
+        at += len(words)
+    return numbers

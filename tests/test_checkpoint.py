@@ -1,3 +1,7 @@
+import hashlib
+import io
+import pickle
+
 import pytest
 import torch
 
@@ -11,12 +15,23 @@ def path(tmp_path):
 
 
 def test_values_come_back(path):
-    state = {"step": 3, "names": ["a"], "nested": {"x": torch.arange(5), "none": None}}
+    state = {"step": 3, "names": ["a"], 7: (0.1, True), "nested": {"x": torch.arange(5), "none": None}}
     save_checkpoint(path, state)
     back = load_checkpoint(path)
     assert torch.equal(back["nested"].pop("x"), state["nested"].pop("x"))
     assert back == state
     assert [p.name for p in path.parent.iterdir()] == ["checkpoint.pt"]
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int32, torch.int64, torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(), (0, 3), (2, 3)])
+def test_tensors_come_back_bit_for_bit(path, dtype, shape):
+    value = (torch.rand(shape, dtype=torch.float64) * 100).to(dtype)
+    save_checkpoint(path, {"first": value, "second": value.mT if value.ndim > 1 else value})
+    back = load_checkpoint(path)
+    assert back["first"].dtype == dtype
+    assert torch.equal(back["first"], value)
+    assert torch.equal(back["second"], value.mT if value.ndim > 1 else value)
 
 
 def test_every_flipped_byte_is_found(path):
@@ -42,15 +57,70 @@ def test_missing_file_is_named(path):
         load_checkpoint(path)
 
 
-def test_code_is_never_run(path, tmp_path):
+def sealed(body):
+    return b"kgs-checkpoint 2 " + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+def test_code_is_neither_written_nor_read(path, tmp_path):
     class Attack:
         def __reduce__(self):
             return (open, (str(tmp_path / "touched"), "w"))
 
-    save_checkpoint(path, {"x": Attack()})
-    with pytest.raises(Exception, match="weights_only|Unsupported"):
-        load_checkpoint(path)
+    with pytest.raises(TypeError, match="Attack"):
+        save_checkpoint(path, {"x": Attack()})
+    attack = io.BytesIO()
+    torch.save({"x": Attack()}, attack)
+    for content in (attack.getvalue(), pickle.dumps(Attack()), pickle.dumps({"x": 1})[:-3]):
+        path.write_bytes(sealed(content))
+        with pytest.raises(DataError, match="description"):
+            load_checkpoint(path)
     assert not (tmp_path / "touched").exists()
+
+
+def test_checkpoints_of_another_version_say_so(path):
+    path.write_bytes(b"kgs-checkpoint 1 " + b"0" * 64 + b"\nPK")
+    with pytest.raises(DataError, match="another version"):
+        load_checkpoint(path)
+
+
+def tensor(shape, name="float32"):
+    return f'{{"dict":[["x",{{"tensor":"{name}","shape":{shape}}}]]}}'
+
+
+@pytest.mark.parametrize(
+    ("description", "data", "reason"),
+    [
+        (tensor("[3]"), bytes(11), "needs 12 bytes"),
+        (tensor("[3]"), bytes(13), "1 bytes are left over"),
+        (tensor("[1000000000000]"), bytes(12), "needs 4000000000000 bytes"),
+        (tensor("[0,1000000000000000000000]"), b"", "shape"),
+        (tensor("[-1,-1]"), bytes(4), "shape"),
+        (tensor("[true]"), bytes(4), "shape"),
+        (tensor("[1]", "object"), bytes(8), "value of a checkpoint"),
+        (tensor("[1]"), b"\0\0\xc0\x7f", "finite"),
+        ('{"dict":[["x",NaN]]}', b"", "finite"),
+        ('{"dict":[["x",1e400]]}', b"", "finite"),
+        ('{"dict":[["x"]]}', b"", "value of a checkpoint"),
+        ('{"dict":[],"tuple":[]}', b"", "value of a checkpoint"),
+        ("[1]", b"", "expected a dict"),
+        ("[" * 100_000, b"", "nested too deep"),
+        ("", b"", "Expecting value"),
+        ("\xff", b"", "description"),
+    ],
+)
+def test_a_right_checksum_is_not_trusted(path, description, data, reason):
+    path.write_bytes(sealed(description.encode("latin-1") + b"\n" + data))
+    with pytest.raises(DataError, match=reason):
+        load_checkpoint(path)
+
+
+def test_values_that_a_checkpoint_cannot_hold_are_not_written(path):
+    for value in (torch.zeros(2, dtype=torch.complex64), {1, 2}, b"bytes"):
+        with pytest.raises(TypeError, match="state: expected"):
+            save_checkpoint(path, {"x": value})
+    with pytest.raises(ValueError, match="JSON"):
+        save_checkpoint(path, {"x": float("nan")})
+    assert not path.exists()
 
 
 def test_a_failed_write_leaves_the_old_file(path, monkeypatch):

@@ -98,7 +98,7 @@ def _fit(out: Path, limit: int | None) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
         return evaluate(trainer, views) if trainer.step == trainer.config.steps else None
 
-    Trainer.psnr = psnr  # type: ignore[method-assign]
+    Trainer.psnr = psnr  # type: ignore[assignment,method-assign]
     _, stopped_by = run.fit_scene(scene, replace(CONFIG, init="random"), out, resume=True, say=lambda line: None)
     if stopped_by:
         os._exit(128 + stopped_by)

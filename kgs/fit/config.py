@@ -6,7 +6,7 @@ another densification threshold and without pruning by size.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from typing import Any
 __all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
 
 _MIN_DENSIFICATIONS = 20
+_MOST_STEPS = 10_000_000
+_SEEDS = 2**59  # ten times a seed is one of torch's
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,12 @@ class Recipe:
     reset_recovery: int = 300
     near_plane: float = 0.05
 
+    def __post_init__(self) -> None:
+        _check_types(self)
+        for name in ("steps", "sh_interval", "densify_interval", "reset_interval", "lr_means", "lr_means_final"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -99,9 +107,14 @@ class FitConfig:
     recipe: Recipe = field(default_factory=Recipe)
 
     def __post_init__(self) -> None:
-        for name, low in (("steps", 1), ("evaluations", 1)):
-            if getattr(self, name) < low:
-                raise ValueError(f"{name}: expected at least {low}, got {getattr(self, name)}")
+        _check_types(self)
+        for name in ("steps", "evaluations"):
+            if not 1 <= getattr(self, name) <= _MOST_STEPS:
+                raise ValueError(f"{name}: expected at least 1 and at most {_MOST_STEPS}, got {getattr(self, name)}")
+        if not isinstance(self.max_gaussians, int | None):
+            raise ValueError(f"max_gaussians: expected a whole number, got {self.max_gaussians!r}")
+        if abs(self.seed) >= _SEEDS:
+            raise ValueError(f"seed: expected a number below 2^59, got {self.seed}")
         if not 0.0 <= self.drop < 1.0:
             raise ValueError(f"drop: expected a rate in [0, 1), got {self.drop}")
         if not 0.0 <= self.coarse <= 1.0:
@@ -122,26 +135,16 @@ class FitConfig:
         Raises:
             ValueError: an entry is unknown or out of range.
         """
+        if not isinstance(values, dict) or not isinstance(values.get("recipe", {}), dict):
+            raise ValueError("values: expected the entries of a FitConfig, got others")
+        init_file = values.get("init_file")
+        if not isinstance(init_file, str | None):
+            raise ValueError(f"init_file: expected a path, got {init_file!r}")
         try:
-            init_file = values.get("init_file")
-            return cls(
-                **{
-                    **values,
-                    "init_file": None if init_file is None else Path(init_file),
-                    "recipe": Recipe(**values.get("recipe", {})),
-                }
-            )
+            recipe = Recipe(**values.get("recipe", {}))
+            return cls(**{**values, "init_file": None if init_file is None else Path(init_file), "recipe": recipe})
         except TypeError as error:
             raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
-
-
-# A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps, hence
-# Gaussians, at twice the rates, and four in five of them on a quarter of the pixels.
-FAST = FitConfig(
-    steps=1000,
-    coarse=0.8,
-    recipe=Recipe(lr_means=3e-4, lr_scales=0.01, lr_sh_dc=0.005, lr_sh_rest=2.5e-4),
-)
 
 
 @dataclass(frozen=True)
@@ -183,3 +186,24 @@ def timetable(config: FitConfig) -> Timetable:
     return Timetable(
         tuple(max(1, step) for step in sh), densify, reset, tuple(sorted(evaluate)), round(config.coarse * steps)
     )
+
+
+def _check_types(config: FitConfig | Recipe) -> None:
+    """Raise a ValueError where an entry is not of its default's kind: a whole number, a finite number or a text."""
+    for entry in fields(config):
+        value, default = getattr(config, entry.name), entry.default
+        if isinstance(default, float):
+            is_right = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+        else:
+            is_right = type(default) not in (int, str) or type(value) is type(default)
+        if not is_right:
+            raise ValueError(f"{entry.name}: expected a value like {default!r}, got {str(value)[:60]!r}")
+
+
+# A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps, hence
+# Gaussians, at twice the rates, and four in five of them on a quarter of the pixels.
+FAST = FitConfig(
+    steps=1000,
+    coarse=0.8,
+    recipe=Recipe(lr_means=3e-4, lr_scales=0.01, lr_sh_dc=0.005, lr_sh_rest=2.5e-4),
+)

@@ -10,14 +10,15 @@ where u_l are the features after the last ReLU of block l, scaled to unit length
 
 from __future__ import annotations
 
+import math
 import zipfile
-import zlib
 from os import PathLike
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from kgs.errors import DataError
@@ -167,17 +168,37 @@ def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
     field = ""
     weights = {}
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with zipfile.ZipFile(path) as archive:
             for field, shape in shapes.items():
-                if field not in arrays:
-                    raise DataError(path, field, f"expected an array of shape {shape}, got none")
-                array = arrays[field]
-                if array.shape != shape or not np.issubdtype(array.dtype, np.floating):
-                    raise DataError(path, field, f"expected floats of shape {shape}, got {array.dtype} {array.shape}")
-                with np.errstate(over="ignore"):
-                    weights[field] = torch.from_numpy(array.astype(np.float32))
-                if not bool(weights[field].isfinite().all()):
-                    raise DataError(path, field, "expected finite numbers in the range of float32, got others")
-    except (OSError, EOFError, ValueError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(path, field, f"expected a readable npz file, got {error}") from error
+                weights[field] = torch.from_numpy(_read_array(path, archive, field, shape))
+    except DataError:
+        raise
+    except Exception as error:  # damaged bytes raise whatever zipfile, its codecs and numpy's parser of headers raise
+        raise DataError(path, field, f"expected a readable npz file, got {error!r}") from error
     return weights
+
+
+def _read_array(path: Path, archive: zipfile.ZipFile, field: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """One array, its header and its size checked before its numbers are unpacked."""
+    if f"{field}.npy" not in archive.namelist():
+        raise DataError(path, field, f"expected an array of shape {shape}, got none")
+    with archive.open(f"{field}.npy") as file:
+        version = np.lib.format.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise DataError(path, field, f"expected an npy file of version 1 or 2, got {version}")
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        got, is_fortran, dtype = read_header(file)
+        if got != shape or dtype.kind != "f":
+            raise DataError(path, field, f"expected floats of shape {shape}, got {dtype} {got}")
+        size = math.prod(shape) * dtype.itemsize
+        data = file.read(size + 1)
+    if len(data) != size:
+        raise DataError(
+            path, field, f"expected {size} bytes of numbers, got {'more' if len(data) > size else len(data)}"
+        )
+    array = np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C")
+    with np.errstate(over="ignore"):
+        numbers = np.array(array, np.float32, order="C")
+    if not np.isfinite(numbers).all():
+        raise DataError(path, field, "expected finite numbers in the range of float32, got others")
+    return numbers

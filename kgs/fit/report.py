@@ -19,6 +19,7 @@ from torch import Tensor
 from kgs import __version__
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
+from kgs.json_files import read_json
 
 from .trainer import Trainer
 
@@ -82,25 +83,8 @@ def peak_rss_mb() -> int:
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
     temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(temporary, path)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        DataError: the file is missing or holds something else.
-    """
-    try:
-        value = json.loads(path.read_text())
-    except OSError as error:
-        raise DataError(path, "", f"expected a JSON file, got {error.strerror}") from error
-    except ValueError as error:
-        raise DataError(path, "", f"expected JSON, got {error}") from error
-    if not isinstance(value, dict):
-        raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
-    return value
 
 
 def png_name(view: str) -> str:

@@ -28,6 +28,7 @@ from kgs.renderer import GaussianRenderer
 from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .initialize import FirstPoints, typical_depths
+from .state import check_optimizer, check_state, fingerprint
 
 __all__ = ["Trainer", "move_camera"]
 
@@ -181,7 +182,7 @@ class Trainer:
             path,
             {
                 "config": self.config.to_dict(),
-                "scene": _fingerprint(self.scene),
+                "scene": fingerprint(self.scene),
                 "init": self.init,
                 "step": self.step,
                 "seconds": self.seconds,
@@ -211,32 +212,37 @@ class Trainer:
             DataError: both files are damaged, or they belong to another scene or configuration.
         """
         state, damage = newest_checkpoint(path)
+        check_state(path, state, scene, config)
+        trainer = cls.__new__(cls)
+        trainer.scene, trainer.config, trainer.device = scene, config, torch.device(config.device)
+        trainer.init, trainer.extent, trainer.max_gaussians = state["init"], state["extent"], state["max_gaussians"]
         try:
-            _check_same(path, "config", state["config"], config.to_dict())
-            _check_same(path, "scene", state["scene"], _fingerprint(scene))
-            trainer = cls.__new__(cls)
-            trainer.scene, trainer.config, trainer.device = scene, config, torch.device(config.device)
-            trainer.init, trainer.extent, trainer.max_gaussians = (
-                state["init"],
-                state["extent"],
-                state["max_gaussians"],
-            )
             model = GaussianModel(**state["model"], sh_degree=state["sh_degree"])
-            trainer._build(model, state["near_plane"])
-            trainer.optimizer.load_state_dict(state["optimizer"])
-            trainer.densifier.load_state_dict(state["densifier"])
-            trainer._order.set_state(state["order"])
-            trainer._stack = state["stack"]
-            if trainer.drop is not None:
-                trainer.drop.set_rng_state(state["drop"], trainer.device)
-            trainer.step, trainer.seconds = state["step"], state["seconds"]
-            trainer.curve, trainer.notes = state["curve"], state["notes"]
-            trainer.saved = f"{path} of step {trainer.step}"
-            if damage:
-                trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
+        except (TypeError, ValueError) as error:
+            raise DataError(path, "model", str(error)) from error
+        trainer._build(model, state["near_plane"])
+        try:
+            trainer._restore(state)
         except KeyError as error:
             raise DataError(path, str(error.args[0]), "expected this entry in the checkpoint, got none") from error
+        except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+            raise DataError(path, "state", str(error)) from error
+        trainer.step, trainer.seconds = state["step"], state["seconds"]
+        trainer.curve, trainer.notes, trainer._stack = state["curve"], state["notes"], state["stack"]
+        trainer.saved = f"{path} of step {trainer.step}"
+        if damage:
+            trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         return trainer
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        """Bring the optimiser, the densifier and the random streams to where a checkpoint left them."""
+        groups = self.optimizer.state_dict()["param_groups"]  # they follow from the configuration
+        self.optimizer.load_state_dict({"state": state["optimizer"]["state"], "param_groups": groups})
+        check_optimizer(self.optimizer)
+        self.densifier.load_state_dict(state["densifier"])
+        self._order.set_state(state["order"])
+        if self.drop is not None:
+            self.drop.set_rng_state(state["drop"], self.device)
 
     def _train_step(self) -> float:
         config, recipe = self.config, self.config.recipe
@@ -308,19 +314,3 @@ def _seed(config: FitConfig, stream: int) -> int:
 def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     """The same camera on another device."""
     return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
-
-
-def _fingerprint(scene: Scene) -> dict[str, Any]:
-    views = scene.train
-    return {
-        "names": list(views.names),
-        "size": list(views.images.shape[-2:]),
-        "images": float(views.images.double().mean()),
-        "cameras": float(views.cameras.extrinsics.double().sum() + views.cameras.intrinsics.double().sum()),
-    }
-
-
-def _check_same(path: Path, field: str, saved: dict[str, Any], asked: dict[str, Any]) -> None:
-    for key, value in asked.items():
-        if key not in saved or saved[key] != value:
-            raise DataError(path, f"{field}.{key}", f"expected {value!r} as asked for now, got {saved.get(key)!r}")

@@ -1,0 +1,164 @@
+"""The readers of scenes, each with a tiny valid scene: three photos of 16 x 12 pixels and one point."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from kgs.datasets import Scene, Views, load_scene
+
+from .mutations import mutate_bytes, mutate_json, mutate_words
+from .readers import Reader, Target, Unsound, check_range
+
+__all__ = ["SCENE_READERS", "write_colmap"]
+
+_SIZE = (16, 12)
+_NAMES = ("0.png", "1.png", "2.png")
+_TURN = (0.998, 0.02, -0.05, 0.03)  # of the second photo, w x y z, not of unit length
+_OPENCV = (14.0, 14.5, 8.2, 6.1, -0.05, 0.01, 0.001, -0.001)
+_RADIAL = (14.0, 8.0, 6.0, -0.02)
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise Unsound where a scene holds numbers that are not finite or not valid."""
+    for views in filter(None, (scene.train, scene.test, scene.finer)):
+        _check_views(views)
+    check_range("points", scene.points)
+    check_range("point_colors", scene.point_colors, 0, 1)
+    check_range("offset", scene.offset)
+    check_range("background", scene.background, 0, 1)
+
+
+def _check_views(views: Views) -> None:
+    check_range("images", views.images, 0, 1)
+    if views.masks is not None:
+        check_range("masks", views.masks, 0, 1)
+    check_range("intrinsics", views.cameras.intrinsics)
+    check_range("extrinsics", views.cameras.extrinsics)
+    check_range("focal lengths", torch.stack([views.cameras.fx, views.cameras.fy]), 1e-30)
+    rotation = views.cameras.extrinsics[:, :3, :3].double()
+    if float((rotation.mT @ rotation - torch.eye(3)).abs().max()) > 1e-5 or float(torch.linalg.det(rotation).min()) < 0:
+        raise Unsound("extrinsics: expected right-handed rotations")
+    if len(set(views.names)) < len(views.names):
+        raise Unsound("names: expected each one once")
+
+
+def _write_photos(folder: Path, channels: int = 3) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(0).integers(0, 255, (len(_NAMES), *_SIZE[::-1], channels), np.uint8)
+    for name, image in zip(_NAMES, noise, strict=True):
+        cv2.imwrite(str(folder / name), image)
+
+
+def _write_llff(root: Path) -> None:
+    rows = np.tile(np.array([0, 1, 0, 0, 12, 1, 0, 0, 0, 16, 0, 0, -1, 0, 14, 1, 9], dtype=float), (3, 1))
+    rows[:, 3] = (0, 0.5, 1)
+    np.save(root / "poses_bounds.npy", rows)
+    _write_photos(root / "images")
+
+
+def write_colmap(root: Path, text: bool = False) -> None:
+    """Two lenses, three photos, two points; as COLMAP writes them."""
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True)
+    _write_photos(root / "images")
+    cameras = {1: ("OPENCV", 4, _OPENCV), 2: ("SIMPLE_RADIAL", 2, _RADIAL)}
+    poses = [
+        ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        (_TURN, (0.5, 0.0, 0.1)),
+        ((-1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ]
+    images = [(i + 1, quat, shift, 1 + i % 2, _NAMES[i]) for i, (quat, shift) in enumerate(poses)]
+    points = [(7, (0.1, 0.2, 5.0), (255, 0, 51), (1, 0, 2, 0, 3, 0)), (8, (0.3, -0.2, 6.0), (1, 2, 3), (2, 1, 3, 1))]
+    if text:
+        lens = [f"{i} {name} 16 12 {_words(numbers)}" for i, (name, _, numbers) in cameras.items()]
+        pose = [
+            f"{i} {_words(q)} {_words(t)} {camera} {name}\n3.5 4.5 7 5.5 6.5 -1" for i, q, t, camera, name in images
+        ]
+        dots = [f"{i} {_words(xyz)} {_words(rgb)} 0.5 {_words(track)}" for i, xyz, rgb, track in points]
+        for stem, lines in (("cameras", lens), ("images", pose), ("points3D", dots)):
+            (folder / f"{stem}.txt").write_text("\n".join([f"# {stem}", *lines, ""]))
+        return
+    data = struct.pack("<Q", 2)
+    for i, (_, model, numbers) in cameras.items():
+        data += struct.pack(f"<IiQQ{len(numbers)}d", i, model, 16, 12, *numbers)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", 3)
+    for i, quat, shift, camera, name in images:
+        data += struct.pack("<I7dI", i, *quat, *shift, camera) + name.encode() + b"\0"
+        data += struct.pack("<Qddqddq", 2, 3.5, 4.5, 7, 5.5, 6.5, -1)
+    (folder / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", 2)
+    for i, xyz, rgb, track in points:
+        data += struct.pack(f"<Q3d3BdQ{len(track)}I", i, *xyz, *rgb, 0.5, len(track) // 2, *track)
+    (folder / "points3D.bin").write_bytes(data)
+
+
+def _words(numbers: tuple[float, ...]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def _matrix(i: int) -> list[list[float]]:
+    """Camera-to-world, turned a little about y and moved along x."""
+    c, s = math.cos(0.1 * i), math.sin(0.1 * i)
+    return [[c, 0.0, s, 0.5 * i], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, 4.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def _write_blender(root: Path) -> None:
+    for split in ("train", "test"):
+        _write_photos(root / split, channels=4)
+        frames = [{"file_path": f"./{split}/{i}", "transform_matrix": _matrix(i)} for i in range(3)]
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+
+
+def _write_nerfstudio(root: Path) -> None:
+    _write_photos(root / "images")
+    lens: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "fl_x": 14.0,
+        "fl_y": 14.5,
+        "cx": 8.2,
+        "cy": 6.1,
+        "w": 16,
+        "h": 12,
+    }
+    frames: list[dict[str, Any]] = [{"file_path": f"images/{i}.png", "transform_matrix": _matrix(i)} for i in range(3)]
+    frames[1] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
+    (root / "transforms.json").write_text(json.dumps({**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001, "frames": frames}))
+
+
+def _read(root: Path, points: str = "none", downscale: float | None = None) -> None:
+    check_scene(load_scene(root, downscale=downscale, points=points))
+
+
+_MODEL = ("cameras", "images", "points3D")
+SCENE_READERS = (
+    Reader("LLFF", _write_llff, partial(_read, downscale=2), (Target("poses_bounds.npy", mutate_bytes),)),
+    Reader(
+        "COLMAP, binary",
+        write_colmap,
+        partial(_read, points="model-points"),
+        tuple(Target(f"sparse/0/{stem}.bin", mutate_bytes) for stem in _MODEL),
+    ),
+    Reader(
+        "COLMAP, text",
+        partial(write_colmap, text=True),
+        partial(_read, points="model-points"),
+        tuple(Target(f"sparse/0/{stem}.txt", mutate_words) for stem in _MODEL),
+    ),
+    Reader(
+        "Blender",
+        _write_blender,
+        partial(_read, downscale=1.5),
+        tuple(Target(f"transforms_{split}.json", mutate_json) for split in ("train", "test")),
+    ),
+    Reader("nerfstudio", _write_nerfstudio, _read, (Target("transforms.json", mutate_json),)),
+)

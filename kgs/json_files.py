@@ -1,0 +1,55 @@
+"""JSON from files that nobody vouches for: every number finite, a limit on the size, one kind of error."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from .errors import DataError
+
+__all__ = ["parse_json", "read_json"]
+
+_MOST_BYTES = 64 * 2**20
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object from UTF-8 text.
+
+    Integers may be of any size; where a key is there twice, the last one counts.
+
+    Raises:
+        DataError: the file is missing, larger than 64 MiB, no JSON (NaN and Infinity are none), nested too deep, holds
+            a number beyond float64, or is no object.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
+        value = parse_json(path.read_bytes())
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise DataError(path, "", f"is no JSON that can be read ({error})") from error
+    if not isinstance(value, dict):
+        raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
+    return value
+
+
+def parse_json(text: bytes) -> Any:
+    """The value that UTF-8 text stands for.
+
+    Raises:
+        ValueError: it is no JSON (NaN and Infinity are none), nested too deep, or holds a number beyond float64.
+    """
+    try:
+        return json.loads(text.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:60]} is not a finite number")
+    return number
