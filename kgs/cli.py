@@ -175,7 +175,13 @@ def render(
     """
     from .fit.render import render_views
 
-    request = {"scene": str(cameras), "train_views": None, "downscale": downscale, "background": background}
+    request = {
+        "scene": str(cameras),
+        "train_views": None,
+        "downscale": downscale,
+        "background": background,
+        "points": "none",
+    }
     count = render_views(ply, _load(request), out, device)
     print(f"{count} pictures in {out}")
     return 0
@@ -189,25 +195,24 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         device: cpu, cuda, ...
     """
-    from .fit.config import FitConfig
-    from .fit.report import read_json, write_json
+    from .fit.report import write_json
     from .fit.run import CHECKPOINT, measure
+    from .fit.settings import read_settings
     from .fit.trainer import Trainer
+    from .json_files import read_json
 
     lpips = _load_lpips(lpips_weights, device)
-    settings = read_json(out / "config.json")
-    try:
-        scene, config = _load(settings["request"]), FitConfig.from_dict(settings["fit"] | {"device": device})
-    except KeyError as error:
-        raise DataError(out / "config.json", str(error.args[0]), "expected this entry, got none") from error
-    metrics = read_json(out / "metrics.json") | measure(Trainer.resume(scene, config, out / CHECKPOINT), lpips)
+    request, config = read_settings(out / "config.json")
+    metrics = read_json(out / "metrics.json")
+    trainer = Trainer.resume(_load(request), replace(config, device=device), out / CHECKPOINT)
+    metrics |= measure(trainer, lpips)
     write_json(out / "metrics.json", metrics)
     _print_metrics(metrics)
     return 0
 
 
 def bench(
-    what: Literal["speed", "precision", "training", "extremes"],
+    what: Literal["speed", "precision", "training", "extremes", "hostile", "faults"],
     /,
     *,
     out: Annotated[Path, _alias("-o")],
@@ -221,7 +226,8 @@ def bench(
         what: speed: time and memory of rendering and of training steps, beside what kgs is held to. precision: errors
             of images, gradients and footprints against time. training: test PSNR against time, one knob of the fit at
             a time, with KGS_DATA on fern too; hours, goes on where it stopped. extremes: errors, bounds and times of
-            stiff and extreme cases; exit code 1 where a bound is missed.
+            stiff and extreme cases. hostile: damaged files against every reader. faults: fits that are killed, or whose
+            disk is full, and memory over many steps. The last three end with exit code 1 where a promise is broken.
         out: folder for the results.
         quick: less of it, in about a minute.
         device: cpu, cuda, ... (speed).
@@ -235,14 +241,22 @@ def bench(
         from .bench.precision import measure_precision
 
         measure_precision(out, quick=quick)
+    elif what == "training":
+        from .bench.training import measure_training
+
+        measure_training(out, quick=quick, processes=processes)
     elif what == "extremes":
         from .bench.extremes import measure_extremes
 
         return int(measure_extremes(out, quick=quick)["missed"] > 0)
-    else:
-        from .bench.training import measure_training
+    elif what == "hostile":
+        from .bench.hostile import measure_hostile
 
-        measure_training(out, quick=quick, processes=processes)
+        return int(bool(measure_hostile(out, quick=quick)["failures"]))
+    else:
+        from .bench.faults import measure_faults
+
+        return int(measure_faults(out, quick=quick)["failed"] > 0)
     return 0
 
 
@@ -260,7 +274,7 @@ def _load(request: dict[str, Any]) -> Any:
         request["train_views"],
         request["downscale"],
         background=request["background"],
-        points=request.get("points", "none"),
+        points=request["points"],
     )
 
 

@@ -88,6 +88,7 @@ class FitConfig:
             which is "sift" except where the layout itself prescribes random points (Blender).
         init_file: point cloud for "file".
         max_gaussians: densification stops there; None: 10 a step, and at least 4 times the first points.
+        max_bytes: bound for the working memory of a render, see :class:`GaussianRenderer`; it changes no result.
         evaluations: how often the curve is measured, the last time at the end.
         device: "cpu", "cuda", ...
         recipe: all the other numbers.
@@ -102,6 +103,7 @@ class FitConfig:
     init: str = "auto"
     init_file: Path | None = None
     max_gaussians: int | None = None
+    max_bytes: int = 2**30
     evaluations: int = 8
     device: str = "cpu"
     recipe: Recipe = field(default_factory=Recipe)

@@ -72,6 +72,7 @@ def fit_scene(
         points = choose_points(scene, config)
         say(f"first points: {len(points.points)} ({points.kind})")
         trainer = Trainer(scene, config, points)
+        say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for old in (checkpoint, previous(checkpoint)):
             old.unlink(missing_ok=True)
     write_json(

@@ -40,6 +40,7 @@ _GROUPS = {
     "sh_dc": "lr_sh_dc",
     "sh_rest": "lr_sh_rest",
 }
+_BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 4096, 40  # measured, with some room
 _LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
 
 
@@ -92,7 +93,7 @@ class Trainer:
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
         self.drop = DropGaussian(config.drop, config.drop_schedule, seed=_seed(config, 1)) if config.drop else None
-        self.renderer = GaussianRenderer(self.drop, near_plane=near_plane).train()
+        self.renderer = GaussianRenderer(self.drop, near_plane=near_plane, max_bytes=config.max_bytes).train()
         self.densifier = Densifier(
             self.model,
             self.optimizer,
@@ -115,6 +116,17 @@ class Trainer:
             image = views.images[i : i + 1].to(self.device)
             targets.append((move_camera(views.camera(i), self.device), image, target_moments(image)))
         return targets
+
+    @property
+    def most_bytes(self) -> int:
+        """A bound for the memory that the fit takes beyond what there is now, known before it begins.
+
+        The renderer's budget, and for each Gaussian of the largest number the parameters, gradients, Adam's moments,
+        their copies while densifying, and what projection and harmonics keep for their backward passes.
+        """
+        images = self.scene.train.images
+        loss = images[:1].numel() * images.element_size() * _IMAGES_OF_THE_LOSS
+        return self.config.max_bytes + self.max_gaussians * _BYTES_PER_GAUSSIAN + loss + 4 * images.nbytes
 
     def fit(self, callback: Callable[[Trainer, float], bool] | None = None) -> None:
         """Train to the end.
