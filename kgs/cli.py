@@ -110,7 +110,7 @@ def fit(
         seed: everything random derives from it.
         init: first points. auto: SIFT matches of the training images (Blender scenes: random points in their box).
         init_file: a point cloud (PLY, OBJ, ...) for --init file.
-        max_gaussians: densification stops there; 10 a step unless given.
+        max_gaussians: densification stops there; 10 a step unless given (14000 with --fast).
         sh_degree: degree of the view-dependent colour.
         background: behind images with transparency.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
@@ -130,7 +130,7 @@ def fit(
         seed=seed,
         init=init,
         init_file=init_file,
-        max_gaussians=max_gaussians,
+        max_gaussians=start.max_gaussians if max_gaussians is None else max_gaussians,
         device=device,
     )
     request = {

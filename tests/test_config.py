@@ -53,5 +53,10 @@ def test_unknown_entry_is_refused():
 def test_the_coarse_share_is_counted_in_steps():
     assert timetable(FitConfig(steps=2000)).coarse == 0
     assert timetable(FitConfig(steps=1000, coarse=0.5)).coarse == 500
-    with pytest.raises(ValueError, match="coarse"):
-        FitConfig(coarse=1.5)
+
+
+@pytest.mark.parametrize("name", ["coarse", "growth"])
+@pytest.mark.parametrize("value", [1.5, -0.1, float("nan")])
+def test_shares_are_from_0_to_1(name, value):
+    with pytest.raises(ValueError, match=name):
+        FitConfig(**{name: value})

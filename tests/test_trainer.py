@@ -123,6 +123,17 @@ def test_the_cap_holds_and_is_said(scene, points):
     assert any("170" in note and "--max-gaussians" in note for note in trainer.notes)
 
 
+def test_the_number_may_grow_evenly(scene, points):
+    config = replace(CONFIG, max_gaussians=450, growth=0.5)
+    counts = []
+    trainer = Trainer(scene, config, points)
+    trainer.fit(lambda trainer, _: counts.append(len(trainer.model)))
+    assert all(count <= 150 + 10 * step for step, count in enumerate(counts, 1))
+    assert 300 < max(counts) <= 450
+    at_once = fitted(scene, points, replace(config, growth=0.0))
+    assert len(at_once.model) >= len(trainer.model)
+
+
 @pytest.mark.parametrize("change", [{"seed": 6}, {"steps": 61}, {"drop": 0.0}])
 def test_a_checkpoint_of_another_fit_is_refused(whole, scene, tmp_path, change):
     whole.save(tmp_path / "checkpoint.pt")

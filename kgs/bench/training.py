@@ -25,6 +25,7 @@ __all__ = ["KNOBS", "fit_cell", "measure_training", "training_cells"]
 KNOBS: dict[str, tuple[Any, ...]] = {
     "steps": (500, 1000),
     "coarse": (0.5,),
+    "growth": (0.8,),
     "sh_degree": (0, 1),
     "max_gaussians": (5_000, 10_000),
     "drop": (0.0, 0.1, 0.3),

@@ -156,8 +156,9 @@ class Trainer:
             start = time.perf_counter()
             if step in self.times.densify:
                 self._check_scales()
+                self.densifier.max_gaussians = limit = self._limit()
                 capped = self.densifier.step().capped
-                if capped and not any("max_gaussians" in note for note in self.notes):
+                if capped and limit == self.max_gaussians and not any("max_gaussians" in note for note in self.notes):
                     self.notes.append(
                         f"step {step}: {capped} Gaussians were not densified, to keep their number at "
                         f"max_gaussians = {self.max_gaussians}; raise it with --max-gaussians"
@@ -312,6 +313,12 @@ class Trainer:
     def _diverged(self, expected: str, got: str = "others") -> TrainingDiverged:
         last = f"the last good checkpoint is {self.saved}" if self.saved else "there is no checkpoint yet"
         return TrainingDiverged(f"step {self.step}: expected {expected}, got {got}; {last}")
+
+    def _limit(self) -> int:
+        """How many Gaussians there may be after this step."""
+        first, growing = self.init["points"], self.config.growth * self.config.steps
+        share = min(1.0, self.step / growing) if growing else 1.0
+        return first + round(share * (self.max_gaussians - first))
 
     def _next_view(self) -> int:
         if not self._stack:
