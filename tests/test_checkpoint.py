@@ -1,3 +1,4 @@
+import contextlib
 import hashlib
 import io
 import pickle
@@ -6,7 +7,7 @@ import pytest
 import torch
 
 from kgs import DataError
-from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
+from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint, previous, save_checkpoint
 
 
 @pytest.fixture
@@ -134,3 +135,42 @@ def test_a_failed_write_leaves_the_old_file(path, monkeypatch):
         save_checkpoint(path, {"step": 2})
     assert load_checkpoint(path) == {"step": 1}
     assert [p.name for p in path.parent.iterdir()] == ["checkpoint.pt"]
+
+
+def test_the_last_two_are_kept_and_the_newest_whole_one_is_found(path):
+    for step in (1, 2, 3):
+        save_checkpoint(path, {"step": step})
+    assert load_checkpoint(path) == {"step": 3}
+    assert load_checkpoint(previous(path)) == {"step": 2}
+    assert newest_checkpoint(path) == ({"step": 3}, "")
+    path.write_bytes(path.read_bytes()[:-1])
+    state, damage = newest_checkpoint(path)
+    assert state == {"step": 2}
+    assert "checkpoint.pt" in damage
+    path.unlink()
+    assert newest_checkpoint(path)[0] == {"step": 2}
+    previous(path).write_bytes(b"")
+    with pytest.raises(DataError, match=r"checkpoint\.pt"):
+        newest_checkpoint(path)
+
+
+@pytest.mark.parametrize("call", ["os.replace", "os.fsync"])
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_wherever_a_write_fails_a_whole_checkpoint_is_left(path, monkeypatch, call, after):
+    save_checkpoint(path, {"step": 1})
+    save_checkpoint(path, {"step": 2})
+    module, name = call.split(".")
+    plain, calls = getattr(__import__(module), name), []
+
+    def failing(*arguments):
+        calls.append(arguments)
+        if len(calls) > after:
+            raise OSError(5, "Input/output error")
+        return plain(*arguments)
+
+    monkeypatch.setattr(call, failing)
+    with contextlib.suppress(OSError):
+        save_checkpoint(path, {"step": 3})
+    monkeypatch.undo()
+    assert newest_checkpoint(path)[0]["step"] in (2, 3)
+    assert not list(path.parent.glob("*.partial"))

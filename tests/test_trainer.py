@@ -160,6 +160,48 @@ def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(scene, points,
     assert all(torch.equal(value, before[key]) for key, value in parameters(trainer).items())
 
 
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_it_stops_at_a_parameter_that_is_not_finite(scene, points, tmp_path, name, value):
+    trainer = Trainer(scene, CONFIG, points)
+    trainer.fit(lambda trainer, _: trainer.step == 2)
+    trainer.save(tmp_path / "checkpoint.pt")
+    with torch.no_grad():
+        trainer.model.get_parameter(name)[7] = value
+    if name == "opacity_logits" and value == torch.inf:
+        return  # an opacity of 1
+    with pytest.raises(TrainingDiverged, match=rf"step 3.*{name} of Gaussian 7.*checkpoint\.pt of step 2"):
+        trainer.fit()
+
+
+def test_it_stops_at_a_gradient_whose_square_overflows(scene, points):
+    trainer = Trainer(scene, CONFIG, points)
+    trainer.model.means.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor([4]), 1e20))
+    with pytest.raises(TrainingDiverged, match="step 1.*below 1e19.*means of Gaussian 4.*no checkpoint yet"):
+        trainer.fit()
+
+
+def test_it_stops_where_scales_explode(scene, points):
+    trainer = Trainer(scene, CONFIG, points)
+    trainer.fit(lambda trainer, _: trainer.step == min(trainer.times.densify) - 1)
+    with torch.no_grad():
+        trainer.model.log_scales[3, 1] = 40.0
+    with pytest.raises(TrainingDiverged, match="scales below 1e[+]06 times the extent.*Gaussian 3"):
+        trainer.fit()
+
+
+def test_the_memory_budget_reaches_the_renderer(scene, points):
+    small = Trainer(scene, replace(CONFIG, max_bytes=1000), points)
+    assert small.most_bytes < Trainer(scene, CONFIG, points).most_bytes
+    with pytest.raises(ValueError, match="max_bytes"):
+        small.fit()
+
+
+def test_a_fit_may_go_on_on_another_device(whole, scene, tmp_path):
+    whole.save(tmp_path / "checkpoint.pt")
+    assert Trainer.resume(scene, replace(CONFIG, device="cpu:0"), tmp_path / "checkpoint.pt").step == 60
+
+
 def test_a_dropped_layer_is_absent_at_rate_zero(scene, points):
     trainer = Trainer(scene, replace(CONFIG, drop=0.0), points)
     assert trainer.drop is None

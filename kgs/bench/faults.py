@@ -33,6 +33,7 @@ SIZE = (48, 64)
 CONFIG = FitConfig(
     steps=450, evaluations=150, max_gaussians=1500, recipe=Recipe(grad_threshold=1e-5, reset_recovery=30)
 )
+POINTS = "points.ply"
 _PATIENCE = 300.0  # seconds after which a process is taken to hang
 _PROCESSES = multiprocessing.get_context("forkserver")  # which has imported torch once for all of them
 _PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.fit.run"])
@@ -55,6 +56,7 @@ def measure_faults(
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
+        _write_points(root / POINTS)
         say("a fit that is left alone ...")
         _finish(root / "alone")
         expected = (root / "alone" / "splat.ply").read_bytes()
@@ -65,7 +67,7 @@ def measure_faults(
         say("a full disk ...")
         rows.append(_full_disk(root / "full", expected))
         say("memory ...")
-        rows += _memory(200 if quick else 2000)
+        rows += _memory(root / POINTS, 200 if quick else 2000)
     failed = sum(row["verdict"] != "met" for row in rows)
     result = {"rows": rows, "failed": failed, "versions": versions()}
     write_csv(out / "faults.csv", rows)
@@ -75,6 +77,15 @@ def measure_faults(
     (out / "faults.md").write_text(table := markdown_table("Faults of long fits", heads, cells, first="fault"))
     say(table)
     return result
+
+
+def _write_points(path: Path) -> None:
+    """Few first points before the cameras, so that there is much to add."""
+    import numpy as np
+    import trimesh
+
+    points = np.random.default_rng(0).uniform((-2, -1.5, 3), (2, 1.5, 7), (300, 3))
+    trimesh.PointCloud(points, np.full((300, 4), 128, np.uint8)).export(path)
 
 
 def _row(fault: str, trials: int, lost: int, found: str, met: bool) -> dict[str, Any]:
@@ -102,7 +113,9 @@ def _fit(out: Path, limit: int | None) -> None:
 
     Trainer.psnr = psnr  # type: ignore[assignment,method-assign]
     try:
-        _, stopped_by = run.fit_scene(scene, replace(CONFIG, init="random"), out, resume=True, say=lambda line: None)
+        _, stopped_by = run.fit_scene(
+            scene, replace(CONFIG, init="file", init_file=out.parent / POINTS), out, resume=True, say=lambda line: None
+        )
     except OSError:
         os._exit(1)  # as the command does, with one line
     if stopped_by:
@@ -203,10 +216,10 @@ def _full_disk(out: Path, expected: bytes) -> dict[str, Any]:
     return _row("full disk", 1, int(step < 0), found, code != 0 and step > 0 and not partial and same)
 
 
-def _memory(steps: int) -> list[dict[str, Any]]:
+def _memory(points: Path, steps: int) -> list[dict[str, Any]]:
     """Growth over the second half of a fit whose number of Gaussians stays, and the peak under a budget."""
     with _PROCESSES.Pool(1) as pool:
-        slope, peak, ceiling = pool.apply(_memory_of, (steps,))
+        slope, peak, ceiling = pool.apply(_memory_of, (points, steps))
     return [
         _row(f"memory, {steps} steps", 1, 0, f"grows by {slope:+.2f} KiB a step over the second half", slope < 1.0),
         _row(
@@ -219,7 +232,7 @@ def _memory(steps: int) -> list[dict[str, Any]]:
     ]
 
 
-def _memory_of(steps: int) -> tuple[float, int, int]:
+def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     """Growth in KiB a step, the peak of the resident memory over that at the start, and the bound, in bytes."""
     import torch
 
@@ -229,7 +242,7 @@ def _memory_of(steps: int) -> tuple[float, int, int]:
 
     torch.set_num_threads(1)
     scene = synthetic_scene(train_views=3, test_views=1, size=SIZE, seed=0)
-    config = replace(CONFIG, steps=steps, evaluations=1, init="random", max_gaussians=1000, max_bytes=2**22)
+    config = replace(CONFIG, steps=steps, evaluations=1, init="file", init_file=points, max_bytes=2**22)
     trainer = Trainer(scene, config, choose_points(scene, config))
     before, resident = _resident(), []
 

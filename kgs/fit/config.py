@@ -90,7 +90,8 @@ class FitConfig:
         max_gaussians: densification stops there; None: 10 a step, and at least 4 times the first points.
         growth: share of the steps over which the limit rises to that, evenly, from the first points; 0 sets it at
             once. In [0, 1].
-        max_bytes: bound for the working memory of a render, see :class:`GaussianRenderer`; it changes no result.
+        max_bytes: bound for the working memory of a render, see :class:`GaussianRenderer`; it changes
+            rounding alone.
         evaluations: how often the curve is measured, the last time at the end.
         device: "cpu", "cuda", ...
         recipe: all the other numbers.
@@ -125,6 +126,8 @@ class FitConfig:
         for name in ("coarse", "growth"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")
+        if self.max_bytes < 1:
+            raise ValueError(f"max_bytes: expected at least 1, got {self.max_bytes}")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
 

@@ -15,7 +15,6 @@ from .config import FitConfig
 
 __all__ = ["check_optimizer", "check_state", "fingerprint"]
 
-_FREE = {"device", "max_bytes"}  # a fit may go on elsewhere
 _POINT = {"step", "seconds", "test_psnr", "train_psnr"}
 
 
@@ -39,7 +38,7 @@ def check_state(path: Path, state: dict[str, Any], scene: Scene, config: FitConf
     for field, asked in (("config", config.to_dict()), ("scene", fingerprint(scene))):
         saved = state.get(field)
         for key, value in asked.items():
-            if key in _FREE:
+            if key == "device":  # a fit may go on elsewhere
                 continue
             if not isinstance(saved, dict) or key not in saved or saved[key] != value:
                 got = saved.get(key) if isinstance(saved, dict) else saved

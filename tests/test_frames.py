@@ -1,0 +1,71 @@
+"""What all layouts share: names that stay in the folder, and numbers that a camera can have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from kgs.datasets.frames import Frame, check_unique, path_inside
+from kgs.datasets.images import Intrinsics
+from kgs.errors import DataError
+
+LENS = Intrinsics(16, 12, 14.0, 14.0, 8.0, 6.0)
+SOURCE = Path("transforms.json")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", "/etc/passwd", "../x.png", "a/../../x.png", "..\\x.png", "C:\\x.png", "\\\\host\\x.png", "a\0b", "x" * 5000],
+)
+def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(DataError, match="expected"):
+        path_inside(SOURCE, tmp_path, name)
+
+
+def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
+    root, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
+    root.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "secret.png").write_bytes(b"x")
+    (root / "file.png").symlink_to(elsewhere / "secret.png")
+    (root / "folder").symlink_to(elsewhere)
+    for name in ("file.png", "folder/secret.png"):
+        with pytest.raises(DataError, match="link that leads out"):
+            path_inside(SOURCE, root, name)
+    (root / "a.png").write_bytes(b"x")
+    (root / "b.png").symlink_to(root / "a.png")  # inside
+    assert path_inside(SOURCE, root, "b.png") == root / "b.png"
+
+
+def test_the_scene_itself_may_be_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real" / "a.png").write_bytes(b"x")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    assert path_inside(SOURCE, tmp_path / "link", "a.png").is_file()
+
+
+@pytest.mark.parametrize("name", ["fx", "fy"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), 1e-16, 1e16])
+def test_focal_lengths_that_no_lens_has(name: str, value: float) -> None:
+    with pytest.raises(DataError, match=r"photo\.png"):
+        Frame(SOURCE, "photo.png", SOURCE, replace(LENS, **{name: value}), torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(0, 0, float("nan")), (0, 3, float("inf")), (1, 1, 1.01), (2, 2, -1.0), (0, 3, 1e16)]
+)
+def test_poses_that_no_camera_has(row: int, column: int, value: float) -> None:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[row, column] = value
+    with pytest.raises(DataError, match=r"photo\.png"):
+        Frame(SOURCE, "photo.png", SOURCE, LENS, pose)
+
+
+def test_one_photo_under_two_names_is_refused(tmp_path: Path) -> None:
+    pose = torch.eye(4, dtype=torch.float64)
+    frames = [Frame(SOURCE, name, tmp_path / "a.png", LENS, pose) for name in ("a.png", "./a.png")]
+    with pytest.raises(DataError, match="2 times"):
+        check_unique(frames)

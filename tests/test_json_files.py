@@ -1,0 +1,59 @@
+"""JSON that nobody vouches for."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kgs.errors import DataError
+from kgs.json_files import parse_json, read_json
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+@given(VALUES)
+def test_what_json_can_say_is_read(value: object) -> None:
+    assert parse_json(json.dumps(value).encode()) == value
+
+
+@given(st.binary(max_size=60) | st.text(alphabet='{}[]",:0123456789eE+-.NaInfty \\', max_size=40).map(str.encode))
+@settings(max_examples=300)
+def test_anything_else_is_a_value_error(text: bytes) -> None:
+    with contextlib.suppress(ValueError):
+        json.dumps(parse_json(text), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (b"[1, 2]", "expected a JSON object, got a list"),
+        (b'{"a": NaN}', "NaN is not a finite number"),
+        (b'{"a": 1e400}', "1e400 is not a finite number"),
+        (b'{"a": ' + b"[" * 100_000, "nested too deep"),
+        (b'{"a": 1', "no JSON"),
+        (b"\xff\xfe", "no JSON"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "no JSON"),  # Python's own limit of the digits
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, text: bytes, reason: str) -> None:
+    (tmp_path / "a.json").write_bytes(text)
+    with pytest.raises(DataError, match=reason):
+        read_json(tmp_path / "a.json")
+
+
+def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
+    with open(tmp_path / "a.json", "wb") as file:
+        file.truncate(2**27)  # takes no room on the disk
+    with pytest.raises(DataError, match="larger than 64 MiB"):
+        read_json(tmp_path / "a.json")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_json(tmp_path)

@@ -1,0 +1,148 @@
+"""Long runs: signals, disks without room, checkpoints by the clock; the loop is the trainer's own."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kgs.datasets.synthetic import synthetic_scene
+from kgs.errors import DataError
+from kgs.fit import run
+from kgs.fit.checkpoint import load_checkpoint, previous
+from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.initialize import FirstPoints
+from kgs.fit.run import CHECKPOINT, fit_scene, train
+from kgs.fit.trainer import Trainer
+
+CONFIG = FitConfig(steps=24, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    return synthetic_scene(train_views=3, test_views=1, size=(24, 32), seed=0)
+
+
+@pytest.fixture(autouse=True)
+def _few_points(monkeypatch: Any) -> None:
+    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
+    first = FirstPoints(points, torch.full((150, 3), 0.5), "random")
+    monkeypatch.setattr(run, "choose_points", lambda scene, config: first)
+
+
+@pytest.fixture
+def trainer(scene: Any) -> Trainer:
+    return Trainer(scene, CONFIG, run.choose_points(scene, CONFIG))
+
+
+def at_step(trainer: Trainer, step: int, act: Any) -> None:
+    """Do something in the middle of a step."""
+    plain = trainer._train_step
+
+    def train_step() -> float:
+        loss = plain()
+        if trainer.step == step:
+            act()
+        return loss
+
+    trainer._train_step = train_step  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_step_and_saves(trainer: Trainer, tmp_path: Path, number: int) -> None:
+    handler = signal.getsignal(number)
+    at_step(trainer, 9, lambda: os.kill(os.getpid(), number))
+    assert train(trainer, tmp_path / CHECKPOINT) == number
+    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == trainer.step == 9
+    assert signal.getsignal(number) == handler
+
+
+def test_a_second_signal_acts_at_once(trainer: Trainer, tmp_path: Path) -> None:
+    def twice() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    at_step(trainer, 9, twice)
+    with pytest.raises(KeyboardInterrupt):
+        train(trainer, tmp_path / CHECKPOINT)
+    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+
+
+def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    fit_scene(scene, CONFIG, tmp_path / "whole", say=lambda line: None)
+    plain = Trainer.__init__
+
+    def interrupted(self: Trainer, *arguments: Any) -> None:
+        plain(self, *arguments)
+        at_step(self, 10, lambda: os.kill(os.getpid(), signal.SIGTERM))
+
+    monkeypatch.setattr(Trainer, "__init__", interrupted)
+    metrics, stopped_by = fit_scene(scene, CONFIG, tmp_path / "cut", say=lambda line: None)
+    assert (metrics["steps"], stopped_by) == (10, signal.SIGTERM)
+    assert (tmp_path / "cut" / "splat.ply").is_file()
+    metrics, stopped_by = fit_scene(scene, CONFIG, tmp_path / "cut", resume=True, say=lambda line: None)
+    assert (metrics["steps"], stopped_by) == (24, 0)
+    assert (tmp_path / "cut" / "splat.ply").read_bytes() == (tmp_path / "whole" / "splat.ply").read_bytes()
+
+
+def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
+    trainer: Trainer, tmp_path: Path, monkeypatch: Any
+) -> None:
+    plain, failed = os.fsync, []
+
+    def full(descriptor: int) -> None:
+        if trainer.step in (12, 18):
+            failed.append(trainer.step)
+            raise OSError(28, "No space left on device")
+        plain(descriptor)
+
+    monkeypatch.setattr("os.fsync", full)
+    assert train(trainer, tmp_path / CHECKPOINT) == 0
+    assert failed == [12, 18]
+    notes = [note for note in trainer.notes if "no checkpoint" in note]
+    assert len(notes) == 2
+    assert "step 12" in notes[0]
+    assert CHECKPOINT in notes[0]
+    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 24
+    assert sorted(p.name for p in tmp_path.iterdir()) == [previous(Path(CHECKPOINT)).name, CHECKPOINT]
+
+
+def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(run, "_SAVE_SECONDS", 0.0)
+    saved: list[int] = []
+    plain = trainer.save
+    monkeypatch.setattr(trainer, "save", lambda path: (saved.append(trainer.step), plain(path)))
+    train(trainer, tmp_path / CHECKPOINT)
+    assert saved == [*range(1, 25), 24]
+
+
+def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, tmp_path: Path) -> None:
+    lines: list[str] = []
+    fit_scene(scene, CONFIG, tmp_path, say=lines.append)
+    whole = (tmp_path / "splat.ply").read_bytes()
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:-7])
+    fit_scene(scene, CONFIG, tmp_path, resume=True, say=lines.append)
+    assert any("went on from the previous checkpoint" in line for line in lines)
+    assert (tmp_path / "splat.ply").read_bytes() == whole
+    for damaged in (path, previous(path)):
+        damaged.write_bytes(b"")
+    with pytest.raises(DataError, match=CHECKPOINT):
+        fit_scene(scene, CONFIG, tmp_path, resume=True, say=lines.append)
+
+
+def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) -> None:
+    fit_scene(scene, CONFIG, tmp_path, say=lambda line: None)
+    fit_scene(scene, replace(CONFIG, seed=1), tmp_path, say=lambda line: None)
+    assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
+
+
+def test_memory_is_foretold(scene: Any, tmp_path: Path) -> None:
+    lines: list[str] = []
+    fit_scene(scene, replace(CONFIG, steps=2), tmp_path, say=lines.append)
+    assert any(line.startswith("memory: at most ") and "300 Gaussians" in line for line in lines)
