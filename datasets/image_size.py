@@ -48,8 +48,12 @@ def image_size(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def _png(data: bytes) -> tuple[int, ...]:
+    """Every chunk has to be in the file: decoders take memory for what its length says."""
     if data[12:16] != b"IHDR":
         raise ValueError
+    at = 8
+    while data[at + 4 : at + 8] != b"IEND":
+        at += 12 + struct.unpack_from(">I", data, at)[0]
     return struct.unpack_from(">II", data, 16)
 
 

@@ -101,6 +101,7 @@ def _fit(out: Path, limit: int | None) -> None:
     from kgs.fit.trainer import Trainer
 
     torch.set_num_threads(1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the progress lines
     scene = synthetic_scene(train_views=3, test_views=1, size=SIZE, seed=0)
     evaluate = Trainer.psnr
     started = out.with_suffix(".started")

@@ -203,8 +203,10 @@ def _check_types(config: FitConfig | Recipe) -> None:
         value, default = getattr(config, entry.name), entry.default
         if isinstance(default, float):
             is_right = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+        elif isinstance(default, int):
+            is_right = type(value) is int and abs(value) < 2**62
         else:
-            is_right = type(default) not in (int, str) or type(value) is type(default)
+            is_right = not isinstance(default, str) or isinstance(value, str)
         if not is_right:
             raise ValueError(f"{entry.name}: expected a value like {default!r}, got {str(value)[:60]!r}")
 

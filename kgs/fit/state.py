@@ -63,11 +63,14 @@ def check_state(path: Path, state: dict[str, Any], scene: Scene, config: FitConf
 
 
 def check_optimizer(optimizer: Optimizer) -> None:
-    """Make sure that Adam's moments have the shapes of their parameters, which torch does not.
+    """Make sure that Adam's state is that of the parameters and has their shapes, which torch does not.
 
     Raises:
-        ValueError: they do not.
+        ValueError: it is not.
     """
+    parameters = {parameter for group in optimizer.param_groups for parameter in group["params"]}
+    if not optimizer.state.keys() <= parameters:
+        raise ValueError("expected the optimiser's state of the parameters alone, got more")
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             state = optimizer.state.get(parameter)

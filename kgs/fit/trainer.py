@@ -40,7 +40,8 @@ _GROUPS = {
     "sh_dc": "lr_sh_dc",
     "sh_rest": "lr_sh_rest",
 }
-_BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 4096, 40  # measured, with some room
+# Measured, with some room; the first is what libraries load when they are used for the first time.
+_BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 _LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
 
 
@@ -126,7 +127,8 @@ class Trainer:
         """
         images = self.scene.train.images
         loss = images[:1].numel() * images.element_size() * _IMAGES_OF_THE_LOSS
-        return self.config.max_bytes + self.max_gaussians * _BYTES_PER_GAUSSIAN + loss + 4 * images.nbytes
+        gaussians = self.max_gaussians * _BYTES_PER_GAUSSIAN
+        return _BYTES_AT_FIRST_USE + self.config.max_bytes + gaussians + loss + 4 * images.nbytes
 
     def fit(self, callback: Callable[[Trainer, float], bool] | None = None) -> None:
         """Train to the end.
