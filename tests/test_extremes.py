@@ -9,7 +9,7 @@ import torch
 from oracles import enumerate_drops, mpmath_pixels, near_threshold, pinhole, random_camera, random_gaussians
 
 import kgs.reference
-from kgs import GaussianRenderer, Gaussians
+from kgs import GaussianModel, GaussianRenderer, Gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -315,3 +315,31 @@ def test_quaternions_of_any_norm(quat):
     assert all(x.grad.isfinite().all() for x in inputs)
     if not peak:
         assert not inputs[1].grad.any()
+
+
+LOG_SCALES = [-math.inf, -100.0, -44.0, 0.0, 44.0, 88.0, 89.0, math.inf]
+LOGITS = [-1e4, -104.0, -17.0, 17.0, 1e4]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_saturated_scales_and_opacities_are_drawn_or_left_out(dtype):
+    pairs = torch.tensor([(s, o) for s in LOG_SCALES for o in LOGITS], dtype=torch.float64).to(dtype)
+    n = len(pairs)
+    generator = torch.Generator().manual_seed(0)
+    model = GaussianModel(
+        means=torch.rand(n, 3, generator=generator).to(dtype) + torch.tensor([-0.5, -0.5, 3.0], dtype=dtype),
+        quats=torch.randn(n, 4, generator=generator).to(dtype),
+        log_scales=pairs[:, :1].expand(n, 3).clone(),
+        opacity_logits=pairs[:, 1].clone(),
+        sh_dc=torch.rand(n, 1, 3, generator=generator).to(dtype),
+        sh_rest=torch.zeros(n, 0, 3, dtype=dtype),
+    )
+    out = GaussianRenderer()(model(), pinhole(9, 11, (10.0, 10.0), dtype=dtype))
+    out.image.square().sum().backward()
+    overflow = float(torch.finfo(dtype).max)
+    beyond = int((pairs[:, 0].exp() > overflow).sum())
+    assert int(out.projected.num_nonfinite) == beyond >= 5
+    assert torch.isfinite(out.image).all()
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh_dc"):
+        finite = torch.isfinite(model.get_parameter(name).grad.reshape(n, -1)).all(1)
+        assert finite[pairs[:, 0].exp() <= overflow].all(), name

@@ -1,5 +1,7 @@
 """Trainer: determinism, resume, and that nothing depends on the test views."""
 
+import contextlib
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -188,6 +190,18 @@ def test_it_stops_where_scales_explode(scene, points):
         trainer.model.log_scales[3, 1] = 40.0
     with pytest.raises(TrainingDiverged, match="scales below 1e[+]06 times the extent.*Gaussian 3"):
         trainer.fit()
+
+
+@pytest.mark.parametrize("factor", [10, 1000])
+def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, factor):
+    rates = {
+        name: factor * getattr(CONFIG.recipe, name) for name in ("lr_means", "lr_scales", "lr_opacity", "lr_quats")
+    }
+    trainer = Trainer(scene, replace(CONFIG, steps=150, recipe=replace(CONFIG.recipe, **rates)), points)
+    with contextlib.suppress(TrainingDiverged):
+        trainer.fit()
+    assert all(torch.isfinite(value).all() for value in parameters(trainer).values())
+    assert math.isfinite(trainer.psnr(scene.train))
 
 
 def test_the_memory_budget_reaches_the_renderer(scene, points):
