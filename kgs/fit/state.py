@@ -45,7 +45,7 @@ def check_state(path: Path, state: dict[str, Any], scene: Scene, config: FitConf
                 raise DataError(path, f"{field}.{key}", f"expected {value!r} as asked for now, got {str(got)[:200]!r}")
     views = len(scene.train)
     for field, what, is_right in (
-        ("init", "a kind and a number of points", lambda v: _is_dict(v, {"kind", "points"})),
+        ("init", "a kind and a number of points", _is_init),
         ("step", f"a number from 0 to {config.steps}", lambda v: _is_int(v, 0, config.steps)),
         ("seconds", "a number, not negative", lambda v: _is_number(v) and v >= 0),
         ("curve", "a list of measurements", lambda v: isinstance(v, list) and all(map(_is_point, v))),
@@ -100,6 +100,10 @@ def _is_int(value: Any, least: int, most: int) -> bool:
 
 def _is_dict(value: Any, keys: set[str]) -> bool:
     return isinstance(value, dict) and value.keys() == keys
+
+
+def _is_init(value: Any) -> bool:
+    return _is_dict(value, {"kind", "points"}) and isinstance(value["kind"], str) and _is_int(value["points"], 1, 2**48)
 
 
 def _is_point(value: Any) -> bool:

@@ -68,7 +68,7 @@ class Trainer:
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
         self.scene = scene
         self.config = config
-        self.init = {"kind": points.kind, "points": len(points.points)}
+        self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
         self.device = torch.device(config.device)
         nearest, median = typical_depths(scene.train, points.points)
         # a rig without extent (one camera, or a pure rotation) still has to move its Gaussians
@@ -318,7 +318,7 @@ class Trainer:
 
     def _limit(self) -> int:
         """How many Gaussians there may be after this step."""
-        first, growing = self.init["points"], self.config.growth * self.config.steps
+        first, growing = int(self.init["points"]), self.config.growth * self.config.steps
         share = min(1.0, self.step / growing) if growing else 1.0
         return first + round(share * (self.max_gaussians - first))
 
