@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
+from .divergence import gradient_fault, parameter_fault, scale_fault
 from .initialize import FirstPoints, typical_depths
 from .state import check_optimizer, check_state, fingerprint
 
@@ -42,7 +43,6 @@ _GROUPS = {
 }
 # Measured, with some room; the first is what libraries load when they are used for the first time.
 _BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
-_LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
 
 
 class Trainer:
@@ -157,7 +157,7 @@ class Trainer:
                 )
             start = time.perf_counter()
             if step in self.times.densify:
-                self._check_scales()
+                self._stop_if(scale_fault(self.model, self.extent))
                 self.densifier.max_gaussians = limit = self._limit()
                 capped = self.densifier.step().capped
                 if capped and limit == self.max_gaussians and not any("max_gaussians" in note for note in self.notes):
@@ -275,12 +275,12 @@ class Trainer:
         loss = photometric_loss(out.image.clamp(0, 1), target, recipe.dssim_weight, moments=moments)
         value = float(loss.detach())
         if int(out.projected.num_nonfinite):
-            raise self._diverged("finite parameters", *self._spoilt(self.model.named_parameters()))
+            self._stop_if(parameter_fault(self.model))
         if not math.isfinite(value):
-            raise self._diverged("a finite loss", str(value))
+            self._stop_if(f"expected a finite loss, got {value}")
         if loss.requires_grad:
             loss.backward()
-            self._check_gradients()
+            self._stop_if(gradient_fault(self.model))
             if out.projected.means2d.grad is not None:
                 self.densifier.observe(out.projected)
             if self.step < config.steps:  # as in the release, the last step only looks
@@ -288,33 +288,10 @@ class Trainer:
             self.optimizer.zero_grad(set_to_none=True)
         return value
 
-    def _check_gradients(self) -> None:
-        """Adam keeps the square of a gradient: one above 1e19 would freeze its parameter for ever."""
-        for name, parameter in self.model.named_parameters():
-            if parameter.grad is not None and not math.isfinite(float(parameter.grad.square().sum())):
-                squares = {name: parameter.grad.square()}
-                raise self._diverged("gradients below 1e19", *self._spoilt(squares.items()))
-
-    def _check_scales(self) -> None:
-        largest, axis = self.model.log_scales.detach().max(dim=0).values.max(dim=0)
-        if float(largest) > math.log(_LARGEST * self.extent):
-            row = int(self.model.log_scales.detach()[:, int(axis)].argmax())
-            raise self._diverged(
-                f"scales below {_LARGEST:g} times the extent", f"e^{float(largest):.1f} in log_scales of Gaussian {row}"
-            )
-
-    def _spoilt(self, values: Iterable[tuple[str, Tensor]]) -> Iterator[str]:
-        """Where the first number is that is not finite, or overflows when it is activated."""
-        for name, value in values:
-            value = value.detach().exp() if name == "log_scales" else value.detach()
-            rows = (~torch.isfinite(value)).reshape(len(self.model), -1).any(1).nonzero()
-            if len(rows):
-                yield f"others in {name} of Gaussian {int(rows[0, 0])}"
-                return
-
-    def _diverged(self, expected: str, got: str = "others") -> TrainingDiverged:
-        last = f"the last good checkpoint is {self.saved}" if self.saved else "there is no checkpoint yet"
-        return TrainingDiverged(f"step {self.step}: expected {expected}, got {got}; {last}")
+    def _stop_if(self, fault: str) -> None:
+        if fault:
+            last = f"the last good checkpoint is {self.saved}" if self.saved else "there is no checkpoint yet"
+            raise TrainingDiverged(f"step {self.step}: {fault}; {last}")
 
     def _limit(self) -> int:
         """How many Gaussians there may be after this step."""

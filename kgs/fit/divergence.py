@@ -1,0 +1,52 @@
+"""Where a fit leaves the finite numbers: what is wrong, and with which parameter of which Gaussian, in words."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kgs.model import GaussianModel
+
+__all__ = ["gradient_fault", "parameter_fault", "scale_fault"]
+
+_LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
+
+
+def parameter_fault(model: GaussianModel) -> str:
+    """The first parameter that is not finite, or overflows when it is activated; "" where there is none."""
+    for name, parameter in model.named_parameters():
+        value = parameter.detach()
+        row = _first_row(value.exp() if name == "log_scales" else value)
+        if row is not None:
+            return f"expected finite parameters, got others in {name} of Gaussian {row}"
+    return ""
+
+
+def gradient_fault(model: GaussianModel) -> str:
+    """The first gradient whose square is not finite; "" where there is none.
+
+    Adam keeps the square of a gradient: one above 1e19 would freeze its parameter for ever.
+    """
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None and not math.isfinite(float(parameter.grad.square().sum())):
+            row = _first_row(parameter.grad.square())
+            whose = "all Gaussians together" if row is None else f"Gaussian {row}"
+            return f"expected gradients below 1e19, got others in {name} of {whose}"
+    return ""
+
+
+def scale_fault(model: GaussianModel, extent: float) -> str:
+    """The first scale above a million extents; "" where there is none."""
+    rows = (model.log_scales.detach() > math.log(_LARGEST * extent)).any(1).nonzero()
+    if not len(rows):
+        return ""
+    row = int(rows[0, 0])
+    largest = float(model.log_scales.detach()[row].max())
+    return f"expected scales below {_LARGEST:g} times the extent, got e^{largest:.1f} in log_scales of Gaussian {row}"
+
+
+def _first_row(value: Tensor) -> int | None:
+    rows = (~torch.isfinite(value)).flatten(1).any(1) if value.ndim > 1 else ~torch.isfinite(value)
+    return int(rows.nonzero()[0, 0]) if bool(rows.any()) else None
