@@ -85,7 +85,7 @@ def fit(
     drop: float = 0.2,
     drop_schedule: Literal["linear", "constant"] = "linear",
     seed: int = 0,
-    init: Literal["auto", "sift", "random", "model-points", "file"] = "auto",
+    init: Literal["auto", "dense", "sift", "random", "model-points", "file"] = "auto",
     init_file: Path | None = None,
     max_gaussians: int | None = None,
     sh_degree: int = 3,
@@ -109,6 +109,7 @@ def fit(
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         seed: everything random derives from it.
         init: first points. auto: SIFT matches of the training images (Blender scenes: random points in their box).
+            dense: from depth maps of the training images, made by a plane sweep in some seconds a view.
         init_file: a point cloud (PLY, OBJ, ...) for --init file.
         max_gaussians: densification stops there; 10 a step unless given (14000 with --fast).
         sh_degree: degree of the view-dependent colour.

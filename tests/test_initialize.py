@@ -183,7 +183,7 @@ def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched() -> None:
 
 def test_few_matches_fall_back_to_random_points_with_a_warning() -> None:
     with pytest.warns(UserWarning, match=r"SIFT found 0 in 3 training views.*500 random points"):
-        result = first_points(flat(), num_random=500)
+        result = first_points(flat(), count=500)
     assert result.kind == "random"
     assert result.points.shape == (500, 3)
     assert torch.allclose(result.colors, torch.tensor([0.2, 0.4, 0.6]).expand(500, 3), atol=1e-6)
@@ -198,7 +198,7 @@ def seeing_views(posed: PinholeCamera, points: torch.Tensor) -> torch.Tensor:
 
 
 def test_random_points_are_seen_by_two_views_and_span_the_sift_depths(planes: Views, found: FirstPoints) -> None:
-    result = first_points(planes, "random", num_random=2000)
+    result = first_points(planes, "random", count=2000)
     assert result.kind == "random"
     assert result.points.shape == result.colors.shape == (2000, 3)
     assert int(seeing_views(planes.cameras, result.points).min()) >= 2
@@ -209,7 +209,7 @@ def test_random_points_are_seen_by_two_views_and_span_the_sift_depths(planes: Vi
 
 def test_random_points_depend_on_the_seed_alone() -> None:
     views = flat()
-    first, again, other = (first_points(views, "random", seed=seed, num_random=300) for seed in (4, 4, 5))
+    first, again, other = (first_points(views, "random", seed=seed, count=300) for seed in (4, 4, 5))
     assert torch.equal(first.points, again.points)
     assert not torch.equal(first.points, other.points)
 
@@ -217,7 +217,7 @@ def test_random_points_depend_on_the_seed_alone() -> None:
 def test_random_points_fill_the_common_frustum_evenly() -> None:
     # Oracle: rejection from a box. Parallel cameras at x = 0, 1, 2, so the depths are 2 to 40 (1 and 20 baselines).
     posed = cameras(np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]), turn=0.0, size=SMALL)
-    points = first_points(flat(posed), "random", num_random=20_000).points
+    points = first_points(flat(posed), "random", count=20_000).points
     assert 2.0 <= float(points[:, 2].min()) < 5.0
     assert 39.0 < float(points[:, 2].max()) <= 40.0
     box = (torch.rand(400_000, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([60.0, 40.0, 38.0])
@@ -237,7 +237,7 @@ def test_random_points_surround_the_place_where_orbiting_cameras_look() -> None:
     extrinsics[:, :3, 3] = torch.tensor([0.0, 0.0, 4.0]) - extrinsics[:, :3, :3] @ target
     sizes = torch.full((6,), SMALL[1]), torch.full((6,), SMALL[0])
     posed = PinholeCamera(cameras(size=SMALL).intrinsics[:1].repeat(6, 1, 1), extrinsics, *sizes)
-    points = first_points(flat(posed), "random", num_random=2000).points
+    points = first_points(flat(posed), "random", count=2000).points
     assert float((points.mean(0) - target).norm()) < 0.5
     assert int(seeing_views(posed, points).min()) >= 2
 
@@ -245,7 +245,7 @@ def test_random_points_surround_the_place_where_orbiting_cameras_look() -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_random_points_where_no_two_views_see_the_same(count: int) -> None:
     posed = cameras(np.zeros((count, 3)), turn=np.pi, size=SMALL)  # two cameras back to back
-    points = first_points(flat(posed), "random", num_random=100).points
+    points = first_points(flat(posed), "random", count=100).points
     assert points.shape == (100, 3)
     assert int(seeing_views(posed, points).min()) == 1
 
@@ -287,10 +287,10 @@ def test_file_with_a_point_that_is_not_finite(tmp_path: Path) -> None:
 
 def test_wrong_arguments() -> None:
     views = flat()
-    with pytest.raises(ValueError, match=r"kind: expected one of \['sift', 'random', 'file'\], got 'dense'"):
-        first_points(views, "dense")
-    with pytest.raises(ValueError, match="num_random: expected at least 1, got 0"):
-        first_points(views, "random", num_random=0)
+    with pytest.raises(ValueError, match=r"kind: expected one of \['dense', 'sift', 'random', 'file'\], got 'stereo'"):
+        first_points(views, "stereo")
+    with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
+        first_points(views, "random", count=0)
     with pytest.raises(ValueError, match="file: expected a path"):
         first_points(views, "file")
 

@@ -84,8 +84,8 @@ class FitConfig:
         sh_degree: degree of the harmonics, 0 to 3.
         coarse: share of the steps, the first ones, that see the training views in half the pixels a side; in [0, 1].
         seed: views, splits, masks and random points are drawn from streams that derive from it.
-        init: first points: "sift", "random", "model-points" (positions refined with test views), "file", or "auto",
-            which is "sift" except where the layout itself prescribes random points (Blender).
+        init: first points: "dense", "sift", "random", "model-points" (positions refined with test views), "file", or
+            "auto", which is "sift" except where the layout itself prescribes random points (Blender).
         init_file: point cloud for "file".
         max_gaussians: densification stops there; None: 10 a step, and at least 4 times the first points.
         growth: share of the steps over which the limit rises to that, evenly, from the first points; 0 sets it at

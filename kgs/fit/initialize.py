@@ -18,12 +18,14 @@ from kgs.datasets.scene import Views
 from kgs.errors import DataError
 from kgs.model import log_spacing
 
+from .dense import dense_points
 from .tracks import find_tracks
 from .triangulate import camera_centers, project_all, triangulate_certain
 
 __all__ = ["FirstPoints", "first_points", "typical_depths"]
 
-KINDS = ("sift", "random", "file")
+KINDS = ("dense", "sift", "random", "file")
+FEWEST_DENSE = 1000
 FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
 MAX_SPACING = 4.0  # of a point, in medians of all
 
@@ -35,7 +37,7 @@ class FirstPoints:
     Args:
         points: in the frame of the views, `(P, 3)` float32 on the CPU.
         colors: RGB in [0, 1], `(P, 3)` float32.
-        kind: where the points come from: "sift", "random" or "file".
+        kind: where the points come from: "dense", "sift", "random" or "file".
     """
 
     points: Tensor
@@ -48,33 +50,35 @@ def first_points(
     kind: str = "sift",
     *,
     seed: int = 0,
-    num_random: int = 10_000,
+    count: int = 10_000,
     file: str | PathLike[str] | None = None,
 ) -> FirstPoints:
     """Find the points a fit starts from.
 
     Args:
         views: the training views, and only these.
-        kind: "sift": SIFT keypoints of the images, matched and triangulated with the given poses; where fewer than 20
-            such points come out, "random" ones with a warning. "random": points spread evenly over the space that at
-            least two of the views see (one, if there is only one), in the images' mean colours there; its depths are
-            those of the SIFT points, or else follow from where the cameras are and look. "file": a point cloud or the
-            vertices of a mesh, in any format of trimesh, in the frame of the views; grey if it has no colours.
-        seed: of the random points; the other kinds have no randomness.
-        num_random: how many points "random" gives, >= 1.
+        kind: "dense": points of depth maps that at least two views agree on, drawn at random; where fewer than 1000
+            come out, those of "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated
+            with the given poses; where fewer than 20 such points come out, "random" ones with a warning. "random":
+            points spread evenly over the space that at least two of the views see (one, if there is only one), in the
+            images' mean colours there; its depths are those of the SIFT points, or else follow from where the cameras
+            are and look. "file": a point cloud or the vertices of a mesh, in any format of trimesh, in the frame of the
+            views; grey if it has no colours.
+        seed: of what is drawn at random.
+        count: how many points "random" gives, and "dense" at most; >= 1.
         file: the file of the kind "file".
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.
 
     Raises:
-        ValueError: another kind, `num_random` below 1, or no file for "file".
+        ValueError: another kind, `count` below 1, or no file for "file".
         DataError: the file is missing, broken, or has no points.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
-    if num_random < 1:
-        raise ValueError(f"num_random: expected at least 1, got {num_random}")
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}")
     if kind == "file":
         if file is None:
             raise ValueError("file: expected a path for the kind 'file', got None")
@@ -85,16 +89,25 @@ def first_points(
     if len(points) >= FEWEST_POINTS:
         together = _in_company(points, seen, views.cameras)
         points, pixels, seen = points[together], pixels[together], seen[together]
-    if kind == "sift" and len(points) >= FEWEST_POINTS:
-        return FirstPoints(points.float(), _mean_colors(views, pixels, seen), kind="sift")
-    if kind == "sift":
+    near, far = _depth_range(points, views.cameras)
+    generator = torch.Generator().manual_seed(seed)
+    if kind == "dense":
+        dense, colors = dense_points(views, near, far, count, generator)
+        if len(dense) >= min(FEWEST_DENSE, count):
+            return FirstPoints(dense, colors, kind="dense")
         warnings.warn(
-            f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
-            f"the fit starts from {num_random} random points instead",
+            f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead",
             stacklevel=2,
         )
-    near, far = _depth_range(points, views.cameras)
-    points = _random_points(views, num_random, near, far, torch.Generator().manual_seed(seed))
+    if kind in ("dense", "sift"):
+        if len(points) >= FEWEST_POINTS:
+            return FirstPoints(points.float(), _mean_colors(views, pixels, seen), kind="sift")
+        warnings.warn(
+            f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
+            f"the fit starts from {count} random points instead",
+            stacklevel=2,
+        )
+    points = _random_points(views, count, near, far, generator)
     pixels, depths = project_all(points, views.cameras)
     colors = _mean_colors(views, pixels, _inside(pixels, depths, views, near, far))
     return FirstPoints(points.float(), colors, kind="random")

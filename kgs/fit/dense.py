@@ -1,0 +1,71 @@
+"""A dense first cloud: depth maps of the training views, kept where the views agree."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kgs.datasets.scene import Views
+
+from .plane_sweep import DepthMap, sweep_depths
+from .triangulate import project_all
+
+__all__ = ["dense_points"]
+
+SCORE = 0.6  # a patch has to match at least so well
+MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000
+AGREEMENT = 0.01  # relative difference of the depths that two views have of a point
+
+
+def dense_points(
+    views: Views, near: float, far: float, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Points on the surfaces that at least two views agree on, with their colours there.
+
+    Large pictures, and many of them, are swept in half the pixels a side, or a quarter: they find enough points all
+    the same, in bounded time and memory.
+
+    Args:
+        views: at least two, posed.
+        near: depth of the nearest surface, > 0.
+        far: of the farthest.
+        count: how many to draw from all that were found, at random.
+        generator: of the draw.
+
+    Returns:
+        Points `(P, 3)` float32 in the frame of the views, P <= count, and RGB `(P, 3)` in [0, 1].
+    """
+    while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
+        views = views.halved()
+    maps = sweep_depths(views, near, far)
+    found = [_agreed(views, maps, view) for view in range(len(views))]
+    points, colors = (torch.cat(parts) for parts in zip(*found, strict=True))
+    chosen = torch.randperm(len(points), generator=generator)[:count]
+    return points[chosen].float(), colors[chosen]
+
+
+def _agreed(views: Views, maps: list[DepthMap], view: int) -> tuple[Tensor, Tensor]:
+    """The points of one view's map that another view's map has too, and their colours in that view."""
+    here = maps[view]
+    rows, columns = (here.is_inner & (here.scores > SCORE)).nonzero().unbind(1)
+    points = _unproject(views, view, rows, columns, here.depths[rows, columns].double())
+    pixels, depths = project_all(points, views.cameras)
+    height, width = here.depths.shape
+    agreed = torch.zeros(len(points), dtype=torch.bool)
+    for other, there in enumerate(maps):
+        if other == view:
+            continue
+        x, y = pixels[:, other].round().unbind(1)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depths[:, other] > 0)
+        x, y = (torch.where(inside, value, 0.0).long() for value in (x, y))
+        close = (there.depths[y, x] / depths[:, other] - 1).abs() < AGREEMENT
+        agreed |= inside & close & there.is_inner[y, x] & (there.scores[y, x] > SCORE)
+    return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]
+
+
+def _unproject(views: Views, view: int, rows: Tensor, columns: Tensor, depths: Tensor) -> Tensor:
+    intrinsics = views.cameras.intrinsics[view, :3, :3].double().cpu()
+    extrinsics = views.cameras.extrinsics[view].double().cpu()
+    pixels = torch.stack([columns.double(), rows.double(), torch.ones_like(depths)], 1)
+    local = pixels @ torch.linalg.inv(intrinsics).mT * depths[:, None]
+    return (local - extrinsics[:3, 3]) @ extrinsics[:3, :3]

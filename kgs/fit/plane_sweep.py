@@ -1,0 +1,177 @@
+"""Depth maps of posed views by a plane sweep: planes parallel to a view's image, warped, compared, smoothed, refined.
+
+Sources: Collins, "A Space-Sweep Approach to True Multi-Image Matching" (CVPR 1996) for the sweep; Hirschmüller, "Stereo
+Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equations 11 to 14, for the smoothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import torch
+import torch.nn.functional as F
+from kornia.color import rgb_to_grayscale
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.datasets.scene import Views
+
+from .triangulate import camera_centers
+
+__all__ = ["DepthMap", "sweep_depths"]
+
+PLANES = 128
+WINDOW = 7  # pixels a side of the patches that are compared
+NEIGHBOURS = 4  # at most, the nearest ones
+# Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
+STEP, JUMP, EDGE = 0.06, 0.5, 0.04
+_VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of every pixel of one view.
+
+    Convention:
+        Depth is z in the camera's frame (OpenCV axes), in world units; pixels have integer centres.
+
+    Args:
+        depths: `(H, W)`.
+        scores: how well the patch matches there, normalised cross-correlation in [-1, 1], `(H, W)`.
+        is_inner: whether the depth is not on the nearest or farthest plane, `(H, W)`.
+    """
+
+    depths: Tensor
+    scores: Tensor
+    is_inner: Tensor
+
+
+def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES) -> list[DepthMap]:
+    """The depth map of each view.
+
+    Args:
+        views: posed; one from whose place no other differs has no depths, and scores of -1.
+        near: depth of the nearest plane, > 0.
+        far: of the farthest, > near.
+        planes: how many, evenly spread over inverse depth.
+    """
+    grey = rgb_to_grayscale(views.images.cpu().float())
+    inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
+    maps = []
+    for view in range(len(views)):
+        others = _neighbours(views, view)
+        if not others:
+            maps.append(_unknown(grey[view, 0], far))
+            continue
+        scores = _combine([_scores(grey, views.cameras, view, other, inverse) for other in others])
+        cost = _semi_global(1.0 - scores, grey[view, 0])
+        maps.append(_refine(cost, scores, inverse))
+    return maps
+
+
+def _unknown(image: Tensor, far: float) -> DepthMap:
+    return DepthMap(torch.full_like(image, far), torch.full_like(image, -1.0), torch.zeros_like(image).bool())
+
+
+def _neighbours(views: Views, view: int) -> list[int]:
+    centers = camera_centers(views.cameras)
+    distances = (centers - centers[view]).norm(dim=1)
+    order = distances.argsort(stable=True).tolist()
+    return [other for other in order if other != view and distances[other] > 0][:NEIGHBOURS]
+
+
+def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
+    """Normalised cross-correlation of patches, `(D, H, W)`; 0 where the patch leaves the other image.
+
+    A plane at depth d of the view has the homography K' (R + t n^T / d) K^-1 to the other view.
+    """
+    intrinsics, extrinsics = cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu()
+    height, width = grey.shape[-2:]
+    rotation = extrinsics[other, :3, :3] @ extrinsics[view, :3, :3].mT
+    shift = extrinsics[other, :3, 3] - rotation @ extrinsics[view, :3, 3]
+    back = torch.linalg.inv(intrinsics[view])
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1).double()
+    rays = (intrinsics[other] @ rotation @ back @ pixels).float()
+    offset = (intrinsics[other] @ shift).float()
+    spans = max(width - 1, 1), max(height - 1, 1)
+    image = grey[view, 0]
+    mean, variance = _moments(image)
+    found = torch.empty(len(inverse), height, width)
+    for plane, value in enumerate(inverse.float().tolist()):
+        x, y, z = (rays + (value * offset)[:, None]).reshape(3, 1, height, width)
+        grid = torch.stack([2 * x / z / spans[0] - 1, 2 * y / z / spans[1] - 1], -1)
+        inside = ((grid.abs() <= 1).all(-1) & (z > 0))[0]
+        grid = torch.where(inside[None, ..., None], grid, 0.0)  # behind the camera there may be infinities
+        warped = F.grid_sample(grey[other : other + 1], grid, align_corners=True)[0, 0]
+        there, spread = _moments(warped)
+        covariance = _box(image * warped) - mean * there
+        score = covariance * ((variance + _VARIANCE) * (spread + _VARIANCE)).rsqrt()
+        found[plane] = torch.where(_box(inside.float()) > 0.99, score, 0.0)
+    return found
+
+
+def _box(image: Tensor) -> Tensor:
+    """Mean over the window of an image `(H, W)`."""
+    return torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
+
+
+def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
+    mean = _box(image)
+    return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
+
+
+def _combine(scores: list[Tensor]) -> Tensor:
+    """Over the neighbours: half the best and half the mean of the better ones, so that one may be hidden."""
+    stack = torch.stack(scores)
+    if len(stack) == 1:
+        return stack[0]
+    best = stack.sort(dim=0, descending=True).values[: max(2, (len(stack) + 1) // 2)]
+    return 0.5 * best[0] + 0.5 * best.mean(0)
+
+
+def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
+    """Costs `(D, H, W)` with those of smooth surfaces along eight directions added."""
+    total = torch.zeros_like(cost)
+    for volume, image, result in ((cost, grey, total), (cost.mT, grey.mT, total.mT)):
+        for flip in (False, True):
+            for slant in (-1, 0, 1) if volume is cost else (0,):
+                _add_paths(volume, image, result, flip, slant)
+    return total
+
+
+def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
+    """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right a row."""
+    rows = range(cost.shape[1] - 1, -1, -1) if flip else range(cost.shape[1])
+    before: Tensor | None = None
+    last = 0
+    for row in rows:
+        path = cost[:, row].clone()
+        if before is not None:
+            came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
+            least = came.amin(0)
+            jump = (JUMP * EDGE / (EDGE + edge)).clamp_min(1.5 * STEP)
+            cheapest = torch.minimum(came, least + jump)
+            cheapest[1:] = torch.minimum(cheapest[1:], came[:-1] + STEP)
+            cheapest[:-1] = torch.minimum(cheapest[:-1], came[1:] + STEP)
+            more = cheapest - least
+            if slant:
+                more[:, 0 if slant > 0 else -1] = 0.0  # paths begin at the border
+            path += more
+        total[:, row] += path
+        before, last = path, row
+
+
+def _refine(cost: Tensor, scores: Tensor, inverse: Tensor) -> DepthMap:
+    """The cheapest plane of each pixel, and between planes the lowest point of a parabola."""
+    planes = len(cost)
+    best = cost.argmin(0)
+    inner = best.clamp(1, planes - 2)
+    left, middle, right = (cost.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
+    step = float(inverse[1] - inverse[0])
+    depths = 1.0 / (float(inverse[0]) + (inner + offset) * step)
+    is_inner = (best > 0) & (best < planes - 1)
+    return DepthMap(depths, scores.gather(0, best[None])[0], is_inner)

@@ -1,0 +1,134 @@
+"""Depth maps and dense first points, against the true depths of the synthetic scene and of a plane."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from kgs.datasets.scene import Views
+from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
+from kgs.fit.dense import dense_points
+from kgs.fit.initialize import first_points
+from kgs.fit.plane_sweep import _semi_global, sweep_depths
+from kgs.fit.triangulate import project_all
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return synthetic_scene(train_views=3, test_views=1, size=(96, 128), seed=0).train
+
+
+@pytest.fixture(scope="module")
+def truth(views: Views) -> torch.Tensor:
+    return synthetic_depths(views.cameras, seed=0)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def span(truth: torch.Tensor) -> tuple[float, float]:
+    return 0.8 * float(truth.min()), 1.25 * float(truth.max())
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
+    for view, found in enumerate(sweep_depths(views, *span)):
+        accepted = found.is_inner & (found.scores > 0.6)
+        errors = (found.depths / truth[view] - 1).abs()
+        assert float(accepted.double().mean()) > 0.6
+        assert float(errors[accepted].median()) < 0.01
+        assert float((errors[accepted] < 0.02).double().mean()) > 0.7
+
+
+def test_points_lie_on_the_surfaces(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
+    points, colors = dense_points(views, *span, 2000, generator())
+    assert points.shape == colors.shape == (2000, 3)
+    assert points.dtype == colors.dtype == torch.float32
+    pixels, depths = project_all(points, views.cameras)
+    x, y = (pixels[..., 0].round().long().clamp(0, 127), pixels[..., 1].round().long().clamp(0, 95))
+    errors = torch.stack([(depths[:, v] / truth[v][y[:, v], x[:, v]] - 1).abs() for v in range(3)]).amin(0)
+    assert float(errors.median()) < 0.01
+    assert float((errors < 0.03).double().mean()) > 0.9
+    seen = torch.stack([views.images[v][:, y[:, v], x[:, v]].mT for v in range(3)])
+    assert float((seen - colors).abs().amax(-1).amin(0).median()) == 0.0  # the colour of the pixel it comes from
+
+
+def test_the_draw_follows_the_seed(views: Views, span: tuple[float, float]) -> None:
+    first, again, other = (dense_points(views, *span, 300, generator(seed))[0] for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("count", [2, 10])
+def test_two_views_and_many(count: int) -> None:
+    scene = synthetic_scene(train_views=count, test_views=1, size=(60, 80), seed=0)
+    depths = synthetic_depths(scene.train.cameras, seed=0)
+    points, _ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
+    assert len(points) > 500
+    assert points.isfinite().all()
+
+
+def select(views: Views, rows: list[int]) -> Views:
+    return views.select(rows)
+
+
+def test_where_nothing_can_be_compared_others_take_over(views: Views) -> None:
+    with pytest.warns(UserWarning, match=r"agree on 0 points only"), pytest.warns(UserWarning, match="random points"):
+        assert first_points(select(views, [0]), "dense", count=200).kind == "random"
+    grey = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
+    with pytest.warns(UserWarning, match="random points"):
+        assert first_points(grey, "dense", count=200).kind == "random"
+
+
+def test_views_from_one_place_have_no_depth(views: Views) -> None:
+    camera = views.camera(0)
+    both = [torch.cat([x, x]) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)]
+    twice = Views(PinholeCamera(*both), views.images[[0, 0]], ("a.png", "b.png"))
+    assert all(not found.is_inner.any() for found in sweep_depths(twice, 1.0, 10.0))
+
+
+def test_dense_is_a_kind_of_first_points(views: Views) -> None:
+    found = first_points(views, "dense")
+    assert found.kind == "dense"
+    assert 1000 <= len(found.points) <= 10_000
+
+
+def test_smoothing_keeps_edges_and_repairs_holes() -> None:
+    """Two flat halves with an edge in the image between them; a third of the pixels say nothing."""
+    planes, height, width = 32, 24, 40
+    truth = torch.full((height, width), 8)
+    truth[:, width // 2 :] = 20
+    grey = (truth == 20).float()
+    cost = (torch.arange(planes)[:, None, None] - truth).abs().clamp(max=5).float() / 5
+    silent = torch.rand(height, width, generator=generator()) < 0.33
+    cost = torch.where(silent, 0.5, cost)
+    found = _semi_global(cost, grey).argmin(0)
+    assert float((found == truth).double().mean()) > 0.99
+    assert float((torch.where(silent, 0.5, cost).argmin(0) == truth).double().mean()) < 0.75
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_smoothing_is_the_same_in_all_directions(tilt: float) -> None:
+    """Turned and mirrored input, turned and mirrored output."""
+    cost = torch.rand(9, 12, 12, generator=generator(3)) + tilt * torch.arange(12)
+    grey = torch.rand(12, 12, generator=generator(4))
+    plain = _semi_global(cost, grey)
+    for move in (lambda x: x.flip(-1), lambda x: x.flip(-2), lambda x: x.mT):
+        assert torch.allclose(move(_semi_global(move(cost), move(grey))), plain, rtol=1e-5)
+
+
+def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float]) -> None:
+    small = views.cameras.extrinsics.clone()
+    small[:, :3, 3] *= 1e-3
+    cameras = PinholeCamera(views.cameras.intrinsics, small, views.cameras.height, views.cameras.width)
+    (plain, *_), (scaled, *_) = (
+        sweep_depths(views, *span),
+        sweep_depths(Views(cameras, views.images, views.names), 1e-3 * span[0], 1e-3 * span[1]),
+    )
+    same = (scaled.depths / (1e-3 * plain.depths) - 1).abs() < 1e-3
+    assert float(same.double().mean()) > 0.99
+    assert math.isfinite(float(scaled.scores.sum()))
