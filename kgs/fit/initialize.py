@@ -92,6 +92,7 @@ def first_points(
     near, far = _depth_range(points, views.cameras)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
+        near, far = _sweep_range(points, views.cameras) if len(points) >= FEWEST_POINTS else (near, far)
         dense, colors = dense_points(views, near, far, count, generator)
         if len(dense) >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind="dense")
@@ -173,6 +174,13 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
             return 0.3 * float(depths.min()), 2.0 * float(depths.max())
     baseline = float(torch.cdist(centers, centers).max()) or 1.0
     return baseline, 20.0 * baseline
+
+
+def _sweep_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
+    """Beyond all points: a background that is cut off costs decibels, a few planes of inverse depth cost nothing."""
+    _, depths = project_all(points, cameras)
+    depths = depths[depths > 0]
+    return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 
 
 def _random_points(views: Views, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
