@@ -58,29 +58,26 @@ def test_points_lie_on_the_surfaces(views: Views, truth: torch.Tensor, span: tup
 
 
 def test_the_draw_follows_the_seed(views: Views, span: tuple[float, float]) -> None:
-    first, again, other = (dense_points(views, *span, 300, generator(seed))[0] for seed in (1, 1, 2))
+    small = views.halved()
+    first, again, other = (dense_points(small, *span, 300, generator(seed))[0] for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
 @pytest.mark.parametrize("count", [2, 10])
 def test_two_views_and_many(count: int) -> None:
-    scene = synthetic_scene(train_views=count, test_views=1, size=(60, 80), seed=0)
+    scene = synthetic_scene(train_views=count, test_views=1, size=(42, 56), seed=0)
     depths = synthetic_depths(scene.train.cameras, seed=0)
     points, _ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
-    assert len(points) > 500
+    assert len(points) > 300
     assert points.isfinite().all()
-
-
-def select(views: Views, rows: list[int]) -> Views:
-    return views.select(rows)
 
 
 def test_where_nothing_can_be_compared_others_take_over(views: Views) -> None:
     with pytest.warns(UserWarning, match=r"agree on 0 points only"), pytest.warns(UserWarning, match="random points"):
-        assert first_points(select(views, [0]), "dense", count=200).kind == "random"
+        assert first_points(views.select([0]), "dense", count=200).kind == "random"
     grey = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
-    with pytest.warns(UserWarning, match="random points"):
+    with pytest.warns(UserWarning, match="agree on 0"), pytest.warns(UserWarning, match="random points"):
         assert first_points(grey, "dense", count=200).kind == "random"
 
 
@@ -122,6 +119,7 @@ def test_smoothing_is_the_same_in_all_directions(tilt: float) -> None:
 
 
 def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float]) -> None:
+    views = views.halved()
     small = views.cameras.extrinsics.clone()
     small[:, :3, 3] *= 1e-3
     cameras = PinholeCamera(views.cameras.intrinsics, small, views.cameras.height, views.cameras.width)

@@ -197,7 +197,7 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
     rates = {
         name: factor * getattr(CONFIG.recipe, name) for name in ("lr_means", "lr_scales", "lr_opacity", "lr_quats")
     }
-    trainer = Trainer(scene, replace(CONFIG, steps=150, recipe=replace(CONFIG.recipe, **rates)), points)
+    trainer = Trainer(scene, replace(CONFIG, steps=90, recipe=replace(CONFIG.recipe, **rates)), points)
     with contextlib.suppress(TrainingDiverged):
         trainer.fit()
     assert all(torch.isfinite(value).all() for value in parameters(trainer).values())

@@ -68,4 +68,5 @@ def _unproject(views: Views, view: int, rows: Tensor, columns: Tensor, depths: T
     extrinsics = views.cameras.extrinsics[view].double().cpu()
     pixels = torch.stack([columns.double(), rows.double(), torch.ones_like(depths)], 1)
     local = pixels @ torch.linalg.inv(intrinsics).mT * depths[:, None]
-    return (local - extrinsics[:3, 3]) @ extrinsics[:3, :3]
+    world: Tensor = (local - extrinsics[:3, 3]) @ extrinsics[:3, :3]
+    return world
