@@ -174,16 +174,11 @@ def render(
         background: behind the splat.
         device: cpu, cuda, ...
     """
+    from kgs.datasets import load_scene
+
     from .fit.render import render_views
 
-    request = {
-        "scene": str(cameras),
-        "train_views": None,
-        "downscale": downscale,
-        "background": background,
-        "points": "none",
-    }
-    count = render_views(ply, _load(request), out, device)
+    count = render_views(ply, load_scene(cameras, None, downscale, background=background), out, device)
     print(f"{count} pictures in {out}")
     return 0
 

@@ -55,7 +55,7 @@ def measure_hostile(out: Path, *, quick: bool = False, say: Callable[[str], None
 
     Args:
         out: folder for the results, made if it is not there.
-        quick: fewer files, in 20 seconds instead of three minutes.
+        quick: fewer files, in 15 seconds instead of some 70.
         say: where lines for the user go.
 
     Returns:

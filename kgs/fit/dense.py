@@ -8,7 +8,7 @@ from torch import Tensor
 from kgs.datasets.scene import Views
 
 from .plane_sweep import DepthMap, sweep_depths
-from .triangulate import project_all
+from .triangulate import project_all, unproject
 
 __all__ = ["dense_points"]
 
@@ -48,7 +48,8 @@ def _agreed(views: Views, maps: list[DepthMap], view: int) -> tuple[Tensor, Tens
     """The points of one view's map that another view's map has too, and their colours in that view."""
     here = maps[view]
     rows, columns = (here.is_inner & (here.scores > SCORE)).nonzero().unbind(1)
-    points = _unproject(views, view, rows, columns, here.depths[rows, columns].double())
+    depths = here.depths[rows, columns].double()
+    points = unproject(torch.stack([columns, rows], 1), depths, torch.full_like(rows, view), views.cameras)
     pixels, depths = project_all(points, views.cameras)
     height, width = here.depths.shape
     agreed = torch.zeros(len(points), dtype=torch.bool)
@@ -61,12 +62,3 @@ def _agreed(views: Views, maps: list[DepthMap], view: int) -> tuple[Tensor, Tens
         close = (there.depths[y, x] / depths[:, other] - 1).abs() < AGREEMENT
         agreed |= inside & close & there.is_inner[y, x] & (there.scores[y, x] > SCORE)
     return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]
-
-
-def _unproject(views: Views, view: int, rows: Tensor, columns: Tensor, depths: Tensor) -> Tensor:
-    intrinsics = views.cameras.intrinsics[view, :3, :3].double().cpu()
-    extrinsics = views.cameras.extrinsics[view].double().cpu()
-    pixels = torch.stack([columns.double(), rows.double(), torch.ones_like(depths)], 1)
-    local = pixels @ torch.linalg.inv(intrinsics).mT * depths[:, None]
-    world: Tensor = (local - extrinsics[:3, 3]) @ extrinsics[:3, :3]
-    return world

@@ -20,7 +20,7 @@ from kgs.model import log_spacing
 
 from .dense import dense_points
 from .tracks import find_tracks
-from .triangulate import camera_centers, project_all, triangulate_certain
+from .triangulate import camera_centers, project_all, triangulate_certain, unproject
 
 __all__ = ["FirstPoints", "first_points", "typical_depths"]
 
@@ -185,17 +185,14 @@ def _sweep_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
 
 def _random_points(views: Views, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
     """Points of even density where at least two views see; where there is no such place, where one sees."""
-    intrinsics, extrinsics = views.cameras.intrinsics[:, :3, :3].double().cpu(), views.cameras.extrinsics.double().cpu()
     size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
     found: list[Tensor] = []
     for fewest in (min(2, len(views)), 1):
         for _ in range(50):
             draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
             view = (torch.rand(4 * count, generator=generator) * len(views)).long()
-            pixels = torch.cat([draws[:, :2] * size - 0.5, torch.ones(4 * count, 1)], dim=1)
             depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
-            local = (torch.linalg.inv(intrinsics)[view] @ pixels[..., None])[..., 0] * depths[:, None]
-            points = ((local - extrinsics[view, :3, 3])[:, None] @ extrinsics[view, :3, :3])[:, 0]
+            points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
             # A place that k views see is drawn k times as often as one that a single view sees.
             seeing = _inside(*project_all(points, views.cameras), views, near, far).sum(1)
             found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])

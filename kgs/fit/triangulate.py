@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .tracks import Tracks
 
-__all__ = ["camera_centers", "project_all", "triangulate", "triangulate_certain"]
+__all__ = ["camera_centers", "project_all", "triangulate", "triangulate_certain", "unproject"]
 
 
 def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
@@ -78,6 +78,15 @@ def project_all(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]
     local = torch.einsum("vij,pj->pvi", extrinsics[:, :3, :3], points.double()) + extrinsics[:, :3, 3]
     image = torch.einsum("vij,pvj->pvi", intrinsics, local)
     return image[..., :2] / image[..., 2:], local[..., 2]
+
+
+def unproject(pixels: Tensor, depths: Tensor, views: Tensor, cameras: PinholeCamera) -> Tensor:
+    """The places in the world `(P, 3)` of pixels `(P, 2)` at depths `(P,)`, each in the camera of its view, float64."""
+    intrinsics, extrinsics = _matrices(cameras)
+    rays = torch.cat([pixels.double(), torch.ones_like(depths)[:, None]], dim=1)
+    local = (torch.linalg.inv(intrinsics)[views] @ rays[..., None])[..., 0] * depths[:, None]
+    world: Tensor = (local - extrinsics[views, :3, 3])[:, None] @ extrinsics[views, :3, :3]
+    return world[:, 0]
 
 
 def camera_centers(cameras: PinholeCamera) -> Tensor:
