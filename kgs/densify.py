@@ -107,7 +107,15 @@ class Densifier:
         self.prune_opacity = prune_opacity
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
-        self._reset_statistics()
+        self._reset_statistics(torch.zeros_like(model.means[:, 0]))
+
+    @property
+    def mean_gradients(self) -> Tensor:
+        """The statistic of each Gaussian since the last `step`, `(N,)`; its value then counts as one more observation.
+
+        Clones and children begin with that of what they come from.
+        """
+        return (self._last_gradients + self._gradient_sums) / (1 + self._counts)
 
     @torch.no_grad()
     def observe(self, projected: ProjectedGaussians) -> None:
@@ -161,7 +169,7 @@ class Densifier:
         new["log_scales"][children] -= math.log(SHRINK)
         for name, parameter in list(model.named_parameters()):
             self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
-        self._reset_statistics()
+        self._reset_statistics(self.mean_gradients[torch.cat([kept, born])])
         pruned = before - len(kept) - len(split)
         return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
 
@@ -182,6 +190,7 @@ class Densifier:
         return {
             "gradient_sums": self._gradient_sums.clone(),
             "counts": self._counts.clone(),
+            "last_gradients": self._last_gradients.clone(),
             "generator": self.generator.get_state(),
         }
 
@@ -191,14 +200,15 @@ class Densifier:
         Raises:
             ValueError: an entry is missing, or the number of Gaussians is another.
         """
-        missing = {"gradient_sums", "counts", "generator"} - state.keys()
+        missing = {"gradient_sums", "counts", "last_gradients", "generator"} - state.keys()
         if missing:
-            raise ValueError(f"state: expected gradient_sums, counts and generator, got none for {sorted(missing)}")
-        for name in ("gradient_sums", "counts"):
+            raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
+        for name in ("gradient_sums", "counts", "last_gradients"):
             if state[name].shape != (len(self.model),):
                 raise ValueError(f"{name}: expected shape ({len(self.model)},), got {tuple(state[name].shape)}")
         self._gradient_sums.copy_(state["gradient_sums"])
         self._counts.copy_(state["counts"])
+        self._last_gradients.copy_(state["last_gradients"])
         self.generator.set_state(state["generator"].cpu())
 
     def _choose(self, hot: Tensor, average: Tensor, remaining: int) -> tuple[Tensor, int]:
@@ -242,10 +252,10 @@ class Densifier:
             self.optimizer.state[new] = state
         setattr(self.model, name, new)
 
-    def _reset_statistics(self) -> None:
-        means = self.model.means
-        self._gradient_sums = means.new_zeros(len(means))
-        self._counts = torch.zeros(len(means), dtype=torch.int64, device=means.device)
+    def _reset_statistics(self, last_gradients: Tensor) -> None:
+        self._last_gradients = last_gradients.detach()
+        self._gradient_sums = torch.zeros_like(self._last_gradients)
+        self._counts = torch.zeros_like(self._last_gradients, dtype=torch.int64)
 
 
 def camera_extent(extrinsics: Tensor) -> float:

@@ -4,7 +4,8 @@ Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sp
 CVPR 2025: o_i <- M_i o_i with M_i = 1/(1 - r) for kept and 0 for dropped Gaussians, r_t = gamma t / T.
 
 The layer needs nothing but torch and fits any splatting pipeline: put it between the activated opacities and the
-rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render.
+rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render. That of
+a subset chosen by scores (`DropGaussian.scores`, for the paper's comparison) is not.
 """
 
 from __future__ import annotations
@@ -73,6 +74,10 @@ class DropGaussian(nn.Module):
     The rate of a call is `p * schedule(progress)`. `progress` is a plain attribute in [0, 1] that the training loop
     sets; it defaults to 1, so that a layer whose progress is never set is plain dropout at p.
 
+    `scores` is a plain attribute too, None unless set: a tensor of the shape of the opacities. With it nothing is
+    random: the call drops the share of the rate with the highest scores, of each camera's row in `(C, N)`, and scales
+    the rest by 1/(1 - rate) as ever. It stays until it is replaced; the layer does not know what the scores mean.
+
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
@@ -104,6 +109,7 @@ class DropGaussian(nn.Module):
         self.p = float(p)
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
         self.seed = seed
+        self.scores: Tensor | None = None
         self._progress: float | None = None
         self._warned = False
         self._generator: torch.Generator | None = None
@@ -127,7 +133,11 @@ class DropGaussian(nn.Module):
         return rate
 
     def forward(self, opacities: Tensor) -> Tensor:
-        """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
+        """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`.
+
+        Raises:
+            ValueError: `scores` is set and has another shape than `opacities`.
+        """
         if not self.training:
             return opacities
         if self._progress is None and not self._warned and self.schedule is not constant:
@@ -137,6 +147,8 @@ class DropGaussian(nn.Module):
                 "throughout; set `drop.progress = step / total_steps` in the loop, or schedule='constant'",
                 stacklevel=2,
             )
+        if self.scores is not None:
+            return _drop_highest(opacities, self.scores, self.rate)
         generator = None if self.seed is None else self._own_generator(opacities.device)
         return drop_gaussian(opacities, self.rate, True, generator)
 
@@ -181,6 +193,18 @@ class DropGaussian(nn.Module):
             device, generator_state = state["_generator"]
             self._generator = torch.Generator(device)
             self._generator.set_state(generator_state)
+
+
+def _drop_highest(opacities: Tensor, scores: Tensor, rate: float) -> Tensor:
+    """Without randomness: the round(rate N) highest scores go; of equal ones the first."""
+    if scores.shape != opacities.shape:
+        raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
+    if rate == 0.0:
+        return opacities
+    rows = scores.reshape(-1, scores.shape[-1]) if scores.ndim > 1 and scores.shape[-1] > 1 else scores.reshape(1, -1)
+    dropped = rows.argsort(dim=1, descending=True, stable=True)[:, : round(rate * rows.shape[1])]
+    mask = torch.full_like(rows, 1.0 / (1.0 - rate), dtype=opacities.dtype).scatter_(1, dropped, 0.0)
+    return opacities * mask.reshape(opacities.shape)
 
 
 def _check_rate(name: str, rate: float) -> None:

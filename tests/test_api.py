@@ -38,12 +38,12 @@ INVENTORY = {
         "project",
         "save_ply",
     ],
-    "kgs.losses": ["TargetMoments", "photometric_loss", "target_moments"],
+    "kgs.losses": ["TargetMoments", "opacity_l1", "photometric_loss", "target_moments"],
     "kgs.datasets": ["Scene", "Views", "load_scene", "synthetic_scene"],
     "kgs.reference": ["Layers", "layers", "render"],
 }
 PUBLIC = [(module, name) for module, names in INVENTORY.items() for name in names]
-HEAVY = ("cv2", "trimesh", "matplotlib", "tqdm", "tyro", "pycolmap", "scipy", "viser")
+HEAVY = ("cv2", "trimesh", "matplotlib", "tqdm", "tyro", "pycolmap", "scipy", "viser", "distributed")
 
 
 def sources(folder):

@@ -466,3 +466,20 @@ def test_extent_of_known_cameras():
 def test_extent_of_something_else_is_refused(shape):
     with pytest.raises(ValueError, match="extrinsics: expected shape"):
         camera_extent(torch.zeros(shape))
+
+
+# -- the mean gradients that scores are made of --------------------------------------------------------------------
+
+
+def test_mean_gradients_go_on_through_a_step_and_children_inherit_them():
+    model, _, densifier = make([SMALL, LARGE, SMALL, SMALL], opacities=[0.5, 0.5, 0.5, 1e-4], grad_threshold=0.5)
+    assert densifier.mean_gradients.tolist() == [0.0, 0.0, 0.0, 0.0]
+    densifier.observe(seen(model, [0, 1, 2, 3], [[0.8, 0.0], [0.9, 0.0], [0.1, 0.0], [0.7, 0.0]]))
+    densifier.observe(seen(model, [0, 1], [[0.8, 0.0], [0.9, 0.0]]))
+    assert densifier.mean_gradients.tolist() == pytest.approx([1.6 / 3, 1.8 / 3, 0.1 / 2, 0.7 / 2])
+    report = densifier.step()
+    assert (report.cloned, report.split, report.pruned) == (1, 1, 1)
+    # kept: 0 and 2; born: the clone of 0, two children of 1; the transparent one is gone
+    assert densifier.mean_gradients.tolist() == pytest.approx([1.6 / 3, 0.1 / 2, 1.6 / 3, 1.8 / 3, 1.8 / 3])
+    densifier.observe(seen(model, [1], [[0.4, 0.0]]))
+    assert densifier.mean_gradients.tolist() == pytest.approx([1.6 / 3, 0.45 / 2, 1.6 / 3, 1.8 / 3, 1.8 / 3])

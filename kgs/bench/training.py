@@ -50,7 +50,8 @@ def fit_cell(cell: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         cell: `scene`, "synthetic" or "fern" (found through KGS_DATA); `fast` where the fit starts from that setting and
-            not from the default; the rest are fields of FitConfig.
+            not from the default; the rest are fields of FitConfig. The fit begins with SIFT points unless "init" says
+            otherwise.
     """
     from kgs.datasets import load_scene, synthetic_scene
     from kgs.fit.run import choose_points, measure
@@ -58,7 +59,7 @@ def fit_cell(cell: dict[str, Any]) -> dict[str, Any]:
 
     settings = FAST if cell.get("fast") else FitConfig()
     turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
-    config = FitConfig.from_dict(settings.to_dict() | turned)
+    config = FitConfig.from_dict(settings.to_dict() | {"init": "sift"} | turned)
     if cell["scene"] == SYNTHETIC:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
     else:

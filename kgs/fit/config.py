@@ -16,6 +16,8 @@ __all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
 _MIN_DENSIFICATIONS = 20
 _MOST_STEPS = 10_000_000
 _SEEDS = 2**59  # ten times a seed is one of torch's
+_DROP_BY = ("random", "high-gradient", "low-gradient", "near", "far")
+_OPACITY_L1_BY = ("gradient", "distance")
 
 
 @dataclass(frozen=True)
@@ -81,13 +83,17 @@ class FitConfig:
         steps: iterations; other numbers than the recipe's 10 000 scale its counts, see :func:`timetable`.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: "linear" (the paper's) or "constant".
+        drop_by: "random" (the method), or by scores those with the highest or lowest mean gradient ("high-gradient",
+            "low-gradient"), those nearest to or farthest from the camera ("near", "far").
+        opacity_l1: weight of the L1 penalty on opacities, see :func:`kgs.losses.opacity_l1`; 0 leaves it out.
+        opacity_l1_by: it is heavier on Gaussians with a low mean "gradient", or at a great "distance".
         sh_degree: degree of the harmonics, 0 to 3.
         coarse: share of the steps, the first ones, that see the training views in half the pixels a side; in [0, 1].
         seed: views, splits, masks and random points are drawn from streams that derive from it.
         init: first points: "dense", "sift", "random", "model-points" (positions refined with test views), "file", or
-            "auto", which is "sift" except where the layout itself prescribes random points (Blender).
+            "auto", which is "dense" except where the layout itself prescribes random points (Blender).
         init_file: point cloud for "file".
-        max_gaussians: densification stops there; None: 10 a step, and at least 4 times the first points.
+        max_gaussians: densification stops there; None: 10 a step, and at least twice the first points.
         growth: share of the steps over which the limit rises to that, evenly, from the first points; 0 sets it at
             once. In [0, 1].
         max_bytes: bound for the working memory of a render, see :class:`GaussianRenderer`; it changes
@@ -100,6 +106,9 @@ class FitConfig:
     steps: int = 2000
     drop: float = 0.2
     drop_schedule: str = "linear"
+    drop_by: str = "random"
+    opacity_l1: float = 0.0
+    opacity_l1_by: str = "gradient"
     sh_degree: int = 3
     coarse: float = 0.0
     seed: int = 0
@@ -123,6 +132,11 @@ class FitConfig:
             raise ValueError(f"seed: expected a number below 2^59, got {self.seed}")
         if not 0.0 <= self.drop < 1.0:
             raise ValueError(f"drop: expected a rate in [0, 1), got {self.drop}")
+        for name, choices in (("drop_by", _DROP_BY), ("opacity_l1_by", _OPACITY_L1_BY)):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: expected one of {list(choices)}, got {getattr(self, name)!r}")
+        if self.opacity_l1 < 0.0:
+            raise ValueError(f"opacity_l1: expected a weight of at least 0, got {self.opacity_l1}")
         for name in ("coarse", "growth"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")

@@ -21,6 +21,7 @@ __all__ = ["DEMO", "run_demo"]
 DEMO = FitConfig(
     steps=1200,
     drop=0.2,
+    init="sift",
     max_gaussians=3000,
     recipe=Recipe(
         lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -13,12 +13,55 @@ from kgs.errors import DataError
 
 from .config import FitConfig
 
-__all__ = ["check_optimizer", "check_state", "fingerprint"]
+if TYPE_CHECKING:
+    from .trainer import Trainer
+
+__all__ = ["check_state", "restore", "trainer_state"]
 
 _POINT = {"step", "seconds", "test_psnr", "train_psnr"}
 
 
-def fingerprint(scene: Scene) -> dict[str, Any]:
+def trainer_state(trainer: Trainer) -> dict[str, Any]:
+    """Everything that the rest of a fit depends on."""
+    return {
+        "config": trainer.config.to_dict(),
+        "scene": _fingerprint(trainer.scene),
+        "init": trainer.init,
+        "step": trainer.step,
+        "seconds": trainer.seconds,
+        "curve": trainer.curve,
+        "notes": trainer.notes,
+        "extent": trainer.extent,
+        "max_gaussians": trainer.max_gaussians,
+        "near_plane": trainer.renderer.near_plane,
+        "model": trainer.model.state_dict(),
+        "sh_degree": trainer.model.sh_degree,
+        "optimizer": trainer.optimizer.state_dict(),
+        "densifier": trainer.densifier.state_dict(),
+        "order": trainer.order.get_state(),
+        "stack": trainer.stack,
+        "drop": None if trainer.drop is None else trainer.drop.get_rng_state(),
+    }
+
+
+def restore(trainer: Trainer, state: dict[str, Any]) -> None:
+    """Bring a trainer whose model is there to where a checkpoint left it: optimiser, densifier, random streams, counts.
+
+    Raises:
+        AttributeError, KeyError, RuntimeError, TypeError or ValueError: an entry is missing or does not fit.
+    """
+    groups = trainer.optimizer.state_dict()["param_groups"]  # they follow from the configuration
+    trainer.optimizer.load_state_dict({"state": state["optimizer"]["state"], "param_groups": groups})
+    _check_optimizer(trainer.optimizer)
+    trainer.densifier.load_state_dict(state["densifier"])
+    trainer.order.set_state(state["order"])
+    if trainer.drop is not None:
+        trainer.drop.set_rng_state(state["drop"], trainer.device)
+    trainer.step, trainer.seconds = state["step"], state["seconds"]
+    trainer.curve, trainer.notes, trainer.stack = state["curve"], state["notes"], state["stack"]
+
+
+def _fingerprint(scene: Scene) -> dict[str, Any]:
     """A few plain values that tell a scene's training views from others."""
     views = scene.train
     return {
@@ -35,7 +78,7 @@ def check_state(path: Path, state: dict[str, Any], scene: Scene, config: FitConf
     Raises:
         DataError: an entry is missing or wrong, or the scene or the configuration is another.
     """
-    for field, asked in (("config", config.to_dict()), ("scene", fingerprint(scene))):
+    for field, asked in (("config", config.to_dict()), ("scene", _fingerprint(scene))):
         saved = state.get(field)
         for key, value in asked.items():
             if key == "device":  # a fit may go on elsewhere
@@ -62,7 +105,7 @@ def check_state(path: Path, state: dict[str, Any], scene: Scene, config: FitConf
             raise DataError(path, field, f"expected {what}, got {got}")
 
 
-def check_optimizer(optimizer: Optimizer) -> None:
+def _check_optimizer(optimizer: Optimizer) -> None:
     """Make sure that Adam's state is that of the parameters and has their shapes, which torch does not.
 
     Raises:

@@ -21,7 +21,7 @@ from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
 from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged
-from kgs.losses import TargetMoments, photometric_loss, target_moments
+from kgs.losses import TargetMoments, opacity_l1, photometric_loss, target_moments
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -29,7 +29,8 @@ from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
 from .initialize import FirstPoints, typical_depths
-from .state import check_optimizer, check_state, fingerprint
+from .scores import gaussian_scores
+from .state import check_state, restore, trainer_state
 
 __all__ = ["Trainer", "move_camera"]
 
@@ -63,6 +64,7 @@ class Trainer:
         seconds: time spent in training steps; evaluations are not counted.
         notes: lines that a user should read (a capped count, for instance).
         saved: the last checkpoint that was written or read, in words; "" before the first.
+        order, stack: the random stream of views, and the views that still come before it is asked again.
     """
 
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
@@ -73,7 +75,7 @@ class Trainer:
         nearest, median = typical_depths(scene.train, points.points)
         # a rig without extent (one camera, or a pure rotation) still has to move its Gaussians
         self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)
-        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 4 * len(points.points))
+        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 2 * len(points.points))
         model = GaussianModel.from_points(points.points, points.colors, config.sh_degree)
         model.sh_degree = 0
         self._build(model, config.recipe.near_plane * nearest)
@@ -82,7 +84,7 @@ class Trainer:
         self.curve: list[dict[str, float | None]] = []
         self.notes: list[str] = []
         self.saved = ""
-        self._stack: list[int] = []
+        self.stack: list[int] = []
 
     def _build(self, model: GaussianModel, near_plane: float) -> None:
         config, recipe = self.config, self.config.recipe
@@ -105,7 +107,7 @@ class Trainer:
             max_gaussians=self.max_gaussians,
             generator=torch.Generator().manual_seed(_seed(config, 2)),
         )
-        self._order = torch.Generator().manual_seed(_seed(config, 3))
+        self.order = torch.Generator().manual_seed(_seed(config, 3))
         self._background = self.scene.background.to(self.device)
         self._views = self._targets(self.scene.train)
         self._coarse_views = self._targets(self.scene.train.halved()) if self.times.coarse else []
@@ -193,28 +195,7 @@ class Trainer:
         Raises:
             OSError: the file cannot be written; earlier ones are untouched.
         """
-        save_checkpoint(
-            path,
-            {
-                "config": self.config.to_dict(),
-                "scene": fingerprint(self.scene),
-                "init": self.init,
-                "step": self.step,
-                "seconds": self.seconds,
-                "curve": self.curve,
-                "notes": self.notes,
-                "extent": self.extent,
-                "max_gaussians": self.max_gaussians,
-                "near_plane": self.renderer.near_plane,
-                "model": self.model.state_dict(),
-                "sh_degree": self.model.sh_degree,
-                "optimizer": self.optimizer.state_dict(),
-                "densifier": self.densifier.state_dict(),
-                "order": self._order.get_state(),
-                "stack": self._stack,
-                "drop": None if self.drop is None else self.drop.get_rng_state(),
-            },
-        )
+        save_checkpoint(path, trainer_state(self))
         self.saved = f"{path} of step {self.step}"
 
     @classmethod
@@ -237,27 +218,15 @@ class Trainer:
             raise DataError(path, "model", str(error)) from error
         trainer._build(model, state["near_plane"])
         try:
-            trainer._restore(state)
+            restore(trainer, state)
         except KeyError as error:
             raise DataError(path, str(error.args[0]), "expected this entry in the checkpoint, got none") from error
         except (AttributeError, RuntimeError, TypeError, ValueError) as error:
             raise DataError(path, "state", str(error)) from error
-        trainer.step, trainer.seconds = state["step"], state["seconds"]
-        trainer.curve, trainer.notes, trainer._stack = state["curve"], state["notes"], state["stack"]
         trainer.saved = f"{path} of step {trainer.step}"
         if damage:
             trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         return trainer
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        """Bring the optimiser, the densifier and the random streams to where a checkpoint left them."""
-        groups = self.optimizer.state_dict()["param_groups"]  # they follow from the configuration
-        self.optimizer.load_state_dict({"state": state["optimizer"]["state"], "param_groups": groups})
-        check_optimizer(self.optimizer)
-        self.densifier.load_state_dict(state["densifier"])
-        self._order.set_state(state["order"])
-        if self.drop is not None:
-            self.drop.set_rng_state(state["drop"], self.device)
 
     def _train_step(self) -> float:
         config, recipe = self.config, self.config.recipe
@@ -267,12 +236,19 @@ class Trainer:
             (1 - progress) * math.log(recipe.lr_means) + progress * math.log(recipe.lr_means_final)
         )
         self.model.sh_degree = sum(self.step >= step for step in self.times.sh)
-        if self.drop is not None:
-            self.drop.progress = progress
         views = self._coarse_views if self.step <= self.times.coarse else self._views
         camera, target, moments = views[self._next_view()]
-        out = self.renderer(self.model(), camera, self._background)
+        if self.drop is not None:
+            self.drop.progress = progress
+            if config.drop_by != "random":
+                self.drop.scores = gaussian_scores(config.drop_by, self.densifier, camera)
+        gaussians = self.model()
+        out = self.renderer(gaussians, camera, self._background)
         loss = photometric_loss(out.image.clamp(0, 1), target, recipe.dssim_weight, moments=moments)
+        if config.opacity_l1:
+            by = "low-gradient" if config.opacity_l1_by == "gradient" else "far"
+            scores = gaussian_scores(by, self.densifier, camera)
+            loss = loss + config.opacity_l1 * opacity_l1(gaussians.opacities, scores)
         value = float(loss.detach())
         if int(out.projected.num_nonfinite):
             self._stop_if(parameter_fault(self.model))
@@ -300,9 +276,9 @@ class Trainer:
         return first + round(share * (self.max_gaussians - first))
 
     def _next_view(self) -> int:
-        if not self._stack:
-            self._stack = torch.randperm(len(self._views), generator=self._order).tolist()
-        return self._stack.pop()
+        if not self.stack:
+            self.stack = torch.randperm(len(self._views), generator=self.order).tolist()
+        return self.stack.pop()
 
 
 def _seed(config: FitConfig, stream: int) -> int:

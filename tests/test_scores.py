@@ -1,0 +1,113 @@
+"""Scores of Gaussians, and the fits that use them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kgs.datasets import synthetic_scene
+from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.initialize import FirstPoints
+from kgs.fit.scores import gaussian_scores
+from kgs.fit.trainer import Trainer
+
+CONFIG = FitConfig(steps=60, drop=0.4, seed=2, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic_scene(train_views=3, test_views=1, size=(32, 40), seed=1)
+
+
+@pytest.fixture(scope="module")
+def points():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
+    return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
+
+
+def test_distances_are_those_to_the_cameras_centre(scene, points):
+    trainer = Trainer(scene, CONFIG, points)
+    for view in range(3):
+        camera = scene.train.camera(view)
+        rotation, shift = camera.extrinsics[0, :3, :3], camera.extrinsics[0, :3, 3]
+        in_camera = points.points @ rotation.T + shift
+        far = gaussian_scores("far", trainer.densifier, camera)
+        torch.testing.assert_close(far, in_camera.norm(dim=1), rtol=1e-5, atol=1e-5)
+        assert torch.equal(gaussian_scores("near", trainer.densifier, camera), -far)
+
+
+def test_gradients_are_those_that_densification_compares(scene, points):
+    trainer = Trainer(scene, replace(CONFIG, recipe=Recipe(grad_threshold=1e9)), points)
+    trainer.fit(lambda trainer, _: trainer.step == 9)  # before the first densification
+    state = trainer.densifier.state_dict()
+    expected = state["gradient_sums"] / (1 + state["counts"])
+    assert float(expected.max()) > 0
+    high = gaussian_scores("high-gradient", trainer.densifier, scene.train.camera(0))
+    torch.testing.assert_close(high, expected)
+    assert torch.equal(gaussian_scores("low-gradient", trainer.densifier, scene.train.camera(0)), -high)
+
+
+@pytest.mark.parametrize("by", ["high-gradient", "low-gradient", "near", "far"])
+def test_the_trainer_sets_the_scores_of_the_present_camera(scene, points, by):
+    trainer = Trainer(scene, replace(CONFIG, drop_by=by), points)
+    seen = []
+
+    def check(module, inputs, output):
+        seen.append((module.scores.clone(), inputs[0].detach(), output.detach(), module.rate))
+
+    trainer.drop.register_forward_hook(check)
+    trainer.fit(lambda trainer, _: trainer.step == 30)
+    for scores, before, after, rate in seen:
+        dropped = (after == 0) & (before > 0)
+        assert int(dropped.sum()) == round(rate * len(before))
+        if dropped.any():
+            assert float(scores[dropped].min()) >= float(scores[~dropped].max())
+    assert trainer.renderer.eval().opacity_layer(before) is before
+
+
+def test_random_is_without_scores(scene, points):
+    trainer = Trainer(scene, CONFIG, points)
+    trainer.fit(lambda trainer, _: trainer.step == 2)
+    assert trainer.drop.scores is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"drop_by": "high-gradient"}, {"drop_by": "far"}, {"opacity_l1": 0.1}, {"opacity_l1": 0.1, "drop": 0.0}],
+    ids=lambda change: "-".join(map(str, change.values())),
+)
+def test_a_fit_with_scores_resumes_bit_for_bit(scene, points, tmp_path, change):
+    config = replace(CONFIG, **change)
+    whole, first = Trainer(scene, config, points), Trainer(scene, config, points)
+    whole.fit()
+    first.fit(lambda trainer, _: trainer.step == 31)
+    first.save(tmp_path / "checkpoint.pt")
+    second = Trainer.resume(scene, config, tmp_path / "checkpoint.pt")
+    second.fit()
+    for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("by", ["gradient", "distance"])
+def test_the_penalty_lowers_opacities_the_more_the_higher_the_score(scene, points, by):
+    config = replace(CONFIG, drop=0.0, recipe=Recipe(grad_threshold=1e9, prune_opacity=0.0))
+    without, penalised = (Trainer(scene, replace(config, opacity_l1=w, opacity_l1_by=by), points) for w in (0.0, 1.0))
+    for trainer in (without, penalised):
+        trainer.fit(lambda trainer, _: trainer.step == 15)
+    fall = (without.model.opacity_logits.sigmoid() - penalised.model.opacity_logits.sigmoid()).detach()
+    assert float(fall.mean()) > 0
+    if by == "distance":
+        distances = torch.stack(
+            [gaussian_scores("far", without.densifier, scene.train.camera(i)) for i in range(3)]
+        ).mean(0)
+        order = distances.argsort()
+        assert float(fall[order[75:]].mean()) > float(fall[order[:75]].mean())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("drop_by", "nearest"), ("opacity_l1_by", "far"), ("opacity_l1", -0.1), ("opacity_l1", "1")]
+)
+def test_other_settings_are_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        FitConfig(**{name: value})
