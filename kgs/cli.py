@@ -8,11 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from .bench.command import bench
 from .errors import DataError, TrainingDiverged
+from .options import alias
 
 __all__ = ["main"]
 
-_EXTRA = {"tyro": "app", "tqdm": "app", "matplotlib": "app", "viser": "view", "pycolmap": "sfm"}
+_EXTRA = {
+    "tyro": "app",
+    "tqdm": "app",
+    "matplotlib": "app",
+    "viser": "view",
+    "pycolmap": "sfm",
+    "distributed": "cluster",
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -42,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def demo(
     *,
-    out: Annotated[Path, _alias("-o")] = Path("demo"),
+    out: Annotated[Path, alias("-o")] = Path("demo"),
     steps: int | None = None,
     size: tuple[int, int] = (54, 72),
     seed: int = 0,
@@ -77,7 +86,7 @@ def fit(
     scene: Path,
     /,
     *,
-    out: Annotated[Path, _alias("-o")],
+    out: Annotated[Path, alias("-o")],
     views: int | None = None,
     downscale: float | None = None,
     fast: bool = False,
@@ -108,10 +117,11 @@ def fit(
         drop: final rate of DropGaussian; 0 leaves it out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         seed: everything random derives from it.
-        init: first points. auto: SIFT matches of the training images (Blender scenes: random points in their box).
-            dense: from depth maps of the training images, made by a plane sweep in some seconds a view.
+        init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds a
+            view. sift: from matches of their keypoints. auto: dense (Blender scenes: random points in their box).
         init_file: a point cloud (PLY, OBJ, ...) for --init file.
-        max_gaussians: densification stops there; 10 a step unless given (14000 with --fast).
+        max_gaussians: densification stops there; 10 a step, and at least twice the first points,
+            unless given (14000 with --fast).
         sh_degree: degree of the view-dependent colour.
         background: behind images with transparency.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
@@ -158,7 +168,7 @@ def render(
     ply: Path,
     /,
     *,
-    out: Annotated[Path, _alias("-o")],
+    out: Annotated[Path, alias("-o")],
     cameras: Path,
     downscale: float | None = None,
     background: Literal["black", "white"] = "black",
@@ -205,61 +215,6 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     write_json(out / "metrics.json", metrics)
     _print_metrics(metrics)
     return 0
-
-
-def bench(
-    what: Literal["speed", "precision", "training", "extremes", "hostile", "faults"],
-    /,
-    *,
-    out: Annotated[Path, _alias("-o")],
-    quick: bool = False,
-    device: str = "cpu",
-    processes: int | None = None,
-) -> int:
-    """Measure this machine and write the figures as tables, CSV, JSON and plots.
-
-    Args:
-        what: speed: time and memory of rendering and of training steps, beside what kgs is held to. precision: errors
-            of images, gradients and footprints against time. training: test PSNR against time, one knob of the fit at
-            a time, with KGS_DATA on fern too; hours, goes on where it stopped. extremes: errors, bounds and times of
-            stiff and extreme cases. hostile: damaged files against every reader. faults: fits that are killed, or whose
-            disk is full, and memory over many steps. The last three end with exit code 1 where a promise is broken.
-        out: folder for the results.
-        quick: less of it, in about a minute.
-        device: cpu, cuda, ... (speed).
-        processes: fits at a time; one a core unless given (training).
-    """
-    if what == "speed":
-        from .bench.speed import measure_speed
-
-        measure_speed(out, quick=quick, device=device)
-    elif what == "precision":
-        from .bench.precision import measure_precision
-
-        measure_precision(out, quick=quick)
-    elif what == "training":
-        from .bench.training import measure_training
-
-        measure_training(out, quick=quick, processes=processes)
-    elif what == "extremes":
-        from .bench.extremes import measure_extremes
-
-        return int(measure_extremes(out, quick=quick)["missed"] > 0)
-    elif what == "hostile":
-        from .bench.hostile import measure_hostile
-
-        return int(bool(measure_hostile(out, quick=quick)["failures"]))
-    else:
-        from .bench.faults import measure_faults
-
-        return int(measure_faults(out, quick=quick)["failed"] > 0)
-    return 0
-
-
-def _alias(name: str) -> Any:
-    import tyro
-
-    return tyro.conf.arg(aliases=(name,))
 
 
 def _load(request: dict[str, Any]) -> Any:

@@ -1,32 +1,33 @@
 """Runs many cells of an experiment, each once: finished ones are kept in a file and not repeated.
 
 A cell is a dict of plain values: what to do and under which settings. Its result is appended to a JSONL file the moment
-it is there, so that a run that is killed loses no finished cell, and the next one goes on. Where the cells run is a
-matter of the executor: local processes, or any other that has the interface of `concurrent.futures`.
+it is there, so that a run that is killed loses no finished cell, and the next one goes on. Cells run in local
+processes, or on the workers of a Dask scheduler; a process that dies takes no other cell with it, and its own is done
+again.
 """
 
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from pathlib import Path
 from typing import Any
 
-__all__ = ["read_rows", "run_grid"]
+from .workers import LOST, Cell, Result, dask_workers, local_processes
 
-Cell = dict[str, Any]
+__all__ = ["read_rows", "run_grid"]
 
 
 def run_grid(
     cells: Sequence[Cell],
-    work: Callable[[Cell], dict[str, Any]],
+    work: Callable[[Cell], Result],
     path: Path,
     *,
-    executor: Executor | None = None,
     processes: int = 1,
+    scheduler: str | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Do the cells that the file does not have yet.
@@ -36,16 +37,22 @@ def run_grid(
         work: a function of a module (other processes import it); takes a cell, returns its result in plain values.
         path: JSONL, one line `{"cell": ..., "result": ...}` a finished cell; made if it is not there. A last line that
             was cut short is dropped.
-        executor: where to run them; None makes local processes, and ends them.
-        processes: how many local processes; they share the cores.
+        processes: how many local processes; they share the cores, and end with this one. A cell whose process dies is
+            tried once more.
+        scheduler: address of a Dask scheduler, as tcp://127.0.0.1:8786; its workers take the place of local processes,
+            and need the same packages and data. Workers may come and go; while there are none, the grid waits. Start
+            them with `dask worker ADDRESS --nthreads 1`: one cell at a time each, on as many cores as OMP_NUM_THREADS
+            says there (1 unless it is set). A cell whose worker dies goes to another one, and counts as failed when
+            the scheduler's `allowed-failures` are used up (the fourth time).
         say: where lines for the user go.
 
     Returns:
         The lines of the given cells, in their order.
 
     Raises:
-        ValueError: two cells are equal, or `processes` is below 1.
+        ValueError: two cells are equal, `processes` is below 1, or no scheduler answers within ten seconds.
         RuntimeError: cells failed; the message has the first error. All others are done and kept.
+        ConnectionError: the scheduler was lost; finished cells are kept.
     """
     if processes < 1:
         raise ValueError(f"processes: expected at least 1, got {processes}")
@@ -57,26 +64,17 @@ def run_grid(
     say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
     failures: list[str] = []
     if missing:
-        own = None if executor is not None else _local_processes(processes)
-        try:
-            futures: dict[Future[dict[str, Any]], Cell] = {
-                (executor or own).submit(work, cell): cell  # type: ignore[union-attr]  # one of the two is there
-                for cell in missing
-            }
-            for count, future in enumerate(as_completed(futures), 1):
-                cell = futures[future]
-                error = future.exception()
-                if error is not None:
-                    failures.append(f"{_key(cell)}: {error!r}")
+        places = local_processes(work, processes) if scheduler is None else dask_workers(work, scheduler, say)
+        with places as (start, limit):
+            for count, (cell, outcome) in enumerate(_outcomes(missing, start, limit), 1):
+                if isinstance(outcome, BaseException):
+                    failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
                     say(f"failed: {failures[-1]}")
                     continue
-                row = {"cell": cell, "result": future.result()}
+                row = {"cell": cell, "result": outcome}
                 _append(path, row)
                 done[_key(cell)] = row
                 say(f"{count} of {len(missing)}: {_key(cell)}")
-        finally:
-            if own is not None:
-                own.shutdown(cancel_futures=True)
     if failures:
         raise RuntimeError(f"{len(failures)} of {len(missing)} cells failed, the first one: {failures[0]}")
     return [done[key] for key in keys]
@@ -110,17 +108,36 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
     return rows
 
 
-def _local_processes(processes: int) -> ProcessPoolExecutor:
-    threads = max(1, (os.cpu_count() or 1) // processes)
-    return ProcessPoolExecutor(
-        processes, multiprocessing.get_context("spawn"), initializer=_limit_threads, initargs=(threads,)
-    )
+def _outcomes(
+    cells: Sequence[Cell], start: Callable[[Cell], Future[Result]], limit: Callable[[], int]
+) -> Iterator[tuple[Cell, Result | BaseException]]:
+    """Every cell with its result or error, as they come.
+
+    No more cells are given out than can run: Dask counts the death of a worker against all cells that wait there.
+    """
+    waiting = deque(cells)
+    running: dict[Future[Result], Cell] = {}
+    while waiting or running:
+        room = max(1, limit()) - len(running)
+        for _ in range(min(room, len(waiting))):
+            cell = waiting.popleft()
+            running[start(cell)] = cell
+        ended = _collect(running)
+        for cell, outcome in ended:
+            if not isinstance(outcome, CancelledError):
+                yield cell, outcome
+        if any(isinstance(outcome, CancelledError) for _, outcome in ended):
+            raise ConnectionError(LOST)
 
 
-def _limit_threads(threads: int) -> None:
-    import torch
+def _collect(running: dict[Future[Result], Cell]) -> list[tuple[Cell, Result | BaseException]]:
+    """Takes out those that ended within a second.
 
-    torch.set_num_threads(threads)
+    Nothing may refer to their futures after that: Dask does a finished cell again when its worker is lost, for as long
+    as somebody has its future.
+    """
+    ended = wait(running, timeout=1, return_when=FIRST_COMPLETED).done
+    return [(running.pop(f), CancelledError() if f.cancelled() else f.exception() or f.result()) for f in ended]
 
 
 def _key(cell: Cell) -> str:

@@ -29,5 +29,5 @@ def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Ten
         gradients = densifier.mean_gradients
         return gradients if by == "high-gradient" else -gradients
     means = densifier.model.means.detach()
-    distances = (means - camera_centers(camera).to(means)).norm(dim=1)
+    distances: Tensor = (means - camera_centers(camera).to(means)).norm(dim=1)
     return distances if by == "far" else -distances

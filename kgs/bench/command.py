@@ -1,0 +1,79 @@
+"""The command `kgs bench`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from kgs.options import alias
+
+__all__ = ["bench"]
+
+
+def bench(
+    what: Literal["speed", "precision", "training", "sparse", "starts", "extremes", "hostile", "faults"],
+    /,
+    *,
+    out: Annotated[Path, alias("-o")],
+    quick: bool = False,
+    device: str = "cpu",
+    processes: int | None = None,
+    preset: Literal["quick", "cpu", "paper"] = "quick",
+    scheduler: str | None = None,
+    lpips_weights: Path | None = None,
+) -> int:
+    """Measure this machine and write the figures as tables, CSV, JSON and plots.
+
+    Args:
+        what: what to measure.
+            speed: time and memory of rendering and of training steps.
+            precision: errors of images, gradients and footprints against time.
+            training: test PSNR against time, one knob of the fit at a time (hours, goes on where it stopped).
+            sparse: DropGaussian on and off, its schedules and rivals, and the starts (goes on where it stopped).
+            starts: depth errors, completeness and times of first points (20 minutes).
+            extremes: errors, bounds and times of stiff and extreme cases; exit code 1 where a bound is missed.
+            hostile: damaged files against every reader; exit code 1 where one is taken for sound.
+            faults: fits that are killed or whose disk is full; exit code 1 where anything is lost.
+            With KGS_DATA, a folder of scenes, training, sparse and starts measure on real ones.
+        out: folder for the results.
+        quick: less of it, in about a minute.
+        device: cpu, cuda, ... (speed).
+        processes: fits at a time; one a core unless given (training, sparse).
+        preset: sparse: quick takes minutes on the built-in scene; cpu hours on the five scenes of KGS_DATA; paper is
+            the paper's protocol on every scene there, for a large machine.
+        scheduler: sparse: address of a Dask scheduler whose workers run the cells.
+        lpips_weights: sparse: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
+    """
+    if what == "speed":
+        from .speed import measure_speed
+
+        measure_speed(out, quick=quick, device=device)
+    elif what == "precision":
+        from .precision import measure_precision
+
+        measure_precision(out, quick=quick)
+    elif what == "training":
+        from .training import measure_training
+
+        measure_training(out, quick=quick, processes=processes)
+    elif what == "sparse":
+        from .sparse import measure_sparse
+
+        measure_sparse(out, preset, processes=processes, scheduler=scheduler, lpips_weights=lpips_weights)
+    elif what == "starts":
+        from .starts import measure_starts
+
+        measure_starts(out, quick=quick)
+    elif what == "extremes":
+        from .extremes import measure_extremes
+
+        return int(measure_extremes(out, quick=quick)["missed"] > 0)
+    elif what == "hostile":
+        from .hostile import measure_hostile
+
+        return int(bool(measure_hostile(out, quick=quick)["failures"]))
+    else:
+        from .faults import measure_faults
+
+        return int(measure_faults(out, quick=quick)["failed"] > 0)
+    return 0

@@ -1,0 +1,94 @@
+"""One cell of the study of sparse views: one fit and everything that the report says of it."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError
+from kgs.fit.config import FitConfig
+from kgs.fit.initialize import FirstPoints
+from kgs.fit.lpips import Lpips
+from kgs.fit.report import peak_rss_mb
+from kgs.fit.run import choose_points, measure
+from kgs.fit.trainer import Trainer
+
+from .coadaptation import coadaptation
+from .thresholds import count_over_threshold
+
+__all__ = ["SYNTHETIC", "sparse_cell"]
+
+SYNTHETIC = "synthetic"
+SIZE = (96, 128)  # of the synthetic pictures
+MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
+
+
+def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
+    """Fit once and measure.
+
+    Fits of the same scene, views, start and seed begin with the same points and see the views in the same order.
+
+    Args:
+        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points),
+            "method" (a name, for the report), "seed", and "fit", the fields of FitConfig that are not the default's.
+        data: the folder of the scenes, where the cell runs.
+        lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
+
+    Returns:
+        Plain values: means of the measures under "test" and "train", "test_views" (PSNR of each), "curve", "init",
+        "gaussians", "wall_seconds" and "cpu_seconds" of the training, "peak_rss_mb", "coadaptation", "thresholds",
+        "protocol" and "versions".
+
+    Raises:
+        DataError: the scene is not there or damaged.
+    """
+    scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
+    config = FitConfig.from_dict(FitConfig().to_dict() | {"init": cell["start"], "seed": cell["seed"]} | cell["fit"])
+    trainer = Trainer(scene, config, points)
+    start = time.process_time()
+    trainer.fit()
+    cpu_seconds = time.process_time() - start
+    metrics = measure(trainer, None if lpips_weights is None else _lpips(lpips_weights))
+    return {
+        **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
+        "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
+        "curve": trainer.curve,
+        "init": {**trainer.init, "seconds": round(seconds, 2)},
+        "gaussians": len(trainer.model),
+        "wall_seconds": round(trainer.seconds, 2),
+        "cpu_seconds": round(cpu_seconds, 2),
+        "peak_rss_mb": peak_rss_mb(),
+        "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
+        "thresholds": count_over_threshold(trainer, points.points),
+        "protocol": metrics["protocol"],
+        "versions": metrics["versions"],
+    }
+
+
+@lru_cache(maxsize=1)  # cells of one start follow each other
+def _start(
+    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int
+) -> tuple[Scene, FirstPoints, float]:
+    """A scene, its first points, and the processor's seconds that they took."""
+    if name == SYNTHETIC:
+        scene = synthetic_scene(train_views=views, size=SIZE)
+    elif data is None:
+        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+    else:
+        kind = "model-points" if start == "model-points" else "none"
+        scene = load_scene(Path(data) / name, views, downscale, points=kind)
+    begin = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a start that fell back says so by its kind
+        points = choose_points(scene, FitConfig(init=start, seed=seed))
+    return scene, points, time.process_time() - begin
+
+
+@lru_cache(maxsize=1)
+def _lpips(weights: str) -> Lpips:
+    return Lpips.load(weights)

@@ -1,0 +1,58 @@
+"""Work for the grid that notes what happens; imports nothing heavy, for the processes that do it."""
+
+import os
+import signal
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+
+@contextmanager
+def threads_instead(work, processes):
+    """Threads in the place of `grid.local_processes`, where it does not matter."""
+    with ThreadPoolExecutor(processes) as executor:
+        yield partial(executor.submit, work), lambda: processes
+
+
+def cells_in(log, count, kill=None, seconds=0.2):
+    """Cells that note in the folder `log`; `kill`: which of them kill their process, {x: "once" or "always"}."""
+    kill = kill or {}
+    return [{"x": x, "log": str(log), "seconds": seconds, "kill": kill.get(x)} for x in range(count)]
+
+
+def do(cell):
+    log = Path(cell["log"])
+    (log / f"process {os.getpid()}").touch()
+    time.sleep(cell["seconds"])
+    killed = log / f"killed {cell['x']}"
+    if cell["kill"] == "always" or (cell["kill"] == "once" and not killed.exists()):
+        killed.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    with (log / "done").open("a") as file:
+        file.write(f"{cell['x']}\n")
+    return {"y": cell["x"] ** 2}
+
+
+def times_done(log):
+    """How often each cell came to its end."""
+    return Counter(int(line) for line in (log / "done").read_text().split())
+
+
+def processes_left(log):
+    """The processes that did a cell and do not end within ten seconds."""
+    pids = [int(path.name.split()[1]) for path in log.glob("process *")]
+    until = time.monotonic() + 10
+    while (left := [pid for pid in pids if _is_there(pid)]) and time.monotonic() < until:
+        time.sleep(0.05)
+    return left
+
+
+def _is_there(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

@@ -1,0 +1,212 @@
+"""The study of sparse views: its cells, what one of them measures, and that it goes on where it stopped."""
+
+import json
+import math
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+from grid_cells import threads_instead
+
+from kgs import DataError
+from kgs.bench import grid, sparse
+from kgs.bench.coadaptation import coadaptation
+from kgs.bench.sparse import METHODS, SCENES, measure_sparse, sparse_cells
+from kgs.bench.sparse_cell import sparse_cell
+from kgs.bench.thresholds import BINS, count_over_threshold
+from kgs.datasets import synthetic_scene
+from kgs.fit.config import FitConfig
+from kgs.fit.initialize import first_points
+from kgs.fit.trainer import Trainer
+from kgs.harmonics import SH_C0
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
+
+TINY = {"steps": 3, "max_gaussians": 400}
+
+
+@pytest.fixture
+def data(tmp_path):
+    for scene in SCENES:
+        (tmp_path / scene).mkdir(parents=True)
+    return tmp_path
+
+
+def tiny_cell(method="off", seed=0, start="sift"):
+    return {
+        "scene": "synthetic",
+        "views": 2,
+        "downscale": None,
+        "start": start,
+        "method": method,
+        "seed": seed,
+        "fit": TINY | METHODS[method],
+    }
+
+
+# -- the cells ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", ["quick", "cpu", "paper"])
+def test_each_cell_is_there_once_and_is_a_fit(preset, data):
+    cells = sparse_cells(preset, data)
+    assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
+    for cell in cells:
+        config = FitConfig.from_dict(FitConfig().to_dict() | cell["fit"])
+        assert config.drop == METHODS[cell["method"]]["drop"]
+
+
+def test_the_preset_cpu_holds_what_the_study_must_show(data):
+    cells = sparse_cells("cpu", data)
+    count = Counter((cell["scene"], cell["views"], cell["start"], cell["method"]) for cell in cells)
+    for scene, views in SCENES.items():
+        start = "scene" if scene.startswith("blender") else "dense"
+        for method in ("off", "progressive 0.2", "fixed 0.1"):
+            assert count[scene, views, start, method] == 3
+        assert count[scene, views, "sift", "progressive 0.2"] == 3
+    for scene in ("llff/fern", "llff/flower"):
+        for views in (6, 9):
+            for method in ("off", "progressive 0.2"):
+                assert count[scene, views, "dense", method] == 1
+    assert all(count["llff/fern", 3, "dense", method] == 3 for method in METHODS)
+    assert {cell["fit"]["steps"] for cell in cells} == {2000}
+
+
+def test_methods_of_one_start_follow_each_other_and_have_the_same_points(data):
+    cells = sparse_cells("cpu", data)[:6]
+    assert [cell["method"] for cell in cells[:3]] == ["off", "progressive 0.2", "fixed 0.1"]
+    assert len({(cell["scene"], cell["seed"]) for cell in cells[:3]}) == 1
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(ValueError, match="preset: expected one of"):
+        sparse_cells("fast", tmp_path)
+    with pytest.raises(DataError, match="KGS_DATA"):
+        sparse_cells("cpu", None)
+    with pytest.raises(DataError, match="llff/fern"):
+        sparse_cells("cpu", tmp_path)
+    with pytest.raises(DataError, match="expected scenes"):
+        sparse_cells("paper", tmp_path)
+
+
+# -- one cell ------------------------------------------------------------------------------------------------------
+
+
+def test_a_cell_measures_and_repeats_bit_for_bit():
+    results = [sparse_cell(tiny_cell("progressive 0.2")) for _ in range(2)]
+    for result in results:
+        json.dumps(result, allow_nan=False)
+        assert math.isfinite(result["test"]["psnr"])
+        assert result["test"]["lpips_vgg"] is None
+        assert result["init"]["kind"] == "sift"
+        assert result["gaussians"] == sum(result["thresholds"]["gaussians"])
+        assert len(result["test_views"]) == len(result["protocol"]["test"])
+        for key in ("wall_seconds", "cpu_seconds", "peak_rss_mb", "curve"):
+            result.pop(key)
+        result["init"].pop("seconds")
+    assert results[0] == results[1]
+
+
+def test_a_real_scene_needs_a_folder():
+    with pytest.raises(DataError, match="KGS_DATA"):
+        sparse_cell(tiny_cell() | {"scene": "llff/fern"})
+
+
+# -- goes on -------------------------------------------------------------------------------------------------------
+
+
+def test_it_goes_on_and_reports(tmp_path, monkeypatch):
+    cells = [tiny_cell("off"), tiny_cell("progressive 0.2"), tiny_cell("off", seed=1)]
+    monkeypatch.setattr(grid, "local_processes", threads_instead)
+    monkeypatch.setattr(sparse, "_quick_cells", lambda: cells[:2])
+    measure_sparse(tmp_path, processes=1, say=lambda line: None)
+    before = (tmp_path / "sparse.jsonl").read_bytes()
+    monkeypatch.setattr(sparse, "_quick_cells", lambda: cells)
+    said = []
+    rows = measure_sparse(tmp_path, processes=1, say=said.append)
+    assert said[0].startswith("2 of 3 cells are there")
+    assert (tmp_path / "sparse.jsonl").read_bytes().startswith(before)
+    assert [row["cell"] for row in rows] == cells
+    assert "off" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
+    assert (tmp_path / "index.html").exists()
+
+
+# -- the probe of co-adaptation ------------------------------------------------------------------------------------
+
+
+def spots(colors, depths, side=12):
+    """Separate opaque spots on a grid, at each place one Gaussian for each colour, at the given depths."""
+    rows, columns = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
+    places = torch.stack([columns, rows], -1).reshape(-1, 2) * 8.0 + 4.0 - 48.0
+    means = torch.cat([torch.cat([places / 100 * depth, torch.full((len(places), 1), depth)], 1) for depth in depths])
+    n = len(means)
+    model = GaussianModel(
+        means=means,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+        log_scales=torch.full((n, 3), math.log(0.03)),
+        opacity_logits=torch.full((n,), 9.0),
+        sh_dc=((torch.tensor(colors).repeat_interleave(len(places))[:, None, None].expand(n, 1, 3) - 0.5) / SH_C0),
+        sh_rest=torch.zeros(n, 0, 3),
+    )
+    scene = synthetic_scene(train_views=1, test_views=0, size=(96, 96))
+    cameras = scene.train.cameras
+    cameras.intrinsics[:, 0, 0] = cameras.intrinsics[:, 1, 1] = 100.0
+    cameras.intrinsics[:, :2, 2] = 47.5
+    cameras.extrinsics[:] = torch.eye(4)
+    return model, scene.train
+
+
+def test_gaussians_that_repeat_each_other_are_not_coadapted():
+    repeated, views = spots([0.6] * 12, [2.0 + 0.01 * k for k in range(12)])
+    rivals, _ = spots([0.2, 1.0] * 6, [2.0 + 0.01 * k for k in range(12)])
+    assert coadaptation(repeated, views) < 0.01 * coadaptation(rivals, views)
+
+
+def test_the_variance_of_one_before_another():
+    model, views = spots([1.0, 0.2], [2.0, 2.05])
+    # at each place both are there, or one, or none, each in one of four halves; all pairs of these by hand
+    half = len(model) // 2
+    states = []
+    for front, behind in ((1, 1), (1, 0), (0, 1), (0, 0)):
+        gaussians = model()
+        switch = torch.tensor([front, behind]).repeat_interleave(half)
+        out = GaussianRenderer()(
+            replace(gaussians, opacities=gaussians.opacities * switch), views.camera(0), outputs=("image", "alpha")
+        )
+        states.append((out.image[0].detach(), out.alpha[0, 0] > 0.8))
+    pairs = [(a, b, seen & also) for a, seen in states for b, also in states]
+    total = sum(float((0.5 * (a - b) ** 2).mean(0)[covered].sum()) for a, b, covered in pairs)
+    expected = total / sum(int(covered.sum()) for _, _, covered in pairs)
+    values = [coadaptation(model, views, subsets=2, seed=seed) for seed in range(40)]
+    assert sum(values) / 40 == pytest.approx(expected, rel=0.07)  # 3 standard errors of 5760 draws
+    assert 0.05 < expected < 0.8**2 * 2 / 9  # where spots are opaque the front one shows in two of three
+
+
+def test_it_is_repeatable_and_says_when_nothing_is_covered():
+    model, views = spots([1.0, 0.2], [2.0, 2.05])
+    assert coadaptation(model, views, seed=3) == coadaptation(model, views, seed=3)
+    single, views = spots([1.0], [2.0], side=1)
+    assert coadaptation(single, views, subsets=8) is None
+    with pytest.raises(ValueError, match="subsets"):
+        coadaptation(model, views, subsets=1)
+
+
+# -- Gaussians over the threshold ----------------------------------------------------------------------------------
+
+
+def test_counts_by_distance():
+    scene = synthetic_scene(train_views=2, test_views=0, size=(24, 32))
+    points = first_points(scene.train, "random", count=600)
+    trainer = Trainer(scene, FitConfig(steps=4, max_gaussians=600), points)
+    trainer.fit()
+    counts = count_over_threshold(trainer, points.points)
+    assert len(counts["distance"]) == BINS + 1
+    assert counts["distance"] == sorted(counts["distance"])
+    assert sum(counts["gaussians"]) == len(trainer.model)
+    assert max(counts["gaussians"]) < 1.2 * min(counts["gaussians"])  # quantiles of where they began
+    assert all(over <= count for over, count in zip(counts["over"], counts["gaussians"], strict=True))
+    trainer.densifier.grad_threshold = 0.0
+    assert count_over_threshold(trainer, points.points)["over"] == counts["gaussians"]
+    trainer.densifier.grad_threshold = math.inf
+    assert sum(count_over_threshold(trainer, points.points)["over"]) == 0

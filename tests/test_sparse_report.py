@@ -1,0 +1,299 @@
+"""The report of the study of sparse views, on made-up cells."""
+
+import base64
+import csv
+import math
+import random
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from kgs.bench.output import html_table, latex_escape, latex_table
+from kgs.bench.sparse import METHODS
+from kgs.bench.sparse_plots import STYLES
+from kgs.bench.sparse_report import write_report
+from kgs.bench.statistics import student_quantile
+
+TEXTS = ("sparse.csv", "summary.csv", "sparse.md", "sparse.tex", "index.html")
+PLOTS = ("forest.png", "curves.png", "gap.png", "cost.png", "coadaptation.png", "thresholds.png")
+MAIN = ("off", "progressive 0.2", "fixed 0.1")
+ABLATIONS = ("progressive 0.3", "fixed 0.15", "fixed 0.3", "near", "far", "L1 gradient 0.01")
+
+
+def made_up(scene, views, start, method, seed, lpips=True):
+    cell = {"scene": scene, "views": views, "start": start, "method": method, "seed": seed, "downscale": 2.0}
+    draw = random.Random(repr(cell))
+    psnr = draw.uniform(20, 25)
+
+    def quality(value):
+        parts = {"ssim": 30, "ssim_zero_padded": 31, "lpips_vgg": 100, "lpips_vgg_unscaled": 110}
+        return {"psnr": value} | {k: value / d if lpips or "ssim" in k else None for k, d in parts.items()}
+
+    counts = [0, *(draw.randint(50, 100) for _ in range(5))]  # nothing in the nearest bin
+    curve = [{"step": k, "seconds": k / 10, "test_psnr": psnr - 1 / k, "train_psnr": psnr} for k in (500, 1000, 2000)]
+    return {
+        "cell": cell | {"fit": {"steps": 2000, "drop": 0.2}},
+        "result": {
+            "test": quality(psnr),
+            "train": quality(psnr + draw.uniform(4, 8)),
+            "test_views": {"a_b.png": psnr},
+            "curve": curve,
+            "init": {"kind": "random" if start == "scene" else start, "points": 10_000, "seconds": 17.2},
+            "gaussians": 20_000,
+            "wall_seconds": draw.uniform(100, 200),
+            "cpu_seconds": draw.uniform(200, 300),
+            "peak_rss_mb": 600,
+            "coadaptation": draw.uniform(1e-3, 2e-3),
+            "thresholds": {"distance": [*range(7)], "gaussians": counts, "over": [count // 3 for count in counts]},
+            "protocol": {"train": ["a"] * views, "test": ["b", "c"], "image_size": [189, 252]},
+            "versions": {"kgs": "0.1.0", "machine": "x86_64, 2 cores"},
+        },
+    }
+
+
+def full(**options):
+    """Every table and plot has something to show."""
+    settings = (("llff/fern", 3, "dense"), ("llff/flower", 3, "dense"), ("blender/lego", 8, "scene"))
+    cells = [(*setting, method, seed) for setting in settings for method in MAIN for seed in range(3)]
+    cells += [("llff/fern", 3, "dense", method, seed) for method in reversed(ABLATIONS) for seed in (0, 1)]
+    cells += [("llff/fern", 3, start, "progressive 0.2", seed) for start in ("sift", "model-points") for seed in (0, 1)]
+    cells += [("llff/fern", 6, "dense", method, 0) for method in MAIN[:2]]
+    return [made_up(*cell, **options) for cell in cells]
+
+
+def psnrs(rows, scene, method, views=3):
+    start = "scene" if scene.startswith("blender") else "dense"
+    wanted = [scene, views, start, method]
+    return [row["result"]["test"]["psnr"] for row in rows if list(row["cell"].values())[:4] == wanted]
+
+
+def interval(differences):
+    half = student_quantile(len(differences) - 1) * np.std(differences, ddof=1) / math.sqrt(len(differences))
+    mean = np.mean(differences)
+    return f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] ({len(differences)})"
+
+
+def lines(markdown, title, *names):
+    """The cells of a table's lines that have these names among them."""
+    table = markdown.split(f"{title}")[1].split("\n\n")[1]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    return [row for row in rows if set(names) <= set(row)]
+
+
+class Balanced(HTMLParser):
+    """Fails where a tag is closed that is not open."""
+
+    VOID = ("meta", "img", "br", "link")
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.images, self.rows = [], [], 0
+
+    def handle_starttag(self, tag, attributes):
+        self.rows += tag == "tr"
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "img":
+            self.images.append(dict(attributes)["src"])
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def assert_latex_is_sound(text):
+    bare = re.sub(r"\\[\\{}&%$#_]", "", text)
+    assert bare.count("{") == bare.count("}")
+    assert bare.count("$") % 2 == 0
+    assert not re.search(r"[#%_^~]", bare)
+    for environment in ("table", "tabular", "itemize"):
+        assert text.count(rf"\begin{{{environment}}}") == text.count(rf"\end{{{environment}}}")
+    for columns, body in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", text, re.DOTALL):
+        for line in re.findall(r"(.*?) \\\\", body):
+            assert line.replace(r"\&", "").count("&") == len(columns) - 1
+
+
+FULL = full()
+CASES = {
+    "full": FULL,
+    "partial": FULL[:4],  # off and one seed of another method
+    "one cell": FULL[:1],
+    "other starts alone": [row for row in FULL if row["cell"]["start"] in ("sift", "model-points")],
+    "main methods missing": [
+        made_up("llff/fern", 3, "dense", "off", 0),
+        made_up("llff/flower", 3, "dense", "far", 0),
+        made_up("llff/fern", 3, "sift", "progressive 0.2", 1),
+    ],
+    "unknown method, no LPIPS": [made_up("synthetic", 3, "dense", name, 0, lpips=False) for name in ("off", "<b> & _")],
+}
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory):
+    """The report on each case: its folder, and what was returned."""
+    folder = tmp_path_factory.mktemp("reports") / "new"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kgs.bench.sparse_plots.DPI", 40)  # time
+        return {
+            name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench sparse --preset cpu"))
+            for k, (name, rows) in enumerate(CASES.items())
+        }
+
+
+@pytest.fixture(scope="module")
+def markdown(reports):
+    return reports["full"][1]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_part_of_the_study_gives_sound_files(case, reports):
+    rows, (out, text) = CASES[case], reports[case]
+    assert text == (out / "sparse.md").read_text()
+    for name in TEXTS:
+        content = (out / name).read_text()
+        visible = re.sub(r'src="data[^"]*"', "", content)
+        assert not re.search(r"\b(nan|inf|none)\b", visible, re.IGNORECASE), name
+    with (out / "sparse.csv").open(newline="") as file:
+        found = list(csv.DictReader(file))
+    assert [row["method"] for row in found] == [row["cell"]["method"] for row in rows]
+    assert all(None not in row and None not in row.values() for row in found)
+    assert_latex_is_sound((out / "sparse.tex").read_text())
+    page = Balanced()
+    page.feed((out / "index.html").read_text())
+    assert not page.open
+    drawn = sorted(path.name for path in out.glob("*.png"))
+    assert len(page.images) == len(drawn)
+    pictures = {(out / name).read_bytes() for name in drawn}
+    assert pictures == {base64.b64decode(image.removeprefix("data:image/png;base64,")) for image in page.images}
+    assert not re.search(r"https?://|<script|<link", (out / "index.html").read_text())
+    tables = [line for line in text.splitlines() if line.startswith("|")]
+    assert page.rows == len(tables) - sum(line.startswith("| ---") for line in tables)
+
+
+def test_methods_are_told_apart():
+    assert len(set(STYLES.values())) == len(STYLES)
+    assert STYLES.keys() == METHODS.keys()  # of the study
+
+
+def test_plots_without_data_are_left_out(reports, tmp_path):
+    drawn = {case: sorted(path.name for path in out.glob("*.png")) for case, (out, _) in reports.items()}
+    assert drawn["full"] == sorted(PLOTS)
+    assert drawn["one cell"] == sorted(set(PLOTS) - {"forest.png"})
+    assert drawn["other starts alone"] == []
+    rows = full()[:1]
+    rows[0]["result"] |= {"curve": [], "coadaptation": None, "thresholds": None, "cpu_seconds": None}
+    write_report(rows, tmp_path, "command")
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["gap.png"]
+
+
+def test_the_same_rows_give_the_same_bytes(reports, tmp_path, monkeypatch):
+    monkeypatch.setattr("kgs.bench.sparse_plots.DPI", 40)
+    write_report(CASES["one cell"], tmp_path, "kgs bench sparse --preset cpu")
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (reports["one cell"][0] / path.name).read_bytes()
+
+
+def test_the_main_table(markdown):
+    rows = FULL
+    for scene, setting in (
+        ("llff/fern", "llff/fern, 3 views, dense"),
+        ("blender/lego", "blender/lego, 8 views, scene"),
+    ):
+        views = 8 if scene == "blender/lego" else 3
+        off, paper = (psnrs(rows, scene, method, views) for method in MAIN[:2])
+        (row,) = lines(markdown, "Test views", setting, "progressive 0.2")
+        expected = ["3", f"{np.mean(paper):.2f} ({np.std(paper, ddof=1):.2f})", f"{max(paper):.2f}"]
+        assert row[2:6] == [*expected, interval(np.subtract(paper, off))]
+        assert row[6] == f"{np.mean(paper) / 31:.3f} ({np.std(paper, ddof=1) / 31:.3f})"
+        assert row[7] == f"{np.mean(paper) / 110:.3f} ({np.std(paper, ddof=1) / 110:.3f})"
+    assert "20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207 | +1.54 or +1.34 |" in markdown
+    assert "25.42 / 0.888 / 0.089 | +3.86 |" in markdown
+
+
+def test_means_over_scenes(markdown):
+    rows = FULL
+    scenes = (("llff/fern", 3), ("llff/flower", 3), ("blender/lego", 8))
+    off, paper = (np.array([psnrs(rows, name, method, views) for name, views in scenes]) for method in MAIN[:2])
+    (row,) = lines(markdown, "Test views", "mean of 3 scenes (fern, flower, lego)", "progressive 0.2")
+    assert row[3] == f"{paper.mean():.2f} ({paper.mean(0).std(ddof=1):.2f})"
+    assert row[4] == f"{paper.mean(0).max():.2f}"
+    differences = paper - off
+    half = student_quantile(6) * math.sqrt(differences.var(1, ddof=1).mean() / 9)
+    mean = differences.mean()
+    assert row[5] == f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] (9)"
+    assert row[8:] == ["-", "-"]  # the paper has no such mean
+    (llff,) = lines(markdown, "Test views", "mean of 2 LLFF scenes (fern, flower)", "progressive 0.2")
+    assert llff[8:] == ["20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207", "+1.54 or +1.34"]
+    assert f"progressive 0.2 over off: {row[5].removesuffix(' (9)')} dB" in markdown
+
+
+def test_other_tables(markdown):
+    rows = FULL
+    (views,) = lines(markdown, "Numbers of views", "llff/fern, 6 views, dense", "off")
+    assert views[2:4] == ["1", f"{psnrs(rows, 'llff/fern', 'off', 6)[0]:.2f}"]
+    dense, off = psnrs(rows, "llff/fern", "progressive 0.2"), psnrs(rows, "llff/fern", "off")
+    sift = [r["result"]["test"]["psnr"] for r in rows if r["cell"]["start"] == "sift"]
+    (start,) = lines(markdown, "First points", "llff/fern, 3 views", "dense")
+    assert start[8:] == [interval(np.subtract(dense[:2], sift)), interval(np.subtract(dense, off))]
+    assert lines(markdown, "First points", "model-points (sees test views)")
+    fixed = psnrs(rows, "llff/fern", "fixed 0.3")
+    (rate,) = lines(markdown, "Rates and schedules", "fixed 0.3")
+    assert rate[4:6] == [interval(np.subtract(fixed, values[:2])) for values in (off, dense)]
+    assert rate[6:] == ["20.15", "+0.93", "-0.41"]
+    growing, mean_rate = psnrs(rows, "llff/fern", "progressive 0.3"), psnrs(rows, "llff/fern", "fixed 0.15")
+    (equal,) = lines(markdown, "A growing rate", "progressive 0.3 over fixed 0.15")
+    assert equal[1:] == [interval(np.subtract(growing, mean_rate)), "-"]
+    assert lines(markdown, "Selected Gaussians", "near")[0][6:] == ["17.49", "-1.73", "-3.27"]
+    assert lines(markdown, "An L1 penalty", "L1 gradient 0.01")[0][6:] == ["19.97", "+0.75", "-0.79"]
+    groups = {}
+    for row in rows:
+        groups.setdefault(tuple(row["cell"].values())[:4], []).append(row["result"]["test"]["psnr"])
+    freedom = sum(len(values) - 1 for values in groups.values())
+    squares = sum(np.var(values) * len(values) for values in groups.values())
+    (noise,) = lines(markdown, "Noise between seeds", "all cells", "PSNR [dB]")
+    sd = math.sqrt(squares / freedom)
+    assert noise[3:6] == [str(freedom), f"{sd:.3f}", f"{1.96 * math.sqrt(2) * sd:.3f}"]
+    fern = [r["result"] for r in rows if list(r["cell"].values())[:4] == ["llff/fern", 3, "dense", "off"]]
+    (cost,) = lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense", "off")
+    methods = [row[1] for row in lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense")]
+    assert methods == [*MAIN, *ABLATIONS]  # not in the order of the rows
+    gaps = [result["train"]["psnr"] - result["test"]["psnr"] for result in fern]
+    adapted = [1e3 * result["coadaptation"] for result in fern]
+    assert cost[3] == f"{np.mean(gaps):.2f} ({np.std(gaps, ddof=1):.2f})"
+    assert cost[8] == f"{np.mean(adapted):.2f} ({np.std(adapted, ddof=1):.2f})"
+    (scene,) = lines(markdown, "Scenes, splits", "blender/lego, 8 views")
+    assert scene[1:] == ["8", "2", "9", "252x189", "drop 0.2, steps 2000"]
+
+
+def test_summary_csv(reports):
+    with (reports["full"][0] / "summary.csv").open(newline="") as file:
+        found = {tuple(row[k] for k in ("scene", "views", "start", "method")): row for row in csv.DictReader(file)}
+    line = found["llff/fern", "3", "dense", "far"]
+    far, off = psnrs(FULL, "llff/fern", "far"), psnrs(FULL, "llff/fern", "off")
+    assert (line["n"], line["seeds"]) == ("2", "0 1")
+    assert float(line["test_psnr_sd"]) == pytest.approx(np.std(far, ddof=1))
+    assert float(line["test_lpips_vgg_best"]) == pytest.approx(min(far) / 100)
+    assert float(line["psnr_over_off_mean"]) == pytest.approx(np.mean(np.subtract(far, off[:2])))
+    assert line["psnr_over_sift_mean"] == ""
+    assert found["llff/fern", "6", "dense", "off"]["test_psnr_sd"] == ""
+
+
+def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="rows"):
+        write_report([], tmp_path, "command")
+    rows = FULL[:1]
+    longer = {"cell": rows[0]["cell"] | {"fit": {"steps": 10_000}}, "result": rows[0]["result"]}
+    with pytest.raises(ValueError, match="two for 0"):
+        write_report([*rows, longer], tmp_path, "command")
+
+
+def test_text_is_escaped():
+    assert latex_escape("a_b & 5 % {x} #1 \\ $ ~ ^") == (
+        r"a\_b \& 5 \% \{x\} \#1 \textbackslash{} \$ \textasciitilde{} \textasciicircum{}"
+    )
+    assert latex_escape("-0.5 [-1, 2] fixed-0 --preset <3") == r"$-$0.5 {[}$-$1, 2] fixed-0 -{}-preset $<$3"
+    table = latex_table("100 %", ["b_c"], [["[x]", "-1"]], first="a")
+    assert_latex_is_sound(table)
+    assert r"{[}x] & $-$1 \\" in table
+    assert '<th scope="row">a &lt;b&gt;</th><td>&amp;</td>' in html_table("t", ["c"], [["a <b>", "&"]])
