@@ -8,7 +8,7 @@ __all__ = ["alias"]
 
 
 def alias(name: str) -> Any:
-    """For an annotation: a second name for an option, as in `Annotated[Path, alias("-o")]`."""
+    """A second name for an option, to annotate its type with."""
     import tyro
 
     return tyro.conf.arg(aliases=(name,))

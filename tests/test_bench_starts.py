@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -46,7 +47,7 @@ def plane() -> tuple[Views, torch.Tensor]:
     return at((0.0, 0.0, 0.0), (shift, 0.0, 0.0)), torch.full((2, HEIGHT, WIDTH), DEPTH, dtype=torch.float64)
 
 
-def test_points_on_the_plane_are_right_and_complete(plane):
+def test_points_on_the_plane_are_right_and_complete(plane: tuple[Views, torch.Tensor]) -> None:
     views, truth = plane
     points = points_of(views, truth)
     assert float(depth_errors(points, views, truth).abs().max()) < 1e-12
@@ -54,7 +55,9 @@ def test_points_on_the_plane_are_right_and_complete(plane):
 
 
 @pytest.mark.parametrize(("factor", "is_close"), [(1.03, False), (0.97, False), (1.019, True), (0.981, True)])
-def test_points_moved_along_their_rays_err_by_as_much(plane, factor, is_close):
+def test_points_moved_along_their_rays_err_by_as_much(
+    plane: tuple[Views, torch.Tensor], factor: float, is_close: bool
+) -> None:
     views, truth = plane
     points = points_of(views, truth, factor)
     assert depth_errors(points, views, truth).numpy() == pytest.approx(factor - 1, abs=1e-12)
@@ -62,7 +65,7 @@ def test_points_moved_along_their_rays_err_by_as_much(plane, factor, is_close):
     assert bool(complete.all()) if is_close else not complete.any()
 
 
-def test_a_point_completes_the_pixels_around_it(plane):
+def test_a_point_completes_the_pixels_around_it(plane: tuple[Views, torch.Tensor]) -> None:
     views, truth = plane
     found = complete_pixels(points_of(views, truth)[[12 * WIDTH + 20]], views, truth)
     assert found.sum((1, 2)).tolist() == [13, 13]  # the pixels of a disc with a radius of 2
@@ -72,7 +75,7 @@ def test_a_point_completes_the_pixels_around_it(plane):
     assert corner.sum((1, 2)).tolist() == [6, 0]  # the other view has it 4 pixels out of its picture
 
 
-def test_what_two_views_see_of_the_plane(plane):
+def test_what_two_views_see_of_the_plane(plane: tuple[Views, torch.Tensor]) -> None:
     seen = seen_twice(*plane)
     assert seen[0, :, 4:].all()
     assert seen[1, :, :-4].all()
@@ -80,7 +83,7 @@ def test_what_two_views_see_of_the_plane(plane):
     assert not seen_twice(plane[0].select([0]), plane[1][:1]).any()
 
 
-def test_a_hidden_point_is_judged_where_it_is_seen():
+def test_a_hidden_point_is_judged_where_it_is_seen() -> None:
     """A surface at 2 before the nearer camera hides the plane that the other one sees."""
     views = at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
     truth = torch.tensor([2.0, 5.0], dtype=torch.float64)[:, None, None].repeat(1, HEIGHT, WIDTH)
@@ -90,14 +93,14 @@ def test_a_hidden_point_is_judged_where_it_is_seen():
     assert not seen_twice(views, truth).any()
 
 
-def test_points_before_nothing_and_outside(plane):
+def test_points_before_nothing_and_outside(plane: tuple[Views, torch.Tensor]) -> None:
     views, truth = plane[0], torch.zeros_like(plane[1])
     errors = depth_errors(torch.tensor([[0.0, 0.0, 3.0], [50.0, 0.0, 3.0], [0.0, 0.0, -3.0]]), views, truth)
     assert errors.tolist() == [-1.0, torch.inf, torch.inf]
     assert not complete_pixels(torch.tensor([[0.0, 0.0, 3.0]]), views, truth).any()
 
 
-def test_points_of_the_exact_depths_of_the_synthetic_scene():
+def test_points_of_the_exact_depths_of_the_synthetic_scene() -> None:
     views = synthetic_scene(train_views=3, test_views=0, size=(63, 84), seed=0).train
     truth = synthetic_depths(views.cameras, seed=0)[:, 0]
     points = points_of(views, truth)
@@ -114,7 +117,7 @@ def test_points_of_the_exact_depths_of_the_synthetic_scene():
     assert float((moved.abs() < 0.02).double().mean()) < 0.03
 
 
-def test_a_model_is_compared_with_the_nearest_pixel_in_front(plane):
+def test_a_model_is_compared_with_the_nearest_pixel_in_front(plane: tuple[Views, torch.Tensor]) -> None:
     views, truth = plane
     cloud = points_of(views, truth)
     model = cloud[[5 * WIDTH + 20]]
@@ -127,7 +130,7 @@ def test_a_model_is_compared_with_the_nearest_pixel_in_front(plane):
     assert len(model_errors(beside[1], model, views)) == 0
 
 
-def test_a_fallback_is_recorded(monkeypatch):
+def test_a_fallback_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(starts, "ALL_POINTS", 500)
     monkeypatch.setattr(starts, "RANDOM_POINTS", 300)
     found, row = starts._find(at((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)), "dense", 0)
@@ -138,7 +141,7 @@ def test_a_fallback_is_recorded(monkeypatch):
     assert row["cpu_seconds"] > 0
 
 
-def test_the_files_of_the_quick_program(tmp_path, monkeypatch):
+def test_the_files_of_the_quick_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(starts, "QUICK", (63, 84))
     lines: list[str] = []
@@ -157,7 +160,7 @@ def test_the_files_of_the_quick_program(tmp_path, monkeypatch):
     assert dense["complete_twice"] >= dense["complete"]
 
 
-def test_a_missing_scene_is_named_at_once(tmp_path, monkeypatch):
+def test_a_missing_scene_is_named_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KGS_DATA", str(tmp_path))
     with pytest.raises(DataError, match="llff/fern"):
         measure_starts(tmp_path / "out", say=lambda _: None)

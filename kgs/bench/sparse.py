@@ -122,17 +122,17 @@ def _cpu_cells(data: Path) -> list[Cell]:
             raise DataError(data, scene, "expected this scene in the folder of KGS_DATA")
     fit = {"steps": 2000}
     main = [
-        _cell(scene, views, _main_start(scene), name, seed, fit, 2.0)
+        cell
         for seed in range(3)
-        for scene, views in SCENES.items()
-        for name in MAIN
-    ]
-    starts = [
-        _cell(scene, views, start, PAPER, seed, fit, 2.0)
-        for seed in range(3)
-        for scene, views in SCENES.items()
-        for start in ("sift", "dense")
-        if start != _main_start(scene)
+        for cell in (
+            *(_cell(s, n, _main_start(s), name, seed, fit, 2.0) for s, n in SCENES.items() for name in MAIN),
+            *(
+                _cell(s, n, start, PAPER, seed, fit, 2.0)
+                for s, n in SCENES.items()
+                for start in ("sift", "dense")
+                if start != _main_start(s)
+            ),
+        )
     ]
     forbidden = [
         _cell(scene, 3, start, PAPER, seed, fit, 2.0)
@@ -152,7 +152,7 @@ def _cpu_cells(data: Path) -> list[Cell]:
         for name in METHODS
         if name not in MAIN
     ]
-    return main + starts + more + ablations + forbidden
+    return main + more + ablations + forbidden
 
 
 def _paper_cells(data: Path) -> list[Cell]:

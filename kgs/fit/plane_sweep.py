@@ -6,11 +6,11 @@ Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equation
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import torch
-import torch.nn.functional as F
 from kornia.color import rgb_to_grayscale
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
@@ -23,7 +23,8 @@ __all__ = ["DepthMap", "sweep_depths"]
 
 PLANES = 128
 WINDOW = 7  # pixels a side of the patches that are compared
-NEIGHBOURS = 4  # at most, the nearest ones
+NEIGHBOURS = 4  # at most
+BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
 # Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
 STEP, JUMP, EDGE = 0.06, 0.5, 0.04
 _VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
@@ -58,13 +59,14 @@ def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES) ->
     """
     grey = rgb_to_grayscale(views.images.cpu().float())
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
+    depth = 1 / float(inverse.mean())
     maps = []
     for view in range(len(views)):
-        others = _neighbours(views, view)
+        others = _neighbours(views, view, depth)
         if not others:
             maps.append(_unknown(grey[view, 0], far))
             continue
-        scores = _combine([_scores(grey, views.cameras, view, other, inverse) for other in others])
+        scores = _combine(_scores(grey, views.cameras, view, other, inverse) for other in others)
         cost = _semi_global(1.0 - scores, grey[view, 0])
         maps.append(_refine(cost, scores, inverse))
     return maps
@@ -74,11 +76,12 @@ def _unknown(image: Tensor, far: float) -> DepthMap:
     return DepthMap(torch.full_like(image, far), torch.full_like(image, -1.0), torch.zeros_like(image).bool())
 
 
-def _neighbours(views: Views, view: int) -> list[int]:
+def _neighbours(views: Views, view: int, depth: float) -> list[int]:
+    """The views to compare with, those first that stand as far apart as tells a depth without hiding it."""
     centers = camera_centers(views.cameras)
-    distances = (centers - centers[view]).norm(dim=1)
-    order = distances.argsort(stable=True).tolist()
-    return [other for other in order if other != view and distances[other] > 0][:NEIGHBOURS]
+    baselines = (centers - centers[view]).norm(dim=1) / depth
+    order = (baselines / BASELINE).log().abs().argsort(stable=True).tolist()
+    return [other for other in order if baselines[other] > 0][:NEIGHBOURS]
 
 
 def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
@@ -91,25 +94,34 @@ def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse
     rotation = extrinsics[other, :3, :3] @ extrinsics[view, :3, :3].mT
     shift = extrinsics[other, :3, 3] - rotation @ extrinsics[view, :3, 3]
     back = torch.linalg.inv(intrinsics[view])
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    pixels = torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1).double()
-    rays = (intrinsics[other] @ rotation @ back @ pixels).float()
-    offset = (intrinsics[other] @ shift).float()
-    spans = max(width - 1, 1), max(height - 1, 1)
-    image = grey[view, 0]
+    image, target = grey[view, 0], grey[other, 0]
     mean, variance = _moments(image)
     found = torch.empty(len(inverse), height, width)
-    for plane, value in enumerate(inverse.float().tolist()):
-        x, y, z = (rays + (value * offset)[:, None]).reshape(3, 1, height, width)
-        grid = torch.stack([2 * x / z / spans[0] - 1, 2 * y / z / spans[1] - 1], -1)
-        inside = ((grid.abs() <= 1).all(-1) & (z > 0))[0]
-        grid = torch.where(inside[None, ..., None], grid, 0.0)  # behind the camera there may be infinities
-        warped = F.grid_sample(grey[other : other + 1], grid, align_corners=True)[0, 0]
+    for plane, value in enumerate(inverse.tolist()):
+        turn = rotation.clone()
+        turn[:, 2] += value * shift
+        homography = intrinsics[other] @ turn @ back
+        warped, inside = (_warp(layer, homography) for layer in (target, torch.ones_like(target)))
         there, spread = _moments(warped)
         covariance = _box(image * warped) - mean * there
         score = covariance * ((variance + _VARIANCE) * (spread + _VARIANCE)).rsqrt()
-        found[plane] = torch.where(_box(inside.float()) > 0.99, score, 0.0)
+        found[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
     return found
+
+
+def _warp(image: Tensor, homography: Tensor) -> Tensor:
+    """The image at the places that pixels are mapped to, `(H, W)`; 0 outside and behind the camera."""
+    height, width = image.shape
+    size = (width, height)
+    warped = torch.from_numpy(
+        cv2.warpPerspective(image.numpy(), homography.numpy(), size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    )
+    corners = torch.tensor([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)], dtype=torch.float64)
+    if bool((corners @ homography[2] > 0).all()):
+        return warped
+    x, y, one = homography[2]
+    depths = x * torch.arange(width) + (y * torch.arange(height))[:, None] + one
+    return torch.where(depths > 0, warped, 0.0)
 
 
 def _box(image: Tensor) -> Tensor:
@@ -122,13 +134,20 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 
 
-def _combine(scores: list[Tensor]) -> Tensor:
-    """Over the neighbours: half the best and half the mean of the better ones, so that one may be hidden."""
-    stack = torch.stack(scores)
-    if len(stack) == 1:
-        return stack[0]
-    best = stack.sort(dim=0, descending=True).values[: max(2, (len(stack) + 1) // 2)]
-    return 0.5 * best[0] + 0.5 * best.mean(0)
+def _combine(scores: Iterable[Tensor]) -> Tensor:
+    """Of the neighbours the best, and the second best with a quarter of the weight: the others may see it hidden."""
+    best: Tensor | None = None
+    second: Tensor | None = None
+    for score in scores:
+        if best is None:
+            best = score
+            continue
+        lower = torch.minimum(best, score)
+        best = torch.maximum(best, score)
+        second = lower if second is None else torch.maximum(second, lower)
+    if best is None:
+        raise ValueError("scores: expected at least one neighbour, got none")
+    return best if second is None else 0.75 * best + 0.25 * second
 
 
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
