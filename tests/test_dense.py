@@ -12,7 +12,7 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.dense import dense_points
 from kgs.fit.initialize import first_points
-from kgs.fit.plane_sweep import _semi_global, sweep_depths
+from kgs.fit.plane_sweep import _neighbours, _semi_global, _warp, sweep_depths
 from kgs.fit.triangulate import project_all
 
 
@@ -79,6 +79,40 @@ def test_where_nothing_can_be_compared_others_take_over(views: Views) -> None:
     grey = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
     with pytest.warns(UserWarning, match="agree on 0"), pytest.warns(UserWarning, match="random points"):
         assert first_points(grey, "dense", count=200).kind == "random"
+
+
+def test_pictures_that_contradict_each_other_have_no_dense_points(views: Views) -> None:
+    """As mirrors do: each photo shows something else."""
+    noise = torch.rand(views.images.shape, generator=generator(3))
+    with pytest.warns(UserWarning, match="points only; SIFT points"), pytest.warns(UserWarning, match="random points"):
+        assert first_points(Views(views.cameras, noise, views.names), "dense", count=2000).kind == "random"
+
+
+def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
+    """Cameras along a line, at 0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4 and 2 times the depth."""
+    places = torch.tensor([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 2.0]) * 3.0
+    n = len(places)
+    extrinsics = torch.eye(4).repeat(n, 1, 1)
+    extrinsics[:, 0, 3] = -places
+    first = views.camera(0)
+    camera = PinholeCamera(first.intrinsics.repeat(n, 1, 1), extrinsics, first.height.repeat(n), first.width.repeat(n))
+    line = Views(camera, views.images[:1].repeat(n, 1, 1, 1), tuple(f"{k}.png" for k in range(n)))
+    assert sorted(_neighbours(line, 0, 3.0)) == [3, 4, 5, 6]
+    assert _neighbours(line, 7, 3.0)[0] == 6
+
+
+def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
+    image = torch.rand(20, 30, generator=generator())
+    homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], [0.002, -0.003, 1.0]], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
+    x, y, z = homography.float() @ torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1)
+    grid = torch.stack([2 * x / z / 29 - 1, 2 * y / z / 19 - 1], -1).reshape(1, 20, 30, 2)
+    inner = (grid.abs() < 1).all(-1)[0]
+    expected = torch.nn.functional.grid_sample(image[None, None], grid, align_corners=True)[0, 0]
+    assert float((_warp(image, homography) - expected)[inner].abs().max()) < 0.05  # OpenCV may round to 1/32 pixel
+    homography[2] = torch.tensor([-0.1, 0.0, 1.0])
+    assert not _warp(torch.ones(20, 30), homography)[:, 10:].any()
+    assert _warp(torch.ones(20, 30), homography)[:, :5].any()
 
 
 def test_views_from_one_place_have_no_depth(views: Views) -> None:

@@ -81,6 +81,24 @@ CLAIMS = {
         assert (running.double() / exact - 1).abs().max() > 5e-3
         """,
     ),
+    "06_a_study_of_one_scene": (
+        """
+        assert {key: len(results) for key, results in fits.items()} == {
+            (start, drop): len(SEEDS) for start in ("sift", "dense") for drop in (0.0, 0.2)
+        }
+        assert len(starts["dense"].points) == POINTS and starts["dense"].kind == "dense"
+        assert all(low < mean < high for _, mean, low, high in intervals)
+        assert "llff/fern, 3 views" in differences("off")
+        """,
+        """
+        assert error.median() < 0.05
+        assert intervals[0][2] > 0.5  # the start
+        for start in ("sift", "dense"):
+            without, with_layer = (fits[start, drop] for drop in (0.0, 0.2))
+            for name in ("train - test", "co-adaptation"):
+                assert max(r[name] for r in with_layer) < min(r[name] for r in without)
+        """,
+    ),
 }
 
 
