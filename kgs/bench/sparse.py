@@ -110,7 +110,7 @@ def measure_sparse(
 
 
 def _quick_cells() -> list[Cell]:
-    fit = {"steps": 300, "max_gaussians": 12_000}
+    fit = {"steps": 200, "max_gaussians": 12_000}
     cells = [_cell(SYNTHETIC, 3, "dense", name, seed, fit, None) for seed in range(3) for name in MAIN]
     cells += [_cell(SYNTHETIC, 3, "dense", name, 0, fit, None) for name in ("fixed 0.2", "far", "L1 distance 0.01")]
     return cells + [_cell(SYNTHETIC, 3, start, PAPER, 0, fit, None) for start in ("sift", "random")]

@@ -24,7 +24,7 @@ from .thresholds import count_over_threshold
 __all__ = ["SYNTHETIC", "sparse_cell"]
 
 SYNTHETIC = "synthetic"
-SIZE = (96, 128)  # of the synthetic pictures
+SIZE = (72, 96)  # of the synthetic pictures
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
 
 
