@@ -11,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.dense import dense_points
-from kgs.fit.initialize import first_points
+from kgs.fit.initialize import _sweep_range, first_points
 from kgs.fit.plane_sweep import _neighbours, _semi_global, _warp, sweep_depths
 from kgs.fit.triangulate import project_all
 
@@ -113,6 +113,14 @@ def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
     homography[2] = torch.tensor([-0.1, 0.0, 1.0])
     assert not _warp(torch.ones(20, 30), homography)[:, 10:].any()
     assert _warp(torch.ones(20, 30), homography)[:, :5].any()
+
+
+def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:
+    near_camera = (
+        torch.linalg.inv(views.camera(0).extrinsics.double())[0] @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
+    )
+    scene = torch.tensor([[0.0, 0.0, 4.0], [0.2, 0.1, 6.0]], dtype=torch.float64)
+    assert _sweep_range(torch.cat([scene, near_camera[None, :3]]), views) == _sweep_range(scene, views)
 
 
 def test_views_from_one_place_have_no_depth(views: Views) -> None:

@@ -92,7 +92,7 @@ def first_points(
     near, far = _depth_range(points, views.cameras)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
-        near, far = _sweep_range(points, views.cameras) if len(points) >= FEWEST_POINTS else (near, far)
+        near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
         dense, colors = dense_points(views, near, far, count, generator)
         if len(dense) >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind="dense")
@@ -176,10 +176,13 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
     return baseline, 20.0 * baseline
 
 
-def _sweep_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
-    """Beyond all points: a background that is cut off costs decibels, a few planes of inverse depth cost nothing."""
-    _, depths = project_all(points, cameras)
-    depths = depths[depths > 0]
+def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
+    """Beyond all points: a background that is cut off costs decibels, a few planes of inverse depth cost nothing.
+
+    Only where a view has them: a point close beside a camera would leave hardly a plane for the scene.
+    """
+    pixels, depths = project_all(points, views.cameras)
+    depths = depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
     return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 
 
