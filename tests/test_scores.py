@@ -5,25 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.initialize import FirstPoints
 from kgs.fit.scores import gaussian_scores
 from kgs.fit.trainer import Trainer
 
 CONFIG = FitConfig(steps=40, drop=0.4, seed=2, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return synthetic_scene(train_views=3, test_views=1, size=(32, 40), seed=1)
-
-
-@pytest.fixture(scope="module")
-def points():
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
-    return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
 
 
 def test_distances_are_those_to_the_cameras_centre(scene, points):

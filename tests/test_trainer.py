@@ -11,24 +11,10 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs import DataError, TrainingDiverged
 from kgs.datasets.scene import Views
-from kgs.datasets.synthetic import synthetic_scene
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.initialize import FirstPoints
 from kgs.fit.trainer import Trainer
 
 CONFIG = FitConfig(steps=60, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return synthetic_scene(train_views=3, test_views=2, size=(32, 40), seed=1)
-
-
-@pytest.fixture(scope="module")
-def points():
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
-    return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
 
 
 def parameters(trainer):

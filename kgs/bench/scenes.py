@@ -1,17 +1,22 @@
-"""Scenes to measure on: made of seeded random numbers, no files."""
+"""Scenes to measure on: one made of seeded random numbers, and whether those of a folder are there."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
 
+from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
 
-__all__ = ["layered_scene"]
+__all__ = ["SYNTHETIC", "check_scenes", "layered_scene", "main_start"]
+
+SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 
 _DEPTHS = np.array([2.2, 3.0, 4.0, 5.5, 7.5, 9.5])
 _SHARES = np.array([0.10, 0.18, 0.22, 0.20, 0.16, 0.14])
@@ -56,3 +61,19 @@ def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0)
     intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = focal
     intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
     return model, PinholeCamera(intrinsics, torch.eye(4)[None], torch.tensor([height]), torch.tensor([width]))
+
+
+def check_scenes(data: Path, scenes: Iterable[str]) -> None:
+    """Make sure that the folder of KGS_DATA has these scenes.
+
+    Raises:
+        DataError: it lacks one.
+    """
+    for scene in scenes:
+        if not (data / scene).is_dir():
+            raise DataError(data, scene, "expected this scene in the folder of KGS_DATA")
+
+
+def main_start(scene: str) -> str:
+    """The kind of first points of the study: as Blender's layout prescribes, dense ones for all other layouts."""
+    return "scene" if scene.startswith("blender") else "dense"

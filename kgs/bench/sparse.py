@@ -15,14 +15,15 @@ from typing import Any
 from kgs.errors import DataError
 
 from .grid import read_rows, run_grid
-from .sparse_cell import SYNTHETIC, sparse_cell
+from .published import PAPER
+from .scenes import SYNTHETIC, check_scenes, main_start
+from .sparse_cell import sparse_cell
 from .sparse_report import write_report
+from .sparse_tables import FIXED, MAIN, OFF
+from .workers import Cell
 
 __all__ = ["METHODS", "PRESETS", "measure_sparse", "sparse_cells"]
 
-Cell = dict[str, Any]
-
-OFF, PAPER, FIXED = "off", "progressive 0.2", "fixed 0.1"
 METHODS: dict[str, dict[str, Any]] = {
     OFF: {"drop": 0.0},
     PAPER: {"drop": 0.2},
@@ -42,7 +43,6 @@ METHODS: dict[str, dict[str, Any]] = {
     "L1 distance 0.001": {"drop": 0.0, "opacity_l1": 0.001, "opacity_l1_by": "distance"},
     "L1 distance 0.01": {"drop": 0.0, "opacity_l1": 0.01, "opacity_l1_by": "distance"},
 }
-MAIN = (OFF, PAPER, FIXED)
 PRESETS = ("quick", "cpu", "paper")
 # The scenes of the preset "cpu" and how many views each is given.
 SCENES = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3, "blender/lego": 8, "nerfstudio/fox": 12}
@@ -117,20 +117,18 @@ def _quick_cells() -> list[Cell]:
 
 
 def _cpu_cells(data: Path) -> list[Cell]:
-    for scene in SCENES:
-        if not (data / scene).is_dir():
-            raise DataError(data, scene, "expected this scene in the folder of KGS_DATA")
+    check_scenes(data, SCENES)
     fit = {"steps": 2000}
     main = [
         cell
         for seed in range(3)
         for cell in (
-            *(_cell(s, n, _main_start(s), name, seed, fit, 2.0) for s, n in SCENES.items() for name in MAIN),
+            *(_cell(s, n, main_start(s), name, seed, fit, 2.0) for s, n in SCENES.items() for name in MAIN),
             *(
                 _cell(s, n, start, PAPER, seed, fit, 2.0)
                 for s, n in SCENES.items()
                 for start in ("sift", "dense")
-                if start != _main_start(s)
+                if start != main_start(s)
             ),
         )
     ]
@@ -161,18 +159,13 @@ def _paper_cells(data: Path) -> list[Cell]:
         raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
     fit = {"steps": 10_000}
     return [
-        _cell(str(path.relative_to(data)), views, _main_start(path.parent.name), name, seed, fit, None)
+        _cell(str(path.relative_to(data)), views, main_start(path.parent.name), name, seed, fit, None)
         for seed in range(5)
         for path in folders
         for views in VIEWS[path.parent.name]
         for name in METHODS
         if name in MAIN or (path.parent.name == "llff" and views == 3)
     ]
-
-
-def _main_start(scene: str) -> str:
-    """Blender's layout prescribes random points in a box; all others begin with the dense ones."""
-    return "scene" if scene.startswith("blender") else "dense"
 
 
 def _cell(

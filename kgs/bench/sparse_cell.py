@@ -12,6 +12,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
+from kgs.fit.evaluate import MEASURES
 from kgs.fit.initialize import FirstPoints
 from kgs.fit.lpips import Lpips
 from kgs.fit.report import peak_rss_mb
@@ -19,13 +20,12 @@ from kgs.fit.run import choose_points, measure
 from kgs.fit.trainer import Trainer
 
 from .coadaptation import coadaptation
+from .scenes import SYNTHETIC
 from .thresholds import count_over_threshold
 
-__all__ = ["SYNTHETIC", "sparse_cell"]
+__all__ = ["sparse_cell"]
 
-SYNTHETIC = "synthetic"
 SIZE = (72, 96)  # of the synthetic pictures
-MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:

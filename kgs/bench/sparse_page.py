@@ -73,8 +73,9 @@ def _list(sentences: Sequence[str]) -> str:
 
 def _figure(plot: Plot) -> str:
     caption = html.escape(plot.caption)
-    data = base64.b64encode(plot.path.read_bytes()).decode("ascii")
-    width = int.from_bytes(plot.path.read_bytes()[16:20])  # of the PNG, where it always stands
+    content = plot.path.read_bytes()
+    data = base64.b64encode(content).decode("ascii")
+    width = int.from_bytes(content[16:20])  # of the PNG, where it always stands
     size = f"max-width: {width}px; min-width: min({width}px, 38rem)"
     image = f'<img alt="{caption}" style="{size}" src="data:image/png;base64,{data}">'
     return f'<figure><figcaption>{caption}</figcaption><div class="scroll">{image}</div></figure>'

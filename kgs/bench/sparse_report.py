@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from kgs.fit.evaluate import MEASURES
+
 from .output import latex_escape, latex_table, markdown_table, write_csv
 from .published import PAPER
 from .sparse_page import sparse_page
@@ -17,9 +19,8 @@ from .statistics import by_seed, group_cells, paired_difference, summarize
 __all__ = ["write_report"]
 
 TITLE = "Sparse views: DropGaussian on and off at equal first points"
-QUALITY = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
-MEASURES = (
-    *(f"{part}.{name}" for part in ("test", "train") for name in QUALITY),
+COLUMNS = (
+    *(f"{part}.{name}" for part in ("test", "train") for name in MEASURES),
     *("init.points", "init.seconds", "gaussians", "wall_seconds", "cpu_seconds", "peak_rss_mb", "coadaptation"),
 )
 NOTES = (
@@ -84,7 +85,7 @@ def _latex(findings: Sequence[str], tables: Sequence[Table]) -> str:
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
     """A line of sparse.csv; what a cell lacks is empty."""
     cell, result = row["cell"], row["result"]
-    numbers = {measure: _number(result, measure) for measure in MEASURES}
+    numbers = {measure: _number(result, measure) for measure in COLUMNS}
     return {
         **{key: cell[key] for key in ("scene", "views", "start", "method", "seed")},
         **{measure.replace(".", "_"): number for measure, number in numbers.items()},
@@ -102,7 +103,7 @@ def _summaries(groups: Groups) -> list[dict[str, Any]]:
     lines = []
     for group, results in groups.items():
         line: dict[str, Any] = {**group._asdict(), "n": len(results), "seeds": " ".join(map(str, sorted(results)))}
-        for measure in MEASURES:
+        for measure in COLUMNS:
             summary = summarize(by_seed(results, measure).values(), lower_is_better="lpips" in measure)
             for key in ("mean", "sd", "best") if measure.startswith("test.") else ("mean", "sd"):
                 line[f"{measure.replace('.', '_')}_{key}"] = getattr(summary, key, None)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from .published import PAPER, Figures, benchmark_of, published, published_differences
+from .scenes import main_start
 from .statistics import (
     Difference,
     Group,
@@ -19,6 +20,7 @@ from .statistics import (
 )
 
 __all__ = [
+    "FIXED",
     "MAIN",
     "OFF",
     "Groups",
@@ -105,7 +107,7 @@ def main_settings(groups: Groups) -> list[Group]:
     """
     settings: dict[str, Group] = {}
     for setting in all_settings(groups):
-        if setting.start == ("scene" if setting.scene.startswith("blender") else "dense"):
+        if setting.start == main_start(setting.scene):
             settings.setdefault(setting.scene, setting)
     return list(settings.values())
 

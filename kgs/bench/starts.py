@@ -15,11 +15,11 @@ from torch import Tensor
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.errors import DataError
 from kgs.fit.initialize import FirstPoints, first_points
 from kgs.fit.report import versions, write_json
 
 from .output import markdown_table, write_csv
+from .scenes import check_scenes
 from .start_measures import CLOSE, NEAR, complete_pixels, depth_errors, front_depths, model_errors, seen_twice
 from .statistics import summarize
 
@@ -55,10 +55,9 @@ def measure_starts(out: Path, *, quick: bool = False, say: Callable[[str], None]
         DataError: KGS_DATA is set and one of the scenes is not there.
     """
     data = None if quick else os.environ.get("KGS_DATA")
-    for name in dict.fromkeys(name for name, _ in REAL) if data is not None else ():
-        if not (Path(data or "") / name).is_dir():
-            raise DataError(Path(data or ""), name, "expected this scene in the folder of KGS_DATA")
-    if data is None:
+    if data is not None:
+        check_scenes(Path(data), [name for name, _ in REAL])
+    else:
         say("the synthetic scene alone" + ("" if quick else ": KGS_DATA is not set"))
     out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from kgs.errors import DataError
 from kgs.fit.config import FAST, FitConfig
 from kgs.fit.report import versions
 
 from .grid import run_grid
 from .output import markdown_table, write_csv
+from .scenes import SYNTHETIC, check_scenes
 
 __all__ = ["KNOBS", "fit_cell", "measure_training", "training_cells"]
 
@@ -32,7 +32,6 @@ KNOBS: dict[str, tuple[Any, ...]] = {
 }
 # What the table shows, and with how many decimals.
 _DECIMALS = {"psnr": 2, "gain": 2, "ssim": 3, "train_psnr": 1, "cpu_seconds": 0, "gaussians": 0}
-SYNTHETIC = "synthetic"
 SIZE = (126, 168)  # of the synthetic pictures
 
 
@@ -97,8 +96,7 @@ def measure_training(
     """
     scenes = [SYNTHETIC]
     if "KGS_DATA" in os.environ:
-        if not (Path(os.environ["KGS_DATA"]) / "llff" / "fern").is_dir():
-            raise DataError(Path(os.environ["KGS_DATA"]), "llff/fern", "expected this scene in the folder of KGS_DATA")
+        check_scenes(Path(os.environ["KGS_DATA"]), ["llff/fern"])
         scenes.append("fern")
     else:
         say("KGS_DATA is not set: the synthetic scene alone, without fern")

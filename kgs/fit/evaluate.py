@@ -23,7 +23,7 @@ from kgs.datasets.scene import Views
 
 from .lpips import Lpips
 
-__all__ = ["evaluate"]
+__all__ = ["MEASURES", "evaluate"]
 
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
 WINDOW = 11

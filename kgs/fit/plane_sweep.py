@@ -6,7 +6,7 @@ Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equation
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -134,19 +134,14 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 
 
-def _combine(scores: Iterable[Tensor]) -> Tensor:
+def _combine(scores: Iterator[Tensor]) -> Tensor:
     """Of the neighbours the best, and the second best with a quarter of the weight: the others may see it hidden."""
-    best: Tensor | None = None
+    best = next(scores)
     second: Tensor | None = None
     for score in scores:
-        if best is None:
-            best = score
-            continue
         lower = torch.minimum(best, score)
         best = torch.maximum(best, score)
         second = lower if second is None else torch.maximum(second, lower)
-    if best is None:
-        raise ValueError("scores: expected at least one neighbour, got none")
     return best if second is None else 0.75 * best + 0.25 * second
 
 
