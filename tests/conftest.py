@@ -4,6 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each; before torch, which reads it once
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import torch
 
 from kgs.datasets import synthetic_scene
