@@ -72,7 +72,7 @@ def _begin(cores: int, parent: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     import torch
 
-    torch.set_num_threads(cores)
+    torch.set_num_threads(min(cores, torch.get_num_threads()))  # OMP_NUM_THREADS may ask for fewer
 
 
 @contextmanager
