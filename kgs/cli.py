@@ -94,7 +94,7 @@ def fit(
     drop: float = 0.2,
     drop_schedule: Literal["linear", "constant"] = "linear",
     seed: int = 0,
-    init: Literal["auto", "dense", "sift", "random", "model-points", "file"] = "auto",
+    init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense",
     init_file: Path | None = None,
     max_gaussians: int | None = None,
     sh_degree: int = 3,
@@ -118,7 +118,8 @@ def fit(
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         seed: everything random derives from it.
         init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds a
-            view. sift: from matches of their keypoints. auto: dense (Blender scenes: random points in their box).
+            view. sift: from matches of their keypoints. random: where at least two images see. scene: the random points
+            that Blender's layout prescribes. model-points: of a COLMAP model, made with the test views.
         init_file: a point cloud (PLY, OBJ, ...) for --init file.
         max_gaussians: densification stops there; 10 a step, and at least twice the first points,
             unless given (14000 with --fast).

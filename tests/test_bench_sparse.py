@@ -61,9 +61,8 @@ def test_the_preset_cpu_holds_what_the_study_must_show(data):
     cells = sparse_cells("cpu", data)
     count = Counter((cell["scene"], cell["views"], cell["start"], cell["method"]) for cell in cells)
     for scene, views in SCENES.items():
-        start = "scene" if scene.startswith("blender") else "dense"
         for method in ("off", "progressive 0.2", "fixed 0.1"):
-            assert count[scene, views, start, method] == 3
+            assert count[scene, views, "dense", method] == 3
         assert count[scene, views, "sift", "progressive 0.2"] == 3
     for scene in ("llff/fern", "llff/flower"):
         for views in (6, 9):

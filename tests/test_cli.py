@@ -17,6 +17,7 @@ from kgs.datasets.synthetic import synthetic_scene
 from kgs.fit.config import FAST, FitConfig
 
 STEPS = 30
+FIT = ("--init", "scene", "--max-gaussians", 3000)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def fitted(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    assert run("fit", folder, "-o", out, "--steps", STEPS, "--max-gaussians", 3000) == 0
+    assert run("fit", folder, "-o", out, "--steps", STEPS, *FIT) == 0
     return out
 
 
@@ -106,12 +107,12 @@ def test_eval_measures_the_same(fitted, capsys):
 
 def test_resume_of_a_finished_fit_changes_nothing(fitted, folder):
     before = (fitted / "splat.ply").read_bytes()
-    assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--max-gaussians", 3000, "--resume") == 0
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS, *FIT, "--resume") == 0
     assert (fitted / "splat.ply").read_bytes() == before
 
 
 def test_resume_with_other_numbers_is_refused(fitted, folder, capsys):
-    assert run("fit", folder, "-o", fitted, "--steps", STEPS + 1, "--max-gaussians", 3000, "--resume") == 2
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS + 1, *FIT, "--resume") == 2
     assert "config.steps" in one_line(capsys)
 
 

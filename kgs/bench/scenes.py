@@ -14,7 +14,7 @@ from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
 
-__all__ = ["SYNTHETIC", "check_scenes", "layered_scene", "main_start"]
+__all__ = ["SYNTHETIC", "check_scenes", "layered_scene"]
 
 SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 
@@ -72,8 +72,3 @@ def check_scenes(data: Path, scenes: Iterable[str]) -> None:
     for scene in scenes:
         if not (data / scene).is_dir():
             raise DataError(data, scene, "expected this scene in the folder of KGS_DATA")
-
-
-def main_start(scene: str) -> str:
-    """The kind of first points of the study: as Blender's layout prescribes, dense ones for all other layouts."""
-    return "scene" if scene.startswith("blender") else "dense"

@@ -16,7 +16,7 @@ from kgs.errors import DataError
 
 from .grid import read_rows, run_grid
 from .published import PAPER
-from .scenes import SYNTHETIC, check_scenes, main_start
+from .scenes import SYNTHETIC, check_scenes
 from .sparse_cell import sparse_cell
 from .sparse_report import write_report
 from .sparse_tables import FIXED, MAIN, OFF
@@ -123,13 +123,10 @@ def _cpu_cells(data: Path) -> list[Cell]:
         cell
         for seed in range(3)
         for cell in (
-            *(_cell(s, n, main_start(s), name, seed, fit, 2.0) for s, n in SCENES.items() for name in MAIN),
-            *(
-                _cell(s, n, start, PAPER, seed, fit, 2.0)
-                for s, n in SCENES.items()
-                for start in ("sift", "dense")
-                if start != main_start(s)
-            ),
+            *(_cell(s, n, "dense", name, seed, fit, 2.0) for s, n in SCENES.items() for name in MAIN),
+            *(_cell(s, n, "sift", PAPER, seed, fit, 2.0) for s, n in SCENES.items()),
+            # as published: from random points
+            *(_cell("blender/lego", 8, "scene", name, seed, fit, 2.0) for name in MAIN),
         )
     ]
     forbidden = [
@@ -159,10 +156,11 @@ def _paper_cells(data: Path) -> list[Cell]:
         raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
     fit = {"steps": 10_000}
     return [
-        _cell(str(path.relative_to(data)), views, main_start(path.parent.name), name, seed, fit, None)
+        _cell(str(path.relative_to(data)), views, start, name, seed, fit, None)
         for seed in range(5)
         for path in folders
         for views in VIEWS[path.parent.name]
+        for start in (("dense", "scene") if path.parent.name == "blender" else ("dense",))
         for name in METHODS
         if name in MAIN or (path.parent.name == "llff" and views == 3)
     ]

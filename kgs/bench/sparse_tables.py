@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from .published import PAPER, Figures, benchmark_of, published, published_differences
-from .scenes import main_start
 from .statistics import (
     Difference,
     Group,
@@ -101,13 +100,10 @@ def all_settings(groups: Groups) -> list[Group]:
 
 
 def main_settings(groups: Groups) -> list[Group]:
-    """Each scene's main protocol, its fewest views: from dense points, Blender's from those that its layout prescribes.
-
-    Scenes without the main start are left out.
-    """
+    """Each scene's main protocol: its fewest views, dense first points. Scenes without these are left out."""
     settings: dict[str, Group] = {}
     for setting in all_settings(groups):
-        if setting.start == main_start(setting.scene):
+        if setting.start == "dense":
             settings.setdefault(setting.scene, setting)
     return list(settings.values())
 

@@ -90,8 +90,8 @@ class FitConfig:
         sh_degree: degree of the harmonics, 0 to 3.
         coarse: share of the steps, the first ones, that see the training views in half the pixels a side; in [0, 1].
         seed: views, splits, masks and random points are drawn from streams that derive from it.
-        init: first points: "dense", "sift", "random", "model-points" (positions refined with test views), "file", or
-            "auto", which is "dense" except where the layout itself prescribes random points (Blender).
+        init: first points: "dense", "sift", "random", "scene" (the random ones that Blender's layout prescribes),
+            "model-points" (positions refined with test views), or "file".
         init_file: point cloud for "file".
         max_gaussians: densification stops there; None: 10 a step, and at least twice the first points.
         growth: share of the steps over which the limit rises to that, evenly, from the first points; 0 sets it at
@@ -112,7 +112,7 @@ class FitConfig:
     sh_degree: int = 3
     coarse: float = 0.0
     seed: int = 0
-    init: str = "auto"
+    init: str = "dense"
     init_file: Path | None = None
     max_gaussians: int | None = None
     growth: float = 0.0

@@ -114,8 +114,6 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
         ValueError: an unknown kind.
     """
     kind = config.init
-    if kind == "auto":
-        kind = "scene" if scene.init_kind == "random" else "dense"
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
             raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
