@@ -127,10 +127,11 @@ def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
     Returns:
         Both over the depths of points inside an image, else of all points before a camera; 1.0 where there are none.
     """
-    pixels, depths = project_all(points.detach().cpu(), views.cameras)
-    before = depths[depths > 0]
-    seen = depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
-    depths = seen if len(seen) else before
+    points = points.detach().cpu()
+    depths = _seen_depths(points, views)
+    if not len(depths):
+        _, depths = project_all(points, views.cameras)
+        depths = depths[depths > 0]
     return (_quantile(depths, 0.01), _quantile(depths, 0.5)) if len(depths) else (1.0, 1.0)
 
 
@@ -181,8 +182,7 @@ def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
 
     Only where a view has them: a point close beside a camera would leave hardly a plane for the scene.
     """
-    pixels, depths = project_all(points, views.cameras)
-    depths = depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
+    depths = _seen_depths(points, views)
     return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 
 
@@ -209,6 +209,12 @@ def _inside(pixels: Tensor, depths: Tensor, views: Views, near: float, far: floa
     height, width = views.images.shape[-2:]
     limits = torch.tensor([width - 0.5, height - 0.5], dtype=pixels.dtype)
     return ((pixels > -0.5) & (pixels < limits)).all(-1) & (depths >= near) & (depths <= far)
+
+
+def _seen_depths(points: Tensor, views: Views) -> Tensor:
+    """Depths of points in the views whose image they lie in, `(D,)`."""
+    pixels, depths = project_all(points, views.cameras)
+    return depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
 
 
 def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:
