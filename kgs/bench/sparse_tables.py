@@ -96,7 +96,7 @@ def all_settings(groups: Groups) -> list[Group]:
     """Scene, views and start of all groups, under the method "off", whether or not that has cells; scene by scene."""
     scenes = [group.scene for group in groups]
     settings = dict.fromkeys(group._replace(method=OFF) for group in groups)
-    return sorted(settings, key=lambda s: (scenes.index(s.scene), s.views))
+    return sorted(settings, key=lambda s: (scenes.index(s.scene), s.views, s.start != "dense"))
 
 
 def main_settings(groups: Groups) -> list[Group]:
