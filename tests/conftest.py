@@ -4,14 +4,13 @@ import os
 from pathlib import Path
 
 import pytest
-
-if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each; before torch, which reads it once
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import torch
 
 from kgs.datasets import synthetic_scene
 from kgs.fit.initialize import FirstPoints
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
+    torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
 
 @pytest.fixture(autouse=True)
