@@ -123,10 +123,8 @@ def _cpu_cells(data: Path) -> list[Cell]:
         cell
         for seed in range(3)
         for cell in (
-            *(_cell(s, n, "dense", name, seed, fit, 2.0) for s, n in SCENES.items() for name in MAIN),
+            *(_cell(s, n, start, m, seed, fit, 2.0) for s, n in SCENES.items() for start in _starts(s) for m in MAIN),
             *(_cell(s, n, "sift", PAPER, seed, fit, 2.0) for s, n in SCENES.items()),
-            # as published: from random points
-            *(_cell("blender/lego", 8, "scene", name, seed, fit, 2.0) for name in MAIN),
         )
     ]
     forbidden = [
@@ -160,10 +158,15 @@ def _paper_cells(data: Path) -> list[Cell]:
         for seed in range(5)
         for path in folders
         for views in VIEWS[path.parent.name]
-        for start in (("dense", "scene") if path.parent.name == "blender" else ("dense",))
+        for start in _starts(path.parent.name)
         for name in METHODS
         if name in MAIN or (path.parent.name == "llff" and views == 3)
     ]
+
+
+def _starts(scene: str) -> tuple[str, ...]:
+    """Where the main methods begin: at dense points; Blender scenes also at the layout's random ones, as published."""
+    return ("dense", "scene") if scene.startswith("blender") else ("dense",)
 
 
 def _cell(
