@@ -1,8 +1,11 @@
 """What every test may rely on."""
 
+import json
 import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -39,3 +42,26 @@ def points():
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
     return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The synthetic orbit scene as a Blender folder."""
+    root = tmp_path_factory.mktemp("scene")
+    scene = synthetic_scene("orbit", train_views=4, test_views=2, size=(36, 40), seed=0)
+    for split, views in (("train", scene.train), ("test", scene.test)):
+        (root / split).mkdir()
+        frames = []
+        for i, image in enumerate(views.images):
+            pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
+            rgba = np.dstack([pixels[:, :, ::-1], np.full(pixels.shape[:2], 255, np.uint8)])
+            cv2.imwrite(str(root / split / f"r_{i}.png"), rgba)
+            pose = (
+                torch.linalg.inv(views.cameras.extrinsics[i].double())
+                @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+            )
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+        width, focal = views.images.shape[-1], float(views.cameras.fx[0])
+        content = {"camera_angle_x": 2 * float(np.arctan(width / 2 / focal)), "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root

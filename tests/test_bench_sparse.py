@@ -11,6 +11,7 @@ from grid_cells import threads_instead
 
 from kgs import DataError
 from kgs.bench import grid, sparse
+from kgs.bench import sparse_cell as sparse_cell_module
 from kgs.bench.coadaptation import coadaptation
 from kgs.bench.sparse import METHODS, SCENES, measure_sparse, sparse_cells
 from kgs.bench.sparse_cell import sparse_cell
@@ -72,10 +73,11 @@ def test_the_preset_cpu_holds_what_the_study_must_show(data):
     assert {cell["fit"]["steps"] for cell in cells} == {2000}
 
 
-def test_methods_of_one_start_follow_each_other_and_have_the_same_points(data):
+def test_methods_of_one_start_follow_each_other(data):
     cells = sparse_cells("cpu", data)[:6]
-    assert [cell["method"] for cell in cells[:3]] == ["off", "progressive 0.2", "fixed 0.1"]
-    assert len({(cell["scene"], cell["seed"]) for cell in cells[:3]}) == 1
+    assert [cell["method"] for cell in cells] == ["off", "progressive 0.2", "fixed 0.1"] * 2
+    assert [cell["scene"] for cell in cells] == ["llff/fern"] * 3 + ["llff/flower"] * 3
+    assert {cell["seed"] for cell in cells} == {0}
 
 
 def test_what_is_missing_is_named(tmp_path):
@@ -107,6 +109,40 @@ def test_a_cell_measures_and_repeats_bit_for_bit():
     assert results[0] == results[1]
 
 
+def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
+    begun = []
+
+    def trainer(scene, config, first):
+        begun.append((config.drop, first.points))
+        return Trainer(scene, config, first)
+
+    monkeypatch.setattr(sparse_cell_module, "Trainer", trainer)
+    for method, seed in (("off", 0), ("fixed 0.1", 0), ("off", 1)):
+        sparse_cell_module._start.cache_clear()  # as in another process
+        sparse_cell(tiny_cell(method, seed, start="random"))
+    (off, first), (drop, second), (_, other) = begun
+    assert (off, drop) == (0.0, 0.1)
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+
+
+def test_a_scene_on_the_disk_and_its_own_points(folder):
+    cell = tiny_cell(start="scene") | {"scene": folder.name, "views": 4, "downscale": 2.0}
+    result = sparse_cell(cell, data=str(folder.parent))
+    assert result["init"]["kind"] == "random"
+    assert "come with the layout" in result["protocol"]["init"]
+    assert result["protocol"]["image_size"] == [18, 20]
+    assert (result["config"]["steps"], result["config"]["drop"]) == (3, 0.0)
+
+
+def test_lpips_is_measured_where_there_are_weights(kgs_data):
+    result = sparse_cell(tiny_cell(), lpips_weights=str(kgs_data / "weights"))
+    for part in ("test", "train"):
+        lpips, unscaled = result[part]["lpips_vgg"], result[part]["lpips_vgg_unscaled"]
+        assert 0 < lpips < 2
+        assert 0 < unscaled != lpips
+
+
 def test_a_real_scene_needs_a_folder():
     with pytest.raises(DataError, match="KGS_DATA"):
         sparse_cell(tiny_cell() | {"scene": "llff/fern"})
@@ -129,6 +165,27 @@ def test_it_goes_on_and_reports(tmp_path, monkeypatch):
     assert [row["cell"] for row in rows] == cells
     assert "off" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
     assert (tmp_path / "index.html").exists()
+
+
+def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch):
+    monkeypatch.setattr(grid, "local_processes", threads_instead)
+    monkeypatch.setattr(sparse, "_quick_cells", lambda: [tiny_cell()])
+    measure_sparse(tmp_path, processes=1, say=lambda line: None)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(sparse, "_quick_cells", lambda: [tiny_cell("fixed 0.1")])
+    with pytest.raises(DataError, match="expected cells of the preset 'quick'"):
+        measure_sparse(tmp_path, processes=1, say=lambda line: None)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(sparse, "_quick_cells", lambda: [tiny_cell()])
+    monkeypatch.setattr(grid, "local_processes", threads_instead)
+    (row,) = measure_sparse(tmp_path, processes=1, say=lambda line: None)
+    with (tmp_path / "sparse.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+    assert measure_sparse(tmp_path, processes=1, say=lambda line: None) == [row]
+    assert "cells: 1 of 1" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
 
 
 # -- the probe of co-adaptation ------------------------------------------------------------------------------------

@@ -9,38 +9,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 
 import kgs
 from kgs.cli import main
-from kgs.datasets.synthetic import synthetic_scene
 from kgs.fit.config import FAST, FitConfig
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """The synthetic orbit scene as a Blender folder."""
-    root = tmp_path_factory.mktemp("scene")
-    scene = synthetic_scene("orbit", train_views=4, test_views=2, size=(36, 40), seed=0)
-    for split, views in (("train", scene.train), ("test", scene.test)):
-        (root / split).mkdir()
-        frames = []
-        for i, image in enumerate(views.images):
-            pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
-            rgba = np.dstack([pixels[:, :, ::-1], np.full(pixels.shape[:2], 255, np.uint8)])
-            cv2.imwrite(str(root / split / f"r_{i}.png"), rgba)
-            pose = (
-                torch.linalg.inv(views.cameras.extrinsics[i].double())
-                @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
-            )
-            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
-        width, focal = views.images.shape[-1], float(views.cameras.fx[0])
-        content = {"camera_angle_x": 2 * float(np.arctan(width / 2 / focal)), "frames": frames}
-        (root / f"transforms_{split}.json").write_text(json.dumps(content))
-    return root
 
 
 def run(*arguments):
@@ -138,6 +113,7 @@ def test_bare_photos_need_poses(tmp_path, capsys):
         (["fit", "{scene}", "-o", "{out}", "--drop", "1.0"], "drop"),
         (["fit", "{scene}", "-o", "{out}", "--init", "file", "--init-file", "{missing}"], "missing"),
         (["fit", "{scene}", "-o", "{out}", "--lpips-weights", "{missing}"], "missing"),
+        (["bench", "sparse", "-o", "{out}", "--quick", "--preset", "cpu"], "--quick"),
         (["render", "{missing}", "--cameras", "{scene}", "-o", "{out}"], "missing"),
         (["eval", "{missing}"], "config.json"),
     ],

@@ -23,7 +23,7 @@ def test_distances_are_those_to_the_cameras_centre(scene, points):
         assert torch.equal(gaussian_scores("near", trainer.densifier, camera), -far)
 
 
-def test_gradients_are_those_that_densification_compares(scene, points):
+def test_gradients_are_means_of_what_the_densifier_observed(scene, points):
     trainer = Trainer(scene, replace(CONFIG, recipe=Recipe(grad_threshold=1e9)), points)
     trainer.fit(lambda trainer, _: trainer.step == 9)  # before the first densification
     state = trainer.densifier.state_dict()

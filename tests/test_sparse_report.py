@@ -12,6 +12,7 @@ import pytest
 
 from kgs.bench.output import html_table, latex_escape, latex_table
 from kgs.bench.sparse import METHODS
+from kgs.bench.sparse_groups import EQUAL_MEAN_RATE, FAMILIES
 from kgs.bench.sparse_plots import STYLES
 from kgs.bench.sparse_report import write_report
 from kgs.bench.statistics import student_quantile
@@ -60,7 +61,7 @@ def full(**options):
     cells += [("llff/fern", 3, "dense", method, seed) for method in reversed(ABLATIONS) for seed in (0, 1)]
     cells += [("llff/fern", 3, start, "progressive 0.2", seed) for start in ("sift", "model-points") for seed in (0, 1)]
     cells += [("blender/lego", 8, "scene", method, seed) for method in MAIN for seed in range(3)]
-    cells += [("llff/fern", 6, "dense", method, 0) for method in MAIN[:2]]
+    cells += [(scene, 6, "dense", method, 0) for scene in ("llff/fern", "llff/flower") for method in MAIN[:2]]
     return [made_up(*cell, **options) for cell in cells]
 
 
@@ -69,10 +70,10 @@ def psnrs(rows, scene, method, views=3):
     return [row["result"]["test"]["psnr"] for row in rows if list(row["cell"].values())[:4] == wanted]
 
 
-def interval(differences):
+def interval(differences, decimals=2):
     half = student_quantile(len(differences) - 1) * np.std(differences, ddof=1) / math.sqrt(len(differences))
     mean = np.mean(differences)
-    return f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] ({len(differences)})"
+    return f"{mean:+.{decimals}f} [{mean - half:+.{decimals}f}, {mean + half:+.{decimals}f}]"
 
 
 def lines(markdown, title, *names):
@@ -136,7 +137,7 @@ def reports(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("kgs.bench.sparse_plots.DPI", 40)  # time
         return {
-            name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench sparse --preset cpu"))
+            name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench sparse --preset cpu", 99))
             for k, (name, rows) in enumerate(CASES.items())
         }
 
@@ -176,6 +177,11 @@ def test_methods_are_told_apart():
     assert STYLES.keys() == METHODS.keys()  # of the study
 
 
+def test_each_method_has_a_table():
+    assert {*MAIN, *(name for family in FAMILIES.values() for name in family)} == METHODS.keys()
+    assert {*EQUAL_MEAN_RATE, *EQUAL_MEAN_RATE.values()} <= METHODS.keys()
+
+
 def test_plots_without_data_are_left_out(reports, tmp_path):
     drawn = {case: sorted(path.name for path in out.glob("*.png")) for case, (out, _) in reports.items()}
     assert drawn["full"] == sorted(PLOTS)
@@ -183,13 +189,13 @@ def test_plots_without_data_are_left_out(reports, tmp_path):
     assert drawn["other starts alone"] == []
     rows = full()[:1]
     rows[0]["result"] |= {"curve": [], "coadaptation": None, "thresholds": None, "cpu_seconds": None}
-    write_report(rows, tmp_path, "command")
+    write_report(rows, tmp_path, "command", 1)
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["gap.png"]
 
 
 def test_the_same_rows_give_the_same_bytes(reports, tmp_path, monkeypatch):
     monkeypatch.setattr("kgs.bench.sparse_plots.DPI", 40)
-    write_report(CASES["one cell"], tmp_path, "kgs bench sparse --preset cpu")
+    write_report(CASES["one cell"], tmp_path, "kgs bench sparse --preset cpu", 99)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (reports["one cell"][0] / path.name).read_bytes()
 
@@ -204,9 +210,10 @@ def test_the_main_table(markdown):
         off, paper = (psnrs(rows, scene, method, views) for method in MAIN[:2])
         (row,) = lines(markdown, "Test views", setting, "progressive 0.2")
         expected = ["3", f"{np.mean(paper):.2f} ({np.std(paper, ddof=1):.2f})", f"{max(paper):.2f}"]
-        assert row[2:6] == [*expected, interval(np.subtract(paper, off))]
+        assert row[2:6] == [*expected, f"{interval(np.subtract(paper, off))} (3)"]
         assert row[6] == f"{np.mean(paper) / 31:.3f} ({np.std(paper, ddof=1) / 31:.3f})"
         assert row[7] == f"{np.mean(paper) / 110:.3f} ({np.std(paper, ddof=1) / 110:.3f})"
+        assert row[8] == interval(np.subtract(paper, off) / 110, decimals=3)
     assert "20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207 | +1.54 or +1.34 |" in markdown
     assert "25.42 / 0.888 / 0.089 | +3.86 |" in markdown
 
@@ -222,30 +229,35 @@ def test_means_over_scenes(markdown):
     half = student_quantile(6) * math.sqrt(differences.var(1, ddof=1).mean() / 9)
     mean = differences.mean()
     assert row[5] == f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] (9)"
-    assert row[8:] == ["-", "-"]  # the paper has no such mean
+    assert row[9:] == ["-", "-"]  # the paper has no such mean
     (llff,) = lines(markdown, "Test views", "mean of 2 LLFF scenes (fern, flower)", "progressive 0.2")
-    assert llff[8:] == ["20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207", "+1.54 or +1.34"]
+    assert llff[9:] == ["20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207", "+1.54 or +1.34"]
     assert f"progressive 0.2 over off: {row[5].removesuffix(' (9)')} dB" in markdown
 
 
 def test_other_tables(markdown):
     rows = FULL
+    six = [psnrs(rows, scene, "off", 6)[0] for scene in ("llff/fern", "llff/flower")]
     (views,) = lines(markdown, "Numbers of views", "llff/fern, 6 views, dense", "off")
-    assert views[2:4] == ["1", f"{psnrs(rows, 'llff/fern', 'off', 6)[0]:.2f}"]
+    assert views[2:4] == ["1", f"{six[0]:.2f}"]
+    (views,) = lines(markdown, "Numbers of views", "mean of 2 scenes (fern, flower), 6 views", "off")
+    assert views[2:4] == ["1", f"{np.mean(six):.2f}"]
+    assert views[9] == "23.80 / 0.814 / 0.125"
     dense, off = psnrs(rows, "llff/fern", "progressive 0.2"), psnrs(rows, "llff/fern", "off")
     sift = [r["result"]["test"]["psnr"] for r in rows if r["cell"]["start"] == "sift"]
     (start,) = lines(markdown, "First points", "llff/fern, 3 views", "dense")
-    assert start[8:] == [interval(np.subtract(dense[:2], sift)), interval(np.subtract(dense, off))]
+    assert start[8:] == [f"{interval(np.subtract(dense[:2], sift))} (2)", f"{interval(np.subtract(dense, off))} (3)"]
     assert lines(markdown, "First points", "model-points (sees test views)")
     fixed = psnrs(rows, "llff/fern", "fixed 0.3")
     (rate,) = lines(markdown, "Rates and schedules", "fixed 0.3")
-    assert rate[4:6] == [interval(np.subtract(fixed, values[:2])) for values in (off, dense)]
-    assert rate[6:] == ["20.15", "+0.93", "-0.41"]
+    assert rate[4:6] == [f"{interval(np.subtract(fixed, values[:2]))} (2)" for values in (off, dense)]
+    assert rate[6:8] == [f"{np.mean(fixed) / d:.3f} ({np.std(fixed, ddof=1) / d:.3f})" for d in (31, 110)]
+    assert rate[8:] == ["20.15 / 0.691 / 0.223", "+0.93", "-0.41"]
     growing, mean_rate = psnrs(rows, "llff/fern", "progressive 0.3"), psnrs(rows, "llff/fern", "fixed 0.15")
     (equal,) = lines(markdown, "A growing rate", "progressive 0.3 over fixed 0.15")
-    assert equal[1:] == [interval(np.subtract(growing, mean_rate)), "-"]
-    assert lines(markdown, "Selected Gaussians", "near")[0][6:] == ["17.49", "-1.73", "-3.27"]
-    assert lines(markdown, "An L1 penalty", "L1 gradient 0.01")[0][6:] == ["19.97", "+0.75", "-0.79"]
+    assert equal[1:] == [f"{interval(np.subtract(growing, mean_rate))} (2)", "-"]
+    assert lines(markdown, "Selected Gaussians", "near")[0][8:] == ["17.49 / 0.582 / 0.273", "-1.73", "-3.27"]
+    assert lines(markdown, "An L1 penalty", "L1 gradient 0.01")[0][8:] == ["19.97 / 0.690 / 0.211", "+0.75", "-0.79"]
     groups = {}
     for row in rows:
         groups.setdefault(tuple(row["cell"].values())[:4], []).append(row["result"]["test"]["psnr"])
@@ -253,7 +265,7 @@ def test_other_tables(markdown):
     squares = sum(np.var(values) * len(values) for values in groups.values())
     (noise,) = lines(markdown, "Noise between seeds", "all cells", "PSNR [dB]")
     sd = math.sqrt(squares / freedom)
-    assert noise[3:6] == [str(freedom), f"{sd:.3f}", f"{1.96 * math.sqrt(2) * sd:.3f}"]
+    assert noise[3:6] == [str(freedom), f"{sd:.3f}", f"{student_quantile(freedom) * math.sqrt(2) * sd:.3f}"]
     fern = [r["result"] for r in rows if list(r["cell"].values())[:4] == ["llff/fern", 3, "dense", "off"]]
     (cost,) = lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense", "off")
     methods = [row[1] for row in lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense")]
@@ -274,18 +286,20 @@ def test_summary_csv(reports):
     assert (line["n"], line["seeds"]) == ("2", "0 1")
     assert float(line["test_psnr_sd"]) == pytest.approx(np.std(far, ddof=1))
     assert float(line["test_lpips_vgg_best"]) == pytest.approx(min(far) / 100)
-    assert float(line["psnr_over_off_mean"]) == pytest.approx(np.mean(np.subtract(far, off[:2])))
+    for measure, scale in (("psnr", 1), ("ssim_zero_padded", 31), ("lpips_vgg_unscaled", 110)):
+        difference = np.mean(np.subtract(far, off[:2])) / scale
+        assert float(line[f"{measure}_over_off_mean"]) == pytest.approx(difference)
     assert line["psnr_over_sift_mean"] == ""
     assert found["llff/fern", "6", "dense", "off"]["test_psnr_sd"] == ""
 
 
 def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
     with pytest.raises(ValueError, match="rows"):
-        write_report([], tmp_path, "command")
+        write_report([], tmp_path, "command", 0)
     rows = FULL[:1]
     longer = {"cell": rows[0]["cell"] | {"fit": {"steps": 10_000}}, "result": rows[0]["result"]}
     with pytest.raises(ValueError, match="two for 0"):
-        write_report([*rows, longer], tmp_path, "command")
+        write_report([*rows, longer], tmp_path, "command", 2)
 
 
 def test_text_is_escaped():

@@ -95,16 +95,25 @@ def test_intervals_over_scenes_hold_as_often_as_they_say():
 
 
 def test_differences_as_text():
-    assert str(Difference(3, 0.314, 0.1, 0.526)) == "+0.31 [+0.10, +0.53]"
-    assert str(Difference(1, -0.001, None, None)) == "+0.00"
+    assert Difference(3, 0.314, 0.1, 0.526).text(2) == "+0.31 [+0.10, +0.53]"
+    assert [Difference(1, -0.001, None, None).text(decimals) for decimals in (2, 3)] == ["+0.00", "-0.001"]
 
 
 def test_noise_floor():
     found = noise_floor([[1.0, 3.0], [5.0], [10.0, 11.0, 12.0], []])
     assert found == Noise(pytest.approx(math.sqrt((2 + 2) / 3)), 3, 2)
-    assert found.between_means(1) == pytest.approx(2.77 * found.sd, rel=1e-3)
+    assert found.between_means(1) == pytest.approx(student_quantile(3) * math.sqrt(2) * found.sd)
     assert found.between_means(4) == pytest.approx(found.between_means(1) / 2)
     assert noise_floor([[1.0], [2.0]]) is None
+
+
+def test_two_means_differ_by_less_than_the_noise_as_often_as_it_says():
+    rng, held, repeats = random.Random(1), 0, 3000
+    for _ in range(repeats):
+        noise = noise_floor([[rng.gauss(0, 0.2) for _ in range(3)] for _ in range(2)])
+        first, second = (sum(rng.gauss(0, 0.2) for _ in range(3)) / 3 for _ in range(2))
+        held += abs(first - second) < noise.between_means(3)
+    assert abs(held / repeats - 0.95) < 3 * math.sqrt(0.95 * 0.05 / repeats)
 
 
 def test_the_best_of_five_normal_numbers():
@@ -136,13 +145,15 @@ def test_cells_in_groups():
 
 
 def test_the_papers_figures():
-    assert benchmark_of("llff/fern") == benchmark_of("colmap/trex") == "LLFF"
-    assert benchmark_of("blender/lego") == "Blender"
-    assert benchmark_of("nerfstudio/fox") is None
+    assert benchmark_of("llff/fern", 3) == benchmark_of("colmap/trex", 6) == "LLFF"
+    assert benchmark_of("blender/lego", 8) == "Blender"
+    assert [benchmark_of("colmap/room", views) for views in (3, 24)] == ["LLFF", "Mip-NeRF 360"]
+    assert benchmark_of("nerfstudio/fox", 12) is benchmark_of("llff/fern", 12) is None
     assert [f.psnr for f in published("LLFF", 3, PAPER)] == [20.76, 20.56]  # it contradicts itself
     assert published("LLFF", 3, "near") == published("LLFF", 3, "far")
     assert published("LLFF", 6, "fixed 0.1") == published(None, 3, "off") == published("LLFF", 12, "off") == ()
     assert published_differences("LLFF", 3, PAPER, "off") == (1.54, 1.34)
+    assert published_differences("Mip-NeRF 360", 24, PAPER, "off") == (1.33, 1.12)  # the second from the text
     assert published_differences("LLFF", 3, "fixed 0.1", PAPER) == (-0.28,)  # of the same table
     assert published_differences("LLFF", 3, "near", "off") == (-1.73,)
     assert published_differences("Blender", 8, PAPER, "off") == (3.86,)
@@ -150,4 +161,4 @@ def test_the_papers_figures():
     rates = TABLES["LLFF", 3]["rate and schedule"].values()
     assert [sum(column) for column in zip(*rates, strict=True)] == pytest.approx([141.14, 4.858, 1.502])
     figures = [figure for tables in TABLES.values() for table in tables.values() for figure in table.values()]
-    assert all(15 < f.psnr < 30 and 0.5 < f.ssim < 0.9 and 0.08 < f.lpips < 0.3 for f in figures)
+    assert all(15 < f.psnr < 30 and 0.5 < f.ssim < 0.9 and 0.08 < f.lpips < 0.42 for f in figures)

@@ -18,7 +18,7 @@ def bench(
     quick: bool = False,
     device: str = "cpu",
     processes: int | None = None,
-    preset: Literal["quick", "cpu", "paper"] = "quick",
+    preset: Literal["quick", "cpu", "paper"] | None = None,
     scheduler: str | None = None,
     lpips_weights: Path | None = None,
 ) -> int:
@@ -36,13 +36,16 @@ def bench(
             faults: fits that are killed or whose disk is full; exit code 1 where anything is lost.
             With KGS_DATA, a folder of scenes, training, sparse and starts measure on real ones.
         out: folder for the results.
-        quick: less of it, in about a minute.
+        quick: less of it, in about a minute; for sparse its preset of that name.
         device: cpu, cuda, ... (speed).
         processes: fits at a time; one a core unless given (training, sparse).
-        preset: sparse: quick takes minutes on the built-in scene; cpu hours on the five scenes of KGS_DATA; paper is
-            the paper's protocol on every scene there, for a large machine.
+        preset: sparse: quick, the default, takes minutes on the built-in scene; cpu hours on the five scenes of
+            KGS_DATA; paper is the paper's 10 000 steps on every scene there in the size it has, for a large machine.
         scheduler: sparse: address of a Dask scheduler whose workers run the cells.
         lpips_weights: sparse: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
+
+    Raises:
+        ValueError: `quick` together with another preset.
     """
     if what == "speed":
         from .speed import measure_speed
@@ -59,7 +62,9 @@ def bench(
     elif what == "sparse":
         from .sparse import measure_sparse
 
-        measure_sparse(out, preset, processes=processes, scheduler=scheduler, lpips_weights=lpips_weights)
+        if quick and preset not in (None, "quick"):
+            raise ValueError(f"preset: expected none but quick together with --quick, got {preset!r}")
+        measure_sparse(out, preset or "quick", processes=processes, scheduler=scheduler, lpips_weights=lpips_weights)
     elif what == "starts":
         from .starts import measure_starts
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from .workers import LOST, Cell, Result, dask_workers, local_processes
 
-__all__ = ["read_rows", "run_grid"]
+__all__ = ["finished_rows", "read_rows", "run_grid"]
 
 
 def run_grid(
@@ -59,7 +59,7 @@ def run_grid(
     keys = [_key(cell) for cell in cells]
     if len(set(keys)) < len(keys):
         raise ValueError("cells: expected each one once, got two that are equal")
-    done = {_key(row["cell"]): row for row in read_rows(path, repair=True)}
+    done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
     missing = [cell for cell, key in zip(cells, keys, strict=True) if key not in done]
     say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
     failures: list[str] = []
@@ -71,13 +71,11 @@ def run_grid(
                     failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
                     say(f"failed: {failures[-1]}")
                     continue
-                row = {"cell": cell, "result": outcome}
-                _append(path, row)
-                done[_key(cell)] = row
+                _append(path, {"cell": cell, "result": outcome})
                 say(f"{count} of {len(missing)}: {_key(cell)}")
     if failures:
         raise RuntimeError(f"{len(failures)} of {len(missing)} cells failed, the first one: {failures[0]}")
-    return [done[key] for key in keys]
+    return finished_rows(cells, path)
 
 
 def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
@@ -92,7 +90,7 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    lines = path.read_bytes().splitlines(keepends=True)
     rows = []
     for number, line in enumerate(lines, 1):
         try:
@@ -101,11 +99,18 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
             if number < len(lines):
                 raise ValueError(f"{path}: line {number} is no JSON ({error})") from error
     whole = lines[: len(rows)]
-    if whole and not whole[-1].endswith("\n"):
-        whole[-1] += "\n"
-    if repair and whole != lines:
-        path.write_text("".join(whole), encoding="utf-8")
+    if repair and len(whole) < len(lines):
+        os.truncate(path, sum(map(len, whole)))
+    elif repair and whole and not whole[-1].endswith(b"\n"):
+        with path.open("ab") as file:
+            file.write(b"\n")
     return rows
+
+
+def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
+    """The lines of those of the cells that the file has, in the cells' order; of two lines of one cell the last."""
+    done = {_key(row["cell"]): row for row in read_rows(path)}
+    return [done[key] for key in map(_key, cells) if key in done]
 
 
 def _outcomes(

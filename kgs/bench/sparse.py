@@ -14,12 +14,12 @@ from typing import Any
 
 from kgs.errors import DataError
 
-from .grid import read_rows, run_grid
+from .grid import finished_rows, read_rows, run_grid
 from .published import PAPER
 from .scenes import SYNTHETIC, check_scenes
 from .sparse_cell import sparse_cell
+from .sparse_groups import FIXED, MAIN, OFF
 from .sparse_report import write_report
-from .sparse_tables import FIXED, MAIN, OFF
 from .workers import Cell
 
 __all__ = ["METHODS", "PRESETS", "measure_sparse", "sparse_cells"]
@@ -88,11 +88,15 @@ def measure_sparse(
         processes: fits at a time, None for one a core; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler that runs the cells instead; its workers find scenes and weights under
             the same paths.
-        lpips_weights: a folder with the weights of VGG16 and LPIPS; without it LPIPS is left out.
+        lpips_weights: a folder with the weights of VGG16 and LPIPS; without it LPIPS is left out, for good: a cell
+            that is there is not measured again.
         say: where lines for the user go.
 
     Returns:
         The lines of sparse.jsonl that belong to the preset.
+
+    Raises:
+        DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
     """
     folder = os.environ.get("KGS_DATA")
     cells = sparse_cells(preset, None if folder is None else Path(folder))
@@ -100,12 +104,16 @@ def measure_sparse(
     data = None if folder is None else os.path.abspath(folder)
     work = partial(sparse_cell, data=data, lpips_weights=weights)
     path = out / "sparse.jsonl"
+    if read_rows(path) and not finished_rows(cells, path):
+        raise DataError(
+            path, "", f"expected cells of the preset {preset!r}, got others; give each preset its own folder"
+        )
     try:
         run_grid(cells, work, path, scheduler=scheduler, processes=processes or os.cpu_count() or 1, say=say)
     finally:
-        rows = [row for row in read_rows(path) if row["cell"] in cells]
+        rows = finished_rows(cells, path)
         if rows:
-            write_report(rows, out, f"kgs bench sparse --preset {preset}")
+            write_report(rows, out, f"kgs bench sparse --preset {preset}", len(cells))
     return rows
 
 

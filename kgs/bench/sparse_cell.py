@@ -41,14 +41,14 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
 
     Returns:
         Plain values: means of the measures under "test" and "train", "test_views" (PSNR of each), "curve", "init",
-        "gaussians", "wall_seconds" and "cpu_seconds" of the training, "peak_rss_mb", "coadaptation", "thresholds",
-        "protocol" and "versions".
+        "gaussians", "wall_seconds" of the training, "cpu_seconds" of the training and its curve, "peak_rss_mb",
+        "coadaptation", "thresholds", "config" (all settings of the fit), "protocol" and "versions".
 
     Raises:
         DataError: the scene is not there or damaged.
     """
     scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
-    config = FitConfig.from_dict(FitConfig().to_dict() | {"init": cell["start"], "seed": cell["seed"]} | cell["fit"])
+    config = FitConfig(init=cell["start"], seed=cell["seed"], **cell["fit"])
     trainer = Trainer(scene, config, points)
     start = time.process_time()
     trainer.fit()
@@ -65,6 +65,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         "peak_rss_mb": peak_rss_mb(),
         "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
         "thresholds": count_over_threshold(trainer, points.points),
+        "config": config.to_dict(),
         "protocol": metrics["protocol"],
         "versions": metrics["versions"],
     }

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .published import PAPER
-from .sparse_tables import MAIN, OFF, Groups, all_settings, main_settings, ordered, over
+from .sparse_groups import MAIN, OFF, Groups, all_settings, main_settings, ordered, over
 from .statistics import Difference, Group, by_seed, paired, paired_difference, summarize
 
 __all__ = ["Plot", "write_plots"]
@@ -74,7 +74,8 @@ def write_plots(groups: Groups, out: Path) -> list[Plot]:
         "thresholds.png": (
             _thresholds,
             f"Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, "
-            f"{pair}: mean over seeds, bars of one sd; each bin began with a sixth of the first points",
+            f"{pair}: mean over seeds, bars of one sd; each bin began with a sixth of the first points; a fit at "
+            "its limit of Gaussians keeps those that it could not densify",
         ),
     }
     return [Plot(out / name, caption) for name, (draw, caption) in plots.items() if draw(groups, out / name)]

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from .published import PAPER, Figures, benchmark_of, published, published_differences
+from .sparse_groups import (
+    EQUAL_MEAN_RATE,
+    FAMILIES,
+    FIXED,
+    MAIN,
+    OFF,
+    Groups,
+    all_settings,
+    main_settings,
+    measured,
+    ordered,
+    over,
+)
 from .statistics import (
     Difference,
     Group,
@@ -18,42 +31,14 @@ from .statistics import (
     summarize,
 )
 
-__all__ = [
-    "FIXED",
-    "MAIN",
-    "OFF",
-    "Groups",
-    "Table",
-    "all_settings",
-    "headline",
-    "main_settings",
-    "ordered",
-    "over",
-    "sparse_tables",
-]
+__all__ = ["QUALITY", "Table", "headline", "sparse_tables"]
 
-Groups = Mapping[Group, Mapping[int, Mapping[str, Any]]]
-
-OFF, FIXED = "off", "fixed 0.1"
-MAIN = (OFF, PAPER, FIXED)
-FAMILIES = {
-    "Rates and schedules": (
-        *("progressive 0.1", "progressive 0.3", "fixed 0.05"),
-        *("fixed 0.1", "fixed 0.15", "fixed 0.2", "fixed 0.3"),
-    ),
-    "Selected Gaussians dropped instead of random ones": ("high gradient", "low gradient", "near", "far"),
-    "An L1 penalty on opacities instead of dropping": (
-        *("L1 gradient 0.001", "L1 gradient 0.01"),
-        *("L1 distance 0.001", "L1 distance 0.01"),
-    ),
-}
-EQUAL_MEAN_RATE = {"progressive 0.1": "fixed 0.05", "progressive 0.2": "fixed 0.1", "progressive 0.3": "fixed 0.15"}
 STARTS = ("sift", "random", "model-points", "dense", "scene")
-QUALITY = {"test.psnr": 2, "test.ssim_zero_padded": 3, "test.lpips_vgg_unscaled": 3}
-_METHODS = tuple(dict.fromkeys((*MAIN, *(name for family in FAMILIES.values() for name in family))))
+LPIPS = "test.lpips_vgg_unscaled"
+QUALITY = {"test.psnr": 2, "test.ssim_zero_padded": 3, LPIPS: 3}
 _QUALITY_COLUMNS = (
-    *("method", "n", "PSNR [dB]", "best", "over off [dB] (pairs)", "SSIM", "LPIPS"),
-    *("paper, mean of 8 scenes: PSNR / SSIM / LPIPS", "paper: over off"),
+    *("method", "n", "PSNR [dB]", "best", "over off [dB] (pairs)", "SSIM", "LPIPS", "LPIPS over off"),
+    *("paper, mean of its scenes: PSNR / SSIM / LPIPS", "paper: over off"),
 )
 
 
@@ -83,85 +68,72 @@ def headline(groups: Groups) -> list[str]:
         difference = paired_difference(scenes)
         if difference is not None:
             counts = f"pairs: {difference.pairs}, scenes: {sum(map(bool, scenes))}"
-            sentences.append(f"{method} over {base}: {difference} dB of test PSNR (mean [95 % interval]; {counts}).")
+            shown = difference.text(2)
+            sentences.append(f"{method} over {base}: {shown} dB of test PSNR (mean [95 % interval]; {counts}).")
     return sentences
-
-
-def ordered(names: Iterable[str], order: Sequence[str] = _METHODS) -> list[str]:
-    """Each name once, known ones first and in their order."""
-    return sorted(dict.fromkeys(names), key=lambda name: order.index(name) if name in order else len(order))
-
-
-def all_settings(groups: Groups) -> list[Group]:
-    """Scene, views and start of all groups, under the method "off", whether or not that has cells; scene by scene."""
-    scenes = [group.scene for group in groups]
-    settings = dict.fromkeys(group._replace(method=OFF) for group in groups)
-    return sorted(settings, key=lambda s: (scenes.index(s.scene), s.views, s.start != "dense"))
-
-
-def main_settings(groups: Groups) -> list[Group]:
-    """Each scene's main protocol: its fewest views, dense first points. Scenes without these are left out."""
-    settings: dict[str, Group] = {}
-    for setting in all_settings(groups):
-        if setting.start == "dense":
-            settings.setdefault(setting.scene, setting)
-    return list(settings.values())
-
-
-def over(groups: Groups, group: Group, measure: str = "test.psnr", **base: str) -> list[float]:
-    """A group's paired differences over the group that differs from it in the fields given."""
-    other = group._replace(**base)  # type: ignore[arg-type]  # the method or the start, both str
-    return paired(_values(groups, group, measure), _values(groups, other, measure))
 
 
 def _methods(groups: Groups, main: list[Group]) -> Table:
     rows = [row for setting in main for row in _quality_rows(groups, [setting], _setting(setting))]
-    llff = [setting for setting in main if benchmark_of(setting.scene) == "LLFF" and setting.views == 3]
+    llff = [setting for setting in main if benchmark_of(setting.scene, setting.views) == "LLFF" and setting.views == 3]
     for settings, kind in ((llff, "LLFF scenes"), (main if main != llff else [], "scenes")):
         methods = [m for m in MAIN if any(setting._replace(method=m) in groups for setting in settings)]
         common = [s for s in settings if all(s._replace(method=m) in groups for m in methods)]
         if len(common) > 1:
-            names = ", ".join(setting.scene.rpartition("/")[2] for setting in common)
-            rows += _quality_rows(groups, common, f"mean of {len(common)} {kind} ({names})")
+            rows += _quality_rows(groups, common, _mean_of(common, kind))
     title = (
         "Test views: mean (sd) over n seeds; paired differences over off with their 95 % interval; the paper's figures "
-        "are means of 8 scenes in other sizes, best of five runs: not comparable in level, only in direction"
+        "are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction"
     )
     return Table(title, _QUALITY_COLUMNS, rows, "scene")
 
 
 def _views(groups: Groups, main: list[Group]) -> Table:
     rows = []
+    by_views: dict[int, list[Group]] = {}
     for setting in main:
         several = [s for s in all_settings(groups) if (s.scene, s.start) == (setting.scene, setting.start)]
         for given in several if len(several) > 1 else []:
             rows += _quality_rows(groups, [given], _setting(given))
+            by_views.setdefault(given.views, []).append(given)
+    for views, settings in sorted(by_views.items()):
+        if len(settings) > 1:
+            rows += _quality_rows(groups, settings, f"{_mean_of(settings, 'scenes')}, {views} views")
     return Table("Numbers of views", _QUALITY_COLUMNS, rows, "scene")
 
 
 def _quality_rows(groups: Groups, settings: list[Group], name: str) -> list[list[str]]:
     """One line a main method: of one setting, or of the mean over several by seed."""
-    benchmarks = {(benchmark_of(setting.scene), setting.views) for setting in settings}
+    benchmarks = {(benchmark_of(setting.scene, setting.views), setting.views) for setting in settings}
     benchmark, views = next(iter(benchmarks)) if len(benchmarks) == 1 else (None, 0)
     rows = []
     for method in MAIN:
         found = [setting._replace(method=method) for setting in settings]
         if not all(group in groups for group in found):
             continue
-        psnr, *others = (
-            (summarize(average_over_scenes([_values(groups, group, measure) for group in found]).values()), decimals)
-            for measure, decimals in QUALITY.items()
+        psnr, others = _quality(groups, found)
+        gain, cost = (
+            paired_difference(over(groups, group, measure, method=OFF) for group in found) if method != OFF else None
+            for measure in ("test.psnr", LPIPS)
         )
-        gain = paired_difference(over(groups, group, method=OFF) for group in found) if method != OFF else None
         rows.append(
             [
-                *(name, method, *_spread(psnr[0]), _difference(gain)),
-                *(_mean(*other) for other in others),
+                *(name, method, *psnr, _difference(gain), *others),
+                "-" if cost is None else cost.text(3),
                 _figures(published(benchmark, views, method)),
                 _printed(published_differences(benchmark, views, method, OFF)) if method != OFF else "-",
             ]
         )
     return rows
+
+
+def _quality(groups: Groups, found: list[Group]) -> tuple[tuple[str, str, str], list[str]]:
+    """Of PSNR how many, mean (sd) and best, of the other measures mean (sd): by seed the mean over the groups."""
+    psnr, *others = (
+        summarize(average_over_scenes([measured(groups, group, measure) for group in found]).values())
+        for measure in QUALITY
+    )
+    return _spread(psnr), [_mean(*other) for other in zip(others, list(QUALITY.values())[1:], strict=True)]
 
 
 def _starts(groups: Groups) -> Table:
@@ -176,7 +148,7 @@ def _starts(groups: Groups) -> Table:
                 over_sift = paired_difference([over(groups, group, start="sift")]) if start != "sift" else None
                 over_off = paired_difference([over(groups, group, method=OFF)]) if method != OFF else None
                 row = [f"{scene}, {views} views", method, _start(start, results)]
-                row += [*_spread(summarize(_values(groups, group).values())), _mean(summarize(points), 0)]
+                row += [*_spread(summarize(measured(groups, group).values())), _mean(summarize(points), 0)]
                 rows.append([*row, _mean(summarize(seconds), 0), _difference(over_sift), _difference(over_off)])
     columns = (
         *("method", "start", "n", "PSNR [dB]", "best", "first points", "their CPU [s]"),
@@ -197,10 +169,10 @@ def _ablations(groups: Groups, setting: Group) -> list[Table]:
     there = {group.method for group in groups if group[:3] == setting[:3]}
     if there <= set(MAIN):
         return []
-    tables, benchmark, where = [], benchmark_of(setting.scene), _setting(setting)
+    tables, benchmark, where = [], benchmark_of(setting.scene, setting.views), _setting(setting)
     columns = (
-        *("n", "PSNR [dB]", "best", "over off [dB] (pairs)", f"over {PAPER} [dB] (pairs)"),
-        *("paper: PSNR", "paper: over off", f"paper: over {PAPER}"),
+        *("n", "PSNR [dB]", "best", "over off [dB] (pairs)", f"over {PAPER} [dB] (pairs)", "SSIM", "LPIPS"),
+        *("paper: PSNR / SSIM / LPIPS", "paper: over off", f"paper: over {PAPER}"),
     )
     for title, family in FAMILIES.items():
         rows = []
@@ -209,9 +181,9 @@ def _ablations(groups: Groups, setting: Group) -> list[Table]:
             bases = (OFF, PAPER)
             gains = [paired_difference([over(groups, group, method=b)]) if b != method else None for b in bases]
             printed = [published_differences(benchmark, setting.views, method, b) if b != method else () for b in bases]
-            psnr = tuple(figures.psnr for figures in published(benchmark, setting.views, method))
-            row = [method, *_spread(summarize(_values(groups, group).values())), *map(_difference, gains)]
-            rows.append([*row, _printed(psnr, sign=""), *map(_printed, printed)])
+            psnr, others = _quality(groups, [group])
+            row = [method, *psnr, *map(_difference, gains), *others]
+            rows.append([*row, _figures(published(benchmark, setting.views, method)), *map(_printed, printed)])
         tables.append(Table(f"{title} ({where})", columns, rows, "method"))
     rows = []
     for method, base in EQUAL_MEAN_RATE.items():
@@ -232,7 +204,7 @@ def _noise(groups: Groups, main: list[Group]) -> Table:
     rows = []
     for scene, measure in [*kinds, *(("all cells", measure) for measure in QUALITY)]:
         chosen = [group for group in groups if scene in (group.scene, "all cells")]
-        noise = noise_floor([list(_values(groups, group, measure).values()) for group in chosen])
+        noise = noise_floor([list(measured(groups, group, measure).values()) for group in chosen])
         if noise is not None:
             numbers = (noise.sd, *(noise.between_means(n) for n in (1, 3, 5)), noise.best_of_five_gain())
             label = {"test.psnr": "PSNR [dB]", "test.ssim_zero_padded": "SSIM"}.get(measure, "LPIPS")
@@ -254,22 +226,23 @@ def _cost(groups: Groups, main: list[Group]) -> Table:
     for setting in main:
         for method in ordered(group.method for group in groups if group[:3] == setting[:3]):
             group = setting._replace(method=method)
-            gap = summarize(paired(_values(groups, group, "train.psnr"), _values(groups, group)))
+            gap = summarize(paired(measured(groups, group, "train.psnr"), measured(groups, group)))
             row = [_setting(setting), method, str(len(groups[group])), _mean(gap, 2)]
             for measure, scale, decimals in measures.values():
-                numbers = [scale * value for value in _values(groups, group, measure).values()]
+                numbers = [scale * value for value in measured(groups, group, measure).values()]
                 row.append(_mean(summarize(numbers), decimals))
             rows.append(row)
     columns = ("method", "n", "PSNR, training less test views [dB]", *measures)
     return Table("Cost, overfitting and co-adaptation: mean (sd) over n seeds", columns, rows, "scene")
 
 
-def _values(groups: Groups, group: Group, measure: str = "test.psnr") -> dict[int, float]:
-    return by_seed(groups.get(group, {}), measure)
-
-
 def _setting(group: Group) -> str:
     return f"{group.scene}, {group.views} views, {group.start}"
+
+
+def _mean_of(settings: list[Group], kind: str) -> str:
+    names = ", ".join(setting.scene.rpartition("/")[2] for setting in settings)
+    return f"mean of {len(settings)} {kind} ({names})"
 
 
 def _spread(summary: Summary | None) -> tuple[str, str, str]:
@@ -282,12 +255,12 @@ def _mean(summary: Summary | None, decimals: int) -> str:
 
 
 def _difference(difference: Difference | None) -> str:
-    return "-" if difference is None else f"{difference} ({difference.pairs})"
+    return "-" if difference is None else f"{difference.text(2)} ({difference.pairs})"
 
 
 def _figures(found: tuple[Figures, ...]) -> str:
     return " or ".join(f"{f.psnr:.2f} / {f.ssim:.3f} / {f.lpips:.3f}" for f in found) or "-"
 
 
-def _printed(values: tuple[float, ...], sign: str = "+") -> str:
-    return " or ".join(f"{value:{sign}.2f}" for value in values) or "-"
+def _printed(values: tuple[float, ...]) -> str:
+    return " or ".join(f"{value:+.2f}" for value in values) or "-"

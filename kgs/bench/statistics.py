@@ -59,10 +59,12 @@ class Difference(NamedTuple):
     low: float | None
     high: float | None
 
-    def __str__(self) -> str:
-        """As "+0.31 [+0.10, +0.52]"."""
-        interval = "" if self.low is None or self.high is None else f" [{_signed(self.low)}, {_signed(self.high)}]"
-        return _signed(self.mean) + interval
+    def text(self, decimals: int) -> str:
+        """As "+0.31 [+0.10, +0.52]"; "+0.31" without an interval."""
+        mean = _signed(self.mean, decimals)
+        if self.low is None or self.high is None:
+            return mean
+        return f"{mean} [{_signed(self.low, decimals)}, {_signed(self.high, decimals)}]"
 
 
 class Noise(NamedTuple):
@@ -75,9 +77,9 @@ class Noise(NamedTuple):
     def between_means(self, n: int) -> float:
         """What the means of two sets of n seeds differ by at most, 95 times in 100, if the settings do nothing.
 
-        For n = 1: two single runs, 2.77 standard deviations.
+        Student's t, as the standard deviation is itself from few numbers. For n = 1: two single runs.
         """
-        return 1.96 * math.sqrt(2 / n) * self.sd
+        return student_quantile(self.freedom) * math.sqrt(2 / n) * self.sd
 
     def best_of_five_gain(self) -> float:
         """How far the best of five runs lies over the mean on average."""
@@ -199,8 +201,8 @@ def student_quantile(freedom: int, confidence: float = 0.95) -> float:
     return math.sqrt(freedom) * math.tan(low)
 
 
-def _signed(value: float) -> str:
-    return f"{round(value, 2) + 0.0:+.2f}"  # no -0.00
+def _signed(value: float, decimals: int) -> str:
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # no -0.00
 
 
 def _student_probability(angle: float, freedom: int) -> float:

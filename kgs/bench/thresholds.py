@@ -20,7 +20,7 @@ def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, An
 
     The distance is that to the nearest training camera, in medians of the first points' distances; the edges are
     quantiles of these, so that fits that begin alike are counted alike. What lies beyond the outer edges counts in the
-    outer bins.
+    outer bins. Where a fit is at its limit of Gaussians, those count that it could not densify.
 
     Args:
         trainer: a fit, with what its densifier has seen since the last densification.
@@ -30,7 +30,7 @@ def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, An
         "distance": edges of the bins; "gaussians" and "over": a count for each bin.
     """
     first, now = _distances(trainer, first_points), _distances(trainer, trainer.model.means.detach())
-    edges = torch.quantile(first[:100_000], torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
+    edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
     bins = torch.bucketize(now, edges[1:-1])
     over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
     return {

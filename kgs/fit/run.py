@@ -170,6 +170,13 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
     return stopped[0] if stopped else 0
 
 
+_STARTS = {
+    "model-points": "points seen in training views, but their positions were refined with test views",
+    "scene": "first points that come with the layout",
+    "file": "first points of a file",
+}
+
+
 def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
     """The conditions under which the figures of a run hold."""
     height, width = scene.train.images.shape[-2:]
@@ -178,12 +185,8 @@ def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
         "test": list(scene.test.names),
         "image_size": [height, width],
         "background": scene.background.tolist(),
-        "init": (
-            f"{config.init}: first points from training views alone"
-            if scene.init_kind != "model-points" or config.init != "model-points"
-            else "points seen in training views, but their positions were refined with test views"
-        )
-        + "; poses as given (estimated with all views in real scenes, the field's protocol)",
+        "init": f"{config.init}: {_STARTS.get(config.init, 'first points from training views alone')}; "
+        "poses as given (estimated with all views in real scenes, the field's protocol)",
         "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
         "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
         "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",

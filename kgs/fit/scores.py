@@ -20,7 +20,7 @@ def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Ten
     """A number for each Gaussian, `(N,)`, the highest for those that `by` is about.
 
     Args:
-        by: "high-gradient" or "low-gradient": the mean gradient of the projected centre, as densification sees it.
+        by: "high-gradient" or "low-gradient": the mean gradient of the projected centre since the last densification.
             "far" or "near": the distance from the camera's centre, in world units.
         densifier: holds the Gaussians and what was observed of them.
         camera: of the present step.
