@@ -96,6 +96,7 @@ def fit(
     seed: int = 0,
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense",
     init_file: Path | None = None,
+    init_points: int = 10_000,
     max_gaussians: int | None = None,
     sh_degree: int = 3,
     background: Literal["black", "white"] = "black",
@@ -121,6 +122,7 @@ def fit(
             view. sift: from matches of their keypoints. random: where at least two images see. scene: the random points
             that Blender's layout prescribes. model-points: of a COLMAP model, made with the test views.
         init_file: a point cloud (PLY, OBJ, ...) for --init file.
+        init_points: how many first points --init random gives, and dense at most.
         max_gaussians: densification stops there; 10 a step, and at least twice the first points,
             unless given (14000 with --fast).
         sh_degree: degree of the view-dependent colour.
@@ -142,6 +144,7 @@ def fit(
         seed=seed,
         init=init,
         init_file=init_file,
+        init_points=init_points,
         max_gaussians=start.max_gaussians if max_gaussians is None else max_gaussians,
         device=device,
     )

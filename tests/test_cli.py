@@ -144,6 +144,11 @@ def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert cv2.imread(str(tmp_path / "curve.png")) is not None
 
 
+def test_as_many_first_points_as_asked_for(folder, tmp_path):
+    assert run("fit", folder, "-o", tmp_path, "--steps", 1, "--init", "random", "--init-points", 321) == 0
+    assert json.loads((tmp_path / "metrics.json").read_text())["init"] == {"kind": "random", "points": 321}
+
+
 def test_fast_is_a_start_that_options_change(folder, tmp_path, monkeypatch):
     seen = []
 

@@ -58,6 +58,7 @@ def test_wrong_requests_are_named(tmp_path: Path, request_: Any, field: str) -> 
         {"seed": 2**60},
         {"max_gaussians": 1.5},
         {"max_bytes": 0},
+        {"init_points": 0},
         {"init_file": 3},
         {"recipe": []},
         {"recipe": {"lr_means": None}},

@@ -93,6 +93,7 @@ class FitConfig:
         init: first points: "dense", "sift", "random", "scene" (the random ones that Blender's layout prescribes),
             "model-points" (positions refined with test views), or "file".
         init_file: point cloud for "file".
+        init_points: how many points "random" gives, and "dense" at most; at least 1.
         max_gaussians: densification stops there; None: 10 a step, and at least twice the first points.
         growth: share of the steps over which the limit rises to that, evenly, from the first points; 0 sets it at
             once. In [0, 1].
@@ -114,6 +115,7 @@ class FitConfig:
     seed: int = 0
     init: str = "dense"
     init_file: Path | None = None
+    init_points: int = 10_000
     max_gaussians: int | None = None
     growth: float = 0.0
     max_bytes: int = 2**30
@@ -140,8 +142,9 @@ class FitConfig:
         for name in ("coarse", "growth"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")
-        if self.max_bytes < 1:
-            raise ValueError(f"max_bytes: expected at least 1, got {self.max_bytes}")
+        for name in ("init_points", "max_bytes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
 

@@ -119,7 +119,7 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
             raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
-    found = first_points(views, kind, seed=config.seed, file=config.init_file)
+    found = first_points(views, kind, seed=config.seed, count=config.init_points, file=config.init_file)
     if kind == "file":  # in the world's coordinates, as the files that kgs writes
         found = replace(found, points=(found.points.double() - scene.offset).float())
     return found
