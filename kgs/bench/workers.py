@@ -96,11 +96,13 @@ def dask_workers(work: Callable[[Cell], Result], address: str, say: Callable[[st
     def limit() -> int:
         nonlocal known
         try:
-            threads: int = sum(client.nthreads().values())
+            workers: dict[str, int] = client.nthreads()
         except OSError:
             raise ConnectionError(LOST) from None
+        threads = sum(workers.values())
         if threads != known:
-            say(f"worker threads at {address}: {threads}")
+            shared = "; cells share a process, which falsifies their CPU seconds: see --nthreads 1"
+            say(f"worker threads at {address}: {threads}{shared if threads > len(workers) else ''}")
             known = threads
         return threads
 
