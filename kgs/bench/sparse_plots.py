@@ -40,6 +40,8 @@ STYLES: dict[str, tuple[str, str]] = {
     "L1 distance 0.01": (_GREEN, ">"),
 }
 _OTHER = ("#777777", "x")
+# How a start fills its markers.
+_FILLS = {"dense": "full", "sift": "none", "random": "left", "model-points": "bottom", "scene": "right"}
 PANEL = (3.9, 3.2)  # inches
 DPI = 110
 
@@ -65,7 +67,7 @@ def write_plots(groups: Groups, out: Path) -> list[Plot]:
         "gap.png": (_gap, "PSNR of training views less that of test views: each seed, and the mean as a bar"),
         "cost.png": (
             _cost,
-            "Test PSNR against CPU time: one point a cell; hollow, with their name: other starts than the main one",
+            "Test PSNR against CPU time: one point a cell, each start with its filling",
         ),
         "coadaptation.png": (
             _coadaptation,
@@ -201,28 +203,30 @@ def _coadaptation(groups: Groups, path: Path) -> bool:
     return _scatter(groups, path, "coadaptation", 1e3, "co-adaptation [1e-3]")
 
 
-def _scatter(groups: Groups, path: Path, measure: str, scale: float, label: str) -> bool:
+def _scatter(groups: Groups, path: Path, measure: str, scale: float, x_label: str) -> bool:
     """Test PSNR of every cell of each main setting's scene and views, over another of its numbers."""
-    main = main_settings(groups)
+    main = {setting[:2] for setting in main_settings(groups)}
+    methods = ordered(group.method for group in groups if group[:2] in main)
 
     def draw(axis: Any, group: Group) -> bool:
         some = False
-        for other in (g for g in groups if (g.scene, g.views, g.method) == (group.scene, group.views, group.method)):
+        colour, marker = STYLES.get(group.method, _OTHER)
+        others = [other for other in groups if other[:2] == group[:2]]
+        for other in (o for o in others if o.method == group.method):
             x, y = by_seed(groups[other], measure), by_seed(groups[other], "test.psnr")
             seeds = sorted(x.keys() & y.keys())
-            colour, marker = STYLES.get(group.method, _OTHER)
-            fill = colour if other.start == group.start or marker == "x" else "none"
             points = [scale * x[seed] for seed in seeds], [y[seed] for seed in seeds]
-            style = {"color": colour, "markerfacecolor": fill, "markersize": 5, "alpha": 0.85}
-            axis.plot(*points, marker, **style, label=group.method if other.start == group.start else None)
-            if seeds and other.start != group.start:
-                place = points[0][0], points[1][0]
-                axis.annotate(other.start, place, (5, -3), textcoords="offset points", fontsize=7, color=colour)
+            style = {"fillstyle": _FILLS.get(other.start, "none"), "markersize": 5, "alpha": 0.85}
+            label = group.method if other.start == group.start else None
+            axis.plot(*points, marker, color=colour, label=label, **style)
             some = some or bool(seeds)
+        if group.method == methods[-1]:  # the legend has the starts after the methods
+            for other in others:
+                fill = _FILLS.get(other.start, "none")
+                axis.plot([], [], "h", color="grey", fillstyle=fill, label=f"from {other.start}")
         return some
 
-    methods = ordered(group.method for group in groups if any(group[:2] == setting[:2] for setting in main))
-    return _panels(groups, path, methods, draw, label, "test PSNR [dB]")
+    return _panels(groups, path, methods, draw, x_label, "test PSNR [dB]")
 
 
 def _panels(
