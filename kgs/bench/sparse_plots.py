@@ -221,9 +221,8 @@ def _scatter(groups: Groups, path: Path, measure: str, scale: float, x_label: st
             axis.plot(*points, marker, color=colour, label=label, **style)
             some = some or bool(seeds)
         if group.method == methods[-1]:  # the legend has the starts after the methods
-            for other in others:
-                fill = _FILLS.get(other.start, "none")
-                axis.plot([], [], "h", color="grey", fillstyle=fill, label=f"from {other.start}")
+            for start in dict.fromkeys(other.start for other in others):
+                axis.plot([], [], "h", color="grey", fillstyle=_FILLS.get(start, "none"), label=f"from {start}")
         return some
 
     return _panels(groups, path, methods, draw, x_label, "test PSNR [dB]")
