@@ -16,9 +16,10 @@ from torch import Tensor
 
 from .steps import ALPHA_MAX, Backward, Forward, Group
 from .threads import run_all
+from .tiles import TileSpans
 from .types import TileBins
 
-__all__ = ["Band", "Rules"]
+__all__ = ["Band", "Rules", "choose_chunk_size"]
 
 _STEP_PAIRS = {"cpu": 2**19, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers
 _PAIRS_TO_SHARE = 2**22  # from here on a CPU has work for two groups, so for two threads
@@ -31,7 +32,7 @@ class Rules:
     alpha_threshold: float
     transmittance_stop: float
     median_depth: bool
-    chunk_size: int | None
+    chunk_size: int
     alpha_bytes: int
 
 
@@ -52,7 +53,7 @@ class Band:
         size, dtype, device = bins.tile_size, table.dtype, table.device
         self.pixels = size * size
         lengths = bins.offsets.diff()
-        self.chunk_size = rules.chunk_size or _chunk_size(bins)
+        self.chunk_size = rules.chunk_size
         self.entries = F.pad(bins.entries, (0, self.chunk_size), value=features.shape[0] - 1)
         self.slots = torch.arange(self.chunk_size, device=device)
         local = torch.arange(size, device=device).to(dtype) - (size - 1) / 2
@@ -140,11 +141,15 @@ class Band:
         return [Group(order[part], starts[part], ends[part], counts[part]) for part in groups if counts]
 
 
-def _chunk_size(bins: TileBins) -> int:
-    """Short chunks waste little at the ends of lists; long ones need fewer operator calls, so few tiles want them."""
-    if bins.entries.device.type != "cpu":
+def choose_chunk_size(spans: TileSpans) -> int:
+    """Short chunks waste little at the ends of lists; long ones need fewer operator calls, so few tiles want them.
+
+    One size for all bands of a picture: it decides the order in which the layers of a pixel are added.
+    """
+    if spans.counts.device.type != "cpu":
         return 32
-    mean, few = bins.entries.shape[0] / max(1, bins.num_tiles), bins.num_tiles * bins.tile_size**2 <= 2**13
+    tiles = spans.entries_per_row.shape[0] * spans.grid[1]
+    mean, few = int(spans.entries_per_row.sum()) / max(1, tiles), tiles * spans.tile_size**2 <= 2**13
     return 8 if mean < 32 else 32 if few and mean >= 64 else 16
 
 

@@ -34,8 +34,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .chunks import Band, Rules
+from .chunks import Band, Rules, choose_chunk_size
 from .covariance import columns, variances, whitening
+from .full_precision import full_precision
 from .tiles import TileSpans, tile_spans
 from .types import ProjectedGaussians, TileBins
 
@@ -97,7 +98,9 @@ def composite(
     per_entry = bytes_per_entry(features.shape[1], tile_size, features.dtype)
     bands = spans.bands(max(1, max_bytes // per_entry))
     left = max_bytes - per_entry * int(spans.entries_per_row.sum()) if len(bands) == 1 else 0
-    rules = Rules(alpha_threshold, transmittance_stop, median_depth, chunk_size, alpha_bytes=left)
+    rules = Rules(
+        alpha_threshold, transmittance_stop, median_depth, chunk_size or choose_chunk_size(spans), alpha_bytes=left
+    )
     sums, transmittance, median = _Composite.apply(*inputs, projected, spans, bands, rules, keep)
     return Composited(sums, transmittance, median if median_depth else None)
 
@@ -176,11 +179,12 @@ class _Composite(torch.autograd.Function):
         inputs = (means2d, factors, opacities, features)
         passes = _Passes(inputs, projected, spans, rules)
         parts, kept = [], None
-        for rows in bands:
-            part, layers = passes.forward(rows, keep)
-            parts.append(part)
-            if keep and len(bands) == 1:
-                kept = layers
+        with full_precision(means2d.device):
+            for rows in bands:
+                part, layers = passes.forward(rows, keep)
+                parts.append(part)
+                if keep and len(bands) == 1:
+                    kept = layers
         ctx.save_for_backward(*inputs)
         ctx.context, ctx.bands, ctx.kept = (projected, spans, rules), bands, kept
         images = tuple(_to_images(torch.cat(x), projected, spans) for x in zip(*parts, strict=True))
@@ -200,18 +204,18 @@ class _Composite(torch.autograd.Function):
         behind = _to_tiles(grad_transmittance, spans)
         moments, width = any(ctx.needs_input_grad[:3]), grads.shape[1] if ctx.needs_input_grad[3] else 0
         total = factors.new_zeros(spans.ids.shape[0], 6 * moments + width)
-        for begin, end in ctx.bands:
-            layers, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
-            if layers is None:
-                layers = passes.forward((begin, end), keep=True)[1]
-            tiles = slice(begin * columns, end * columns)
-            passes.backward(layers, grads[tiles], behind[tiles], total, moments=moments, features=width > 0)
+        with full_precision(factors.device):
+            for begin, end in ctx.bands:
+                layers, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
+                if layers is None:
+                    layers = passes.forward((begin, end), keep=True)[1]
+                tiles = slice(begin * columns, end * columns)
+                passes.backward(layers, grads[tiles], behind[tiles], total, moments=moments, features=width > 0)
         ids = spans.ids
         found: tuple[Tensor | None, ...] = (None, None, None, total[:, total.shape[1] - width :])
         if moments:
             used = factors.index_select(0, ids), opacities.index_select(0, ids)
-            with torch.autocast(factors.device.type, enabled=False):
-                found = (*_from_moments(total[:, :6], *used, projected.eps2d), found[3])
+            found = (*_from_moments(total[:, :6], *used, projected.eps2d), found[3])
 
         def of_all(value: Tensor) -> Tensor:
             return value.new_zeros(factors.shape[0], *value.shape[1:]).index_copy_(0, ids, value)

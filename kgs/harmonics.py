@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .full_precision import in_full_precision
 from .types import sh_degree
 
 __all__ = ["SH_C0", "evaluate_harmonics", "harmonics_basis"]
@@ -80,5 +81,5 @@ def evaluate_harmonics(colors: Tensor, directions: Tensor) -> Tensor:
     if degree == 0:
         value = SH_C0 * colors[:, 0]
     else:
-        value = torch.bmm(harmonics_basis(directions, degree)[:, None], colors)[:, 0]
+        value = in_full_precision(torch.bmm, harmonics_basis(directions, degree)[:, None], colors)[:, 0]
     return (value + 0.5).clamp_min(0.0)

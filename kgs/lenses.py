@@ -23,6 +23,7 @@ from kornia.sensors.camera.distortion_model import AffineTransform, BrownConrady
 from kornia.sensors.camera.projection_model import OrthographicProjection
 from torch import Tensor
 
+from .full_precision import in_full_precision
 from .types import Cameras, PosedCamera
 
 __all__ = ["Lens", "image_size", "intrinsics", "lenses"]
@@ -87,9 +88,14 @@ def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
     k = camera.intrinsics[0, :2, :2]
     fx, fy, cx, cy = (camera.intrinsics[0, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     limits = _tangent_limits(fx, fy, cx, cy, height, width)
+
+    def pixels(intrinsics: Tensor, extrinsics: Tensor, world: Tensor) -> Tensor:
+        pixels: Tensor = PinholeCamera(intrinsics, extrinsics, camera.height, camera.width).project(world[None])[0]
+        return pixels
+
     return Lens(
         extrinsics=camera.extrinsics[0],
-        project=lambda world, _: camera.project(world[None])[0],
+        project=lambda world, _: in_full_precision(pixels, camera.intrinsics, camera.extrinsics, world),
         jacobian=lambda points: _perspective_jacobian(k, points, limits),
     )
 
@@ -147,7 +153,7 @@ def _perspective_jacobian(k: Tensor, points: Tensor, limits: tuple[Tensor, ...])
     inverse = 1.0 / z
     tx = (x * inverse).clamp(limits[0], limits[1])
     ty = (y * inverse).clamp(limits[2], limits[3])
-    last = -inverse[:, None] * (torch.stack([tx, ty], 1) @ k.T)
+    last = -inverse[:, None] * in_full_precision(torch.matmul, torch.stack([tx, ty], 1), k.T)
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
 

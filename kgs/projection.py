@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from .covariance import footprint_factors, variances
+from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
 from .lenses import Lens, image_size, intrinsics, lenses
 from .types import Cameras, Gaussians, ProjectedGaussians
@@ -68,9 +69,11 @@ def project(
         )
     finite = _finite(gaussians)
     reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), alpha_threshold)
-    parts = [
-        _project_one(gaussians, c, lens, size, finite, near_plane, eps2d, reach, colors) for c, lens in enumerate(views)
-    ]
+    with full_precision(means.device):
+        parts = [
+            _project_one(gaussians, c, lens, size, finite, near_plane, eps2d, reach, colors)
+            for c, lens in enumerate(views)
+        ]
     fields = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
     ids, means2d, factors, depths, radii, opacities, rgb = fields
     counts = torch.tensor([part[0].shape[0] for part in parts], device=means.device)
@@ -120,8 +123,8 @@ def _project_one(
 
     def footprints(ids: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         means = _rows(gaussians.means, ids)
-        points = torch.addmm(translation, means, rotation.T)
-        rows = lens.jacobian(points) @ rotation
+        points = in_full_precision(torch.addmm, translation, means, rotation.T)
+        rows = in_full_precision(torch.matmul, lens.jacobian(points), rotation)
         factors = footprint_factors(rows, _rows(gaussians.quats, ids), _rows(gaussians.scales, ids))
         return means, points, lens.project(means, points), factors
 
@@ -179,7 +182,7 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     if lens.parallel:
         return rotation[2].expand_as(means)
-    offsets = means + rotation.T @ translation
+    offsets = means + in_full_precision(torch.mv, rotation.T, translation)
     lengths: Tensor = torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return offsets / lengths
 
@@ -197,5 +200,5 @@ def _finite(gaussians: Gaussians) -> Tensor:
 
 
 def _rows(values: Tensor, ids: Tensor) -> Tensor:
-    """Rows of a tensor; the tensor itself where all rows, in order, are wanted."""
-    return values if ids.shape[0] == values.shape[0] else values.index_select(0, ids)
+    """Rows of a tensor, contiguous; no copy where all rows, in order, are wanted."""
+    return values.contiguous() if ids.shape[0] == values.shape[0] else values.index_select(0, ids)

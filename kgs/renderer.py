@@ -96,41 +96,40 @@ class GaussianRenderer(nn.Module):
         wanted = _check_outputs(outputs)
         if not isinstance(gaussians, Gaussians):
             raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
-        with torch.autocast(gaussians.means.device.type, enabled=False):
-            opacities = self.opacity_layer(gaussians.opacities)
-            if opacities is not gaussians.opacities:
-                gaussians = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.colors)
-            projected = project(
-                gaussians,
-                cameras,
-                near_plane=self.near_plane,
-                eps2d=self.eps2d,
-                alpha_threshold=self.alpha_threshold,
-                colors="image" in wanted,
-            )
-            if projected.means2d.requires_grad:
-                projected.means2d.retain_grad()
-            features = projected.colors
-            if "depth" in wanted:
-                features = torch.cat([features, projected.depths[:, None]], 1)
-            result = composite(
-                projected,
-                features,
-                tile_size=self.tile_size,
-                alpha_threshold=self.alpha_threshold,
-                transmittance_stop=self.transmittance_stop,
-                median_depth="median_depth" in wanted,
-                max_bytes=self.max_bytes,
-            )
-            alpha = 1.0 - result.transmittance
-            image = depth = None
-            if "image" in wanted:
-                image = result.features[:, :3]
-                if background is not None:
-                    image = image + result.transmittance * _check_background(background, image)
-            if "depth" in wanted:
-                covered = alpha >= 1e-6
-                depth = torch.where(covered, result.features[:, -1:] / torch.where(covered, alpha, 1.0), 0.0)
+        opacities = self.opacity_layer(gaussians.opacities)
+        if opacities is not gaussians.opacities:
+            gaussians = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.colors)
+        projected = project(
+            gaussians,
+            cameras,
+            near_plane=self.near_plane,
+            eps2d=self.eps2d,
+            alpha_threshold=self.alpha_threshold,
+            colors="image" in wanted,
+        )
+        if projected.means2d.requires_grad:
+            projected.means2d.retain_grad()
+        features = projected.colors
+        if "depth" in wanted:
+            features = torch.cat([features, projected.depths[:, None]], 1)
+        result = composite(
+            projected,
+            features,
+            tile_size=self.tile_size,
+            alpha_threshold=self.alpha_threshold,
+            transmittance_stop=self.transmittance_stop,
+            median_depth="median_depth" in wanted,
+            max_bytes=self.max_bytes,
+        )
+        alpha = 1.0 - result.transmittance
+        image = depth = None
+        if "image" in wanted:
+            image = result.features[:, :3]
+            if background is not None:
+                image = image + result.transmittance * _check_background(background, image)
+        if "depth" in wanted:
+            covered = alpha >= 1e-6
+            depth = torch.where(covered, result.features[:, -1:] / torch.where(covered, alpha, 1.0), 0.0)
         return Rendering(
             image=image,
             alpha=alpha if "alpha" in wanted else None,

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,19 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the 
 def _reproducible():
     """The same global random stream for every test, whatever ran before."""
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def matmul_precision() -> Iterator[Callable[[str], None]]:
+    """Sets the precision of torch's float32 products for the test."""
+
+    def reset(precision: str = "highest") -> None:
+        if hasattr(torch.backends, "fp32_precision"):
+            torch.backends.fp32_precision = "none"
+        torch.set_float32_matmul_precision(precision)
+
+    yield reset
+    reset()
 
 
 @pytest.fixture

@@ -369,7 +369,7 @@ def as_on_a_gpu(monkeypatch):
     monkeypatch.setattr(Band, "__init__", init)
     monkeypatch.setattr("kgs.chunks._STEP_PAIRS", {"cpu": 2**24})
     monkeypatch.setattr("kgs.chunks._PAIRS_TO_SHARE", 2**60)
-    monkeypatch.setattr("kgs.chunks._chunk_size", lambda _: 32)
+    monkeypatch.setattr("kgs.compositing.choose_chunk_size", lambda _: 32)
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])

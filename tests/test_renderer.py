@@ -403,33 +403,26 @@ def test_results_have_the_dtype_of_the_gaussians(dtype):
 
 
 @pytest.mark.parametrize("backward_inside", [False, True])
-def test_autocast_changes_nothing(backward_inside):
+@pytest.mark.parametrize("setting", ["autocast", "medium"])
+def test_lower_precision_around_it_changes_nothing(setting, backward_inside, matmul_precision):
+    """Nor the gradients of Gaussians, intrinsics and pose; "medium" rounds where the processor has units for it."""
     camera = random_camera(24, 32, 0, torch.float32)
-    gaussians, inputs = with_grad(random_gaussians(40, 0, torch.float32, None))
-    image = GaussianRenderer()(gaussians, camera).image
-    expected = [image, *torch.autograd.grad(image.square().sum(), inputs)]
-    with torch.autocast("cpu", torch.bfloat16):
-        image = GaussianRenderer()(gaussians, camera).image
-        loss = image.square().sum()
-        if backward_inside:
-            found = torch.autograd.grad(loss, inputs)
-    if not backward_inside:
-        found = torch.autograd.grad(loss, inputs)
-    for name, a, b in zip(("image", *FIELDS), [image, *found], expected, strict=True):
-        # torch itself rounds the matrix products of its own backward formulas there, as it warns: the projection's
-        rounded = backward_inside and name in ("means", "quats", "scales")
-        assert largest(a, b) <= (2e-2 if rounded else 1e-6) * b.abs().max(), name
+    gaussians, inputs = with_grad(random_gaussians(3000, 0, torch.float32, 3))
+    inputs += [camera.intrinsics.requires_grad_(), camera.extrinsics.requires_grad_()]
 
+    def lowered(on):
+        matmul_precision("medium" if on and setting == "medium" else "highest")
+        return torch.autocast("cpu", torch.bfloat16, enabled=on and setting == "autocast")
 
-def test_matmul_precision_changes_nothing():
-    camera, gaussians = random_camera(24, 32, 0, torch.float32), random_gaussians(40, 0, torch.float32, 3)
-    expected = GaussianRenderer()(gaussians, camera).image
-    before = torch.get_float32_matmul_precision()
-    try:
-        torch.set_float32_matmul_precision("medium")
-        assert largest(GaussianRenderer()(gaussians, camera).image, expected) <= 1e-6
-    finally:
-        torch.set_float32_matmul_precision(before)
+    results = []
+    for on in (False, True):
+        with lowered(on):
+            image = GaussianRenderer()(gaussians, camera).image
+            loss = image.square().sum()
+        with lowered(on and backward_inside):
+            results.append([image, *torch.autograd.grad(loss, inputs)])
+    for name, b, a in zip(("image", *FIELDS, "intrinsics", "extrinsics"), *results, strict=True):
+        assert largest(a, b) <= 1e-6 * b.abs().max(), name
 
 
 @pytest.mark.parametrize("threads", [1, 2])

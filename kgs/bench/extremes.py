@@ -80,12 +80,12 @@ def _gradients(image: Tensor, inputs: Gaussians) -> dict[str, Tensor]:
 def _render(
     scene: Scene, dtype: torch.dtype, within: AbstractContextManager[Any] | None = None, **options: Any
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Image and gradients, exact but for rounding; the image is made within a context."""
+    """Image and gradients, exact but for rounding, made within a context."""
     inputs = _leaves(scene[0], dtype)
     renderer = GaussianRenderer(alpha_threshold=0.0, transmittance_stop=0.0, **options)
     with within or nullcontext():
         image = renderer(inputs, _cast(scene[1], dtype)).image
-    return image.detach(), _gradients(image, inputs)
+        return image.detach(), _gradients(image, inputs)
 
 
 def _errors(case: Case, name: str) -> dict[str, Any]:
@@ -218,7 +218,7 @@ _IDENTITIES: dict[str, tuple[str, str, Callable[[str], float]]] = {
     "opacity 0": ("ln 0", "in no list, no gradient", _transparent),
     "under autocast to bfloat16": (
         "8 bits of pixel coordinates",
-        "switched off inside; backward belongs outside, as torch says",
+        "switched off inside, forward and backward",
         _autocast,
     ),
     "one and two threads, repeated": ("sums in another order", "every sum has a fixed order", _threads),
