@@ -72,15 +72,17 @@ def opencv_pose(path: Path, frame: dict[str, Any]) -> Tensor:
     """A frame's `transform_matrix`, given with OpenGL axes, as camera-to-world with OpenCV axes, `(4, 4)` float64.
 
     Raises:
-        DataError: it is no 4x4 matrix of finite numbers with the last row 0, 0, 0, 1.
+        DataError: it is no 4x4 matrix of finite numbers with the last row 0, 0, 0, 1, up to 1e-6 as an inverse has it.
     """
     rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     if len(rows) != 4 or not all(_is_finite(x) for row in rows for x in row):
         raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
     matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
-    if matrix[0, 3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+    last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if float((matrix[0, 3] - last).abs().max()) > 1e-6:
         raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {matrix[0, 3].tolist()}")
+    matrix[0, 3] = last
     return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]
 
 

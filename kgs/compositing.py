@@ -154,7 +154,8 @@ class _Passes:
         depths: Tensor | None = None
         if rules.median_depth:
             depths = F.pad(self.projected.depths.detach().index_select(0, bins.ids), (0, 1))
-        return Band(table, F.pad(features, (0, 0, 0, 1)), depths, bins, rules)
+        features = torch.cat([features, features.new_zeros(1, features.shape[1])])
+        return Band(table, features, depths, bins, rules)
 
 
 class _Composite(torch.autograd.Function):

@@ -68,7 +68,7 @@ def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def evaluate_harmonics(colors: Tensor, directions: Tensor) -> Tensor:
-    """Colours max(0, 0.5 + sum_k b_k(direction) c_k); at exactly 0 the gradient passes (clamp's convention).
+    """Colours max(0, 0.5 + sum_k b_k(direction) c_k); at exactly 0 the gradient passes.
 
     Args:
         colors: coefficients, `(M, K, 3)` with K = 1, 4, 9 or 16; only these bands are evaluated.
@@ -82,4 +82,5 @@ def evaluate_harmonics(colors: Tensor, directions: Tensor) -> Tensor:
         value = SH_C0 * colors[:, 0]
     else:
         value = in_full_precision(torch.bmm, harmonics_basis(directions, degree)[:, None], colors)[:, 0]
-    return (value + 0.5).clamp_min(0.0)
+    value = value + 0.5
+    return value.masked_fill(value < 0, 0.0)  # the gradient of clamp_min at 0 is not that of every torch

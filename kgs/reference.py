@@ -115,13 +115,14 @@ def layers(
     distances = torch.einsum("lpi,lij,lpj->lp", offsets, torch.linalg.inv(covariances), offsets)
     responses = (opacities * torch.exp(-distances / 2)).reshape(-1, height, width)
 
-    alphas = responses.clamp(max=0.99)
+    alphas = responses.masked_fill(responses > 0.99, 0.99)
     alphas = torch.where(alphas >= alpha_threshold, alphas, 0.0)
     light = torch.cat([torch.ones(1, height, width).to(alphas), torch.cumprod(1 - alphas, 0)])
     light = torch.where(light >= transmittance_stop, light, 0.0)
     if colors.ndim == 3:
         directions = torch.nn.functional.normalize(means + rotation.T @ translation, dim=1)
-        colors = (torch.einsum("lk,lkc->lc", _harmonics(directions, colors.shape[1]), colors) + 0.5).clamp(min=0.0)
+        colors = torch.einsum("lk,lkc->lc", _harmonics(directions, colors.shape[1]), colors) + 0.5
+        colors = colors.masked_fill(colors < 0, 0.0)
     return Layers(alphas * light[:-1], light[-1], colors, points[:, 2], order, responses)
 
 

@@ -185,6 +185,17 @@ def test_wrong_fields(tmp_path: Path, values: dict[str, Any], message: str) -> N
         load_scene(tmp_path)
 
 
+def test_the_last_row_of_an_inverse_is_that_of_a_pose(tmp_path: Path) -> None:
+    write(tmp_path)
+    exact = load_scene(tmp_path).train.cameras.extrinsics
+    path = tmp_path / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"][3] = [1e-8, 0.0, -3.3e-17, 0.9999999999999999]
+    path.write_text(json.dumps(data))
+    assert torch.equal(load_scene(tmp_path).train.cameras.extrinsics, exact)
+
+
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "{}", '{"frames": []}', '{"frames": [3]}', '{"camera_angle_x": NaN}', "[" * 100_000, "\xff"]
 )

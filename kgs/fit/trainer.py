@@ -244,7 +244,8 @@ class Trainer:
                 self.drop.scores = gaussian_scores(config.drop_by, self.densifier, camera)
         gaussians = self.model()
         out = self.renderer(gaussians, camera, self._background)
-        loss = photometric_loss(out.image.clamp(0, 1), target, recipe.dssim_weight, moments=moments)
+        image = out.image.masked_fill(out.image > 1, 1.0)  # it is never below 0
+        loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments)
         if config.opacity_l1:
             by = "low-gradient" if config.opacity_l1_by == "gradient" else "far"
             scores = gaussian_scores(by, self.densifier, camera)
