@@ -85,8 +85,8 @@ def _forbid_rounding() -> Callable[[], None]:
     for backend in (torch.backends.mkldnn.matmul, torch.backends.cuda.matmul):
         precision = backend.fp32_precision
         if precision not in ("none", "ieee"):
-            inherited = precision == torch.backends.fp32_precision
-            changed.append((backend, "none" if inherited else precision))
+            backend.fp32_precision = "none"  # what it has now comes from torch.backends.fp32_precision
+            changed.append((backend, "none" if backend.fp32_precision == precision else precision))
             backend.fp32_precision = "ieee"
 
     def put_back() -> None:
