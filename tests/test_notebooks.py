@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -126,8 +127,7 @@ def execute(path, folder, quick):
 
     notebook = nbformat.read(path, as_version=4)
     for claims in CLAIMS[path.stem][: 1 if quick else 2]:
-        lines = [line.strip() for line in claims.strip().splitlines()]
-        notebook.cells.append(nbformat.v4.new_code_cell("\n".join(lines)))
+        notebook.cells.append(nbformat.v4.new_code_cell(textwrap.dedent(claims).strip()))
     environment = {key: value for key, value in os.environ.items() if key not in ("KGS_QUICK", "MPLBACKEND")}
     environment["IPYTHONDIR"] = str(folder / "ipython")
     shutil.copytree(path.parents[1] / "docs" / "results", folder / "docs" / "results")
