@@ -17,7 +17,7 @@ from kgs.errors import DataError
 from .grid import finished_rows, read_rows, run_grid
 from .published import PAPER
 from .scenes import SYNTHETIC, check_scenes
-from .sparse_cell import sparse_cell
+from .sparse_cell import FULL, sparse_cell
 from .sparse_groups import FIXED, MAIN, OFF
 from .sparse_report import write_report
 from .workers import Cell
@@ -138,7 +138,7 @@ def _cpu_cells(data: Path) -> list[Cell]:
     forbidden = [
         _cell(scene, 3, start, PAPER, seed, fit, 2.0)
         for scene in ("llff/fern", "llff/flower")
-        for start in ("random", "model-points")
+        for start in ("random", "model-points", FULL)
         for seed in range(3 if scene == "llff/fern" else 1)
     ]
     more = [

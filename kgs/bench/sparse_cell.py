@@ -8,6 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
@@ -26,6 +28,8 @@ from .thresholds import count_over_threshold
 __all__ = ["sparse_cell"]
 
 SIZE = (72, 96)  # of the synthetic pictures
+FULL = "full-model"  # a start that no fit may have: the upper bound
+_FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
@@ -34,7 +38,8 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     Fits of the same scene, views, start and seed begin with the same points and see the views in the same order.
 
     Args:
-        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points),
+        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
+            "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test views),
             "method" (a name, for the report), "seed", and "fit", the fields of FitConfig that are not the default's.
         data: the folder of the scenes, where the cell runs.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
@@ -48,7 +53,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         DataError: the scene is not there or damaged.
     """
     scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
-    config = FitConfig(init=cell["start"], seed=cell["seed"], **cell["fit"])
+    config = _config(cell["start"], cell["seed"], **cell["fit"])
     trainer = Trainer(scene, config, points)
     start = time.process_time()
     trainer.fit()
@@ -66,7 +71,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
         "thresholds": count_over_threshold(trainer, points.points),
         "config": config.to_dict(),
-        "protocol": metrics["protocol"],
+        "protocol": metrics["protocol"] | ({"init": _FULL_MODEL} if cell["start"] == FULL else {}),
         "versions": metrics["versions"],
     }
 
@@ -81,13 +86,27 @@ def _start(
     elif data is None:
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
-        kind = "model-points" if start == "model-points" else "none"
+        kind = "model-points" if start in ("model-points", FULL) else "none"
         scene = load_scene(Path(data) / name, views, downscale, points=kind)
     begin = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a start that fell back says so by its kind
-        points = choose_points(scene, FitConfig(init=start, seed=seed))
+        points = choose_points(scene, _config(start, seed))
+    if start == FULL:
+        points = _full_model(Path(data or "") / name, scene, seed)
     return scene, points, time.process_time() - begin
+
+
+def _config(start: str, seed: int, **fit: Any) -> FitConfig:
+    return FitConfig(init="model-points" if start == FULL else start, seed=seed, **fit)
+
+
+def _full_model(root: Path, scene: Scene, seed: int) -> FirstPoints:
+    """Of photos that the fit never sees: those between its views and the test views."""
+    everything = load_scene(root, points="model-points")
+    chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
+    points = everything.points[chosen].double() + (everything.offset - scene.offset)
+    return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
 
 
 @lru_cache(maxsize=1)

@@ -33,7 +33,7 @@ from .statistics import (
 
 __all__ = ["QUALITY", "Table", "headline", "sparse_tables"]
 
-STARTS = ("sift", "random", "model-points", "dense", "scene")
+STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
 LPIPS = "test.lpips_vgg_unscaled"
 QUALITY = {"test.psnr": 2, "test.ssim_zero_padded": 3, LPIPS: 3}
 _QUALITY_COLUMNS = (
@@ -162,7 +162,7 @@ def _start(start: str, results: Mapping[int, Mapping[str, Any]]) -> str:
     gave = {str(result["init"]["kind"]) for result in results.values()} - {start}
     if start in ("dense", "sift") and gave:
         return f"{start} (gave {', '.join(sorted(gave))})"
-    return f"{start} (sees test views)" if start == "model-points" else start
+    return f"{start} (sees test views)" if start in ("model-points", "full-model") else start
 
 
 def _ablations(groups: Groups, setting: Group) -> list[Table]:

@@ -22,6 +22,8 @@ def dense_points(
 ) -> tuple[Tensor, Tensor]:
     """Points on the surfaces that at least two views agree on, with their colours there.
 
+    Where the views have masks, points lie where the masks of both are above 0.5.
+
     Large pictures, and many of them, are swept in half the pixels a side, or a quarter: they find enough points all
     the same, in bounded time and memory.
 
@@ -38,16 +40,19 @@ def dense_points(
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
         views = views.halved()
     maps = sweep_depths(views, near, far)
-    found = [_agreed(views, maps, view) for view in range(len(views))]
+    certain = [there.is_inner & (there.scores > SCORE) for there in maps]
+    if views.masks is not None:
+        certain = [pixels & (mask[0] > 0.5).cpu() for pixels, mask in zip(certain, views.masks, strict=True)]
+    found = [_agreed(views, maps, certain, view) for view in range(len(views))]
     points, colors = (torch.cat(parts) for parts in zip(*found, strict=True))
     chosen = torch.randperm(len(points), generator=generator)[:count]
     return points[chosen].float(), colors[chosen]
 
 
-def _agreed(views: Views, maps: list[DepthMap], view: int) -> tuple[Tensor, Tensor]:
-    """The points of one view's map that another view's map has too, and their colours in that view."""
+def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor]:
+    """The points of one view's certain pixels that another view's have too, and their colours in that view."""
     here = maps[view]
-    rows, columns = (here.is_inner & (here.scores > SCORE)).nonzero().unbind(1)
+    rows, columns = certain[view].nonzero().unbind(1)
     depths = here.depths[rows, columns].double()
     points = unproject(torch.stack([columns, rows], 1), depths, torch.full_like(rows, view), views.cameras)
     pixels, depths = project_all(points, views.cameras)
@@ -60,5 +65,5 @@ def _agreed(views: Views, maps: list[DepthMap], view: int) -> tuple[Tensor, Tens
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depths[:, other] > 0)
         x, y = (torch.where(inside, value, 0.0).long() for value in (x, y))
         close = (there.depths[y, x] / depths[:, other] - 1).abs() < AGREEMENT
-        agreed |= inside & close & there.is_inner[y, x] & (there.scores[y, x] > SCORE)
+        agreed |= inside & close & certain[other][y, x]
     return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]
