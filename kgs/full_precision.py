@@ -7,6 +7,7 @@ the backward formulas of torch's own products.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from torch import Tensor
 
 __all__ = ["full_precision", "in_full_precision"]
 
+_EACH_BACKEND = hasattr(torch.backends.mkldnn, "matmul")  # torch before 2.9 has one setting for all
 _lock = threading.Lock()
 _inside = 0
 _put_back: Callable[[], None]  # set by who enters first
@@ -39,7 +41,7 @@ def full_precision(device: torch.device) -> Iterator[None]:
             yield
     finally:
         with _lock:
-            _inside -= 1
+            _inside = max(_inside - 1, 0)  # a fork from within begins at 0
             if _inside == 0:
                 _put_back()
 
@@ -67,30 +69,59 @@ class _InFullPrecision(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[1:]
+        needed, again = ctx.needs_input_grad[1:], torch.is_grad_enabled()
         with full_precision(grad.device), torch.enable_grad():
-            inputs = [x.detach().requires_grad_(n) for x, n in zip(ctx.saved_tensors, needed, strict=True)]
-            result = ctx.function(*inputs)
-            found = iter(torch.autograd.grad(result, [x for x in inputs if x.requires_grad], grad))
+            # views of the inputs where second derivatives are wanted: one input may depend on another
+            inputs = [
+                x.view_as(x) if again else x.detach().requires_grad_(n)
+                for x, n in zip(ctx.saved_tensors, needed, strict=True)
+            ]
+            wanted = [x for x, n in zip(inputs, needed, strict=True) if n]
+            found = iter(torch.autograd.grad(ctx.function(*inputs), wanted, grad, create_graph=again))
         return None, *(next(found) if n else None for n in needed)
 
 
 def _forbid_rounding() -> Callable[[], None]:
-    """Full precision for the process; returns what puts the setting back."""
-    if not hasattr(torch.backends.mkldnn, "matmul"):  # torch before 2.9 has one setting for all backends
-        before = torch.get_float32_matmul_precision()
+    """Full precision for the process; returns what puts the setting back, unless somebody has changed it meanwhile."""
+    level = _level()
+    backends = [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if _EACH_BACKEND else []
+    settings = [] if level == "highest" else [_own_setting(backend) for backend in backends]
+    if level != "highest":
         torch.set_float32_matmul_precision("highest")
-        return lambda: torch.set_float32_matmul_precision(before)
-    changed = []
-    for backend in (torch.backends.mkldnn.matmul, torch.backends.cuda.matmul):
-        precision = backend.fp32_precision
-        if precision not in ("none", "ieee"):
-            backend.fp32_precision = "none"  # what it has now comes from torch.backends.fp32_precision
-            changed.append((backend, "none" if backend.fp32_precision == precision else precision))
-            backend.fp32_precision = "ieee"
 
     def put_back() -> None:
-        for backend, precision in changed:
-            backend.fp32_precision = precision
+        if level == "highest" or _level() != "highest":
+            return
+        if level is not None:
+            torch.set_float32_matmul_precision(level)
+        for backend, setting in zip(backends, settings, strict=True):
+            backend.fp32_precision = setting
 
     return put_back
+
+
+def _level() -> str | None:
+    """The one setting for all backends; None where they differ, which torch reports as an error."""
+    try:
+        return torch.get_float32_matmul_precision()
+    except RuntimeError:
+        return None
+
+
+def _own_setting(backend: Any) -> Any:
+    """What a backend was set to, "none" if it follows torch.backends.fp32_precision; it is "none" afterwards."""
+    setting = backend.fp32_precision
+    backend.fp32_precision = "none"
+    return "none" if backend.fp32_precision == setting else setting
+
+
+def _start_anew() -> None:
+    """In the child of a fork, where no other thread will leave."""
+    global _lock, _inside
+    if _inside:
+        _put_back()
+    _lock, _inside = threading.Lock(), 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_start_anew)

@@ -112,6 +112,20 @@ def test_a_damaged_line_before_the_last_is_an_error(tmp_path):
 
 
 @pytest.mark.usefixtures("threads")
+@pytest.mark.usefixtures("threads")
+def test_a_file_belongs_to_one_run_at_a_time(tmp_path):
+    pytest.importorskip("fcntl")
+    path = tmp_path / "rows.jsonl"
+
+    def second(cell):
+        with pytest.raises(ValueError, match=r"rows\.jsonl: expected no other run"):
+            run_grid(CELLS, square, path, say=quiet)
+        return square(cell)
+
+    assert len(run_grid(CELLS, second, path, say=quiet)) == len(CELLS)
+    assert len(run_grid(CELLS, fails_on_three, path, say=quiet)) == len(CELLS)
+
+
 def test_a_failing_cell_stops_no_other(tmp_path):
     path = tmp_path / "g.jsonl"
     with pytest.raises(RuntimeError, match=r"1 of 6 cells failed.*three"):

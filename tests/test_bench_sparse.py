@@ -14,9 +14,9 @@ from kgs.bench import grid, sparse
 from kgs.bench import sparse_cell as sparse_cell_module
 from kgs.bench.coadaptation import coadaptation
 from kgs.bench.sparse import METHODS, SCENES, measure_sparse, sparse_cells
-from kgs.bench.sparse_cell import sparse_cell
+from kgs.bench.sparse_cell import FULL, sparse_cell
 from kgs.bench.thresholds import BINS, count_over_threshold
-from kgs.datasets import synthetic_scene
+from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.initialize import first_points
 from kgs.fit.trainer import Trainer
@@ -135,6 +135,28 @@ def test_a_scene_on_the_disk_and_its_own_points(folder):
     assert (result["config"]["steps"], result["config"]["drop"]) == (3, 0.0)
 
 
+def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
+    """It is moved into the frame of the few views, and drawn by the seed."""
+    cloud = torch.rand(12_000, 3, dtype=torch.float64) * 4 - 2  # in the world of the files
+
+    def with_points(path, views=None, downscale=None, points="none"):
+        assert points == "model-points"
+        loaded = load_scene(path, views, downscale)
+        own = cloud if views is None else cloud[:50]
+        return replace(loaded, points=(own - loaded.offset).float(), point_colors=torch.zeros(len(own), 3))
+
+    monkeypatch.setattr(sparse_cell_module, "load_scene", with_points)
+    few, first, _ = sparse_cell_module._start(str(folder.parent), folder.name, 2, None, FULL, 0)
+    _, other, _ = sparse_cell_module._start(str(folder.parent), folder.name, 2, None, FULL, 1)
+    assert len(first.points) == 10_000
+    assert not torch.equal(first.points, other.points)
+    nearest = torch.cdist(first.points[:100].double() + few.offset, cloud).amin(1)
+    assert float(nearest.max()) < 1e-5
+    result = sparse_cell(tiny_cell(start=FULL) | {"scene": folder.name}, data=str(folder.parent))
+    assert result["init"]["kind"] == FULL
+    assert "not allowed" in result["protocol"]["init"]
+
+
 def test_lpips_is_measured_where_there_are_weights(kgs_data):
     result = sparse_cell(tiny_cell(), lpips_weights=str(kgs_data / "weights"))
     for part in ("test", "train"):
@@ -163,7 +185,9 @@ def test_it_goes_on_and_reports(tmp_path, monkeypatch):
     assert said[0].startswith("2 of 3 cells are there")
     assert (tmp_path / "sparse.jsonl").read_bytes().startswith(before)
     assert [row["cell"] for row in rows] == cells
-    assert "off" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
+    report = (tmp_path / "sparse.md").read_text(encoding="utf-8")
+    assert "off" in report
+    assert "kgs bench sparse --preset quick -o OUT" in report
     assert (tmp_path / "index.html").exists()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -62,6 +63,25 @@ def test_the_draw_follows_the_seed(views: Views, span: tuple[float, float]) -> N
     first, again, other = (dense_points(small, *span, 300, generator(seed))[0] for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float]) -> None:
+    masks = torch.zeros(3, 1, 96, 128)
+    masks[..., 20:70, 30:100] = 1.0
+    points, _ = dense_points(replace(views, masks=masks), *span, 2000, generator())
+    pixels, _ = project_all(points, views.cameras)
+    x, y = pixels.round().long().unbind(-1)
+    inside = (x >= 30) & (x < 100) & (y >= 20) & (y < 70)
+    assert len(points) > 300
+    assert bool((inside.sum(1) >= 2).all())
+
+
+def test_planes_out_of_range(views: Views) -> None:
+    for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0)):
+        with pytest.raises(ValueError, match="near, far"):
+            sweep_depths(views, near, far)
+    with pytest.raises(ValueError, match="planes: expected at least 3, got 2"):
+        sweep_depths(views, 1.0, 2.0, planes=2)
 
 
 @pytest.mark.parametrize("count", [2, 10])

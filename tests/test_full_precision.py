@@ -1,5 +1,6 @@
 """Products inside are exact to their dtype, and what the program had set is as before."""
 
+import os
 import threading
 
 import pytest
@@ -50,6 +51,33 @@ def test_settings_of_single_backends_are_put_back(matmul_precision):
         assert settings() == before
 
 
+def test_what_is_set_meanwhile_stays(matmul_precision):
+    matmul_precision("medium")
+    with full_precision(CPU):
+        assert torch.get_float32_matmul_precision() == "highest"
+        assert not torch.backends.cuda.matmul.allow_tf32
+        torch.set_float32_matmul_precision("high")
+    assert torch.get_float32_matmul_precision() == "high"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_fork_while_somebody_is_inside(matmul_precision):
+    matmul_precision("medium")
+    with full_precision(CPU):
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                with full_precision(CPU):
+                    inside = torch.get_float32_matmul_precision()
+                code = 0 if (inside, torch.get_float32_matmul_precision()) == ("highest", "medium") else 2
+            finally:
+                os._exit(code)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert torch.get_float32_matmul_precision() == "medium"
+
+
 def test_the_last_thread_puts_it_back(matmul_precision):
     matmul_precision("medium")
     inside, leave = threading.Event(), threading.Event()
@@ -84,6 +112,8 @@ def test_gradients_by_finite_differences():
     a, b = (torch.rand(2, 3, 3, dtype=torch.float64, requires_grad=True) for _ in range(2))
     assert torch.autograd.gradcheck(lambda *x: in_full_precision(torch.bmm, *x), (a, b))
     assert torch.autograd.gradcheck(lambda x: in_full_precision(torch.bmm, x, b.detach()), a)
+    assert torch.autograd.gradgradcheck(lambda *x: in_full_precision(torch.bmm, *x), (a, b))
+    assert torch.autograd.gradgradcheck(lambda x: in_full_precision(torch.bmm, x, 2 * x), a)
     assert not in_full_precision(torch.bmm, a.detach(), b.detach()).requires_grad
 
 

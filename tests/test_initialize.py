@@ -84,7 +84,7 @@ def planes() -> Views:
 
 @pytest.fixture(scope="module")
 def found(planes: Views) -> FirstPoints:
-    return first_points(planes)
+    return first_points(planes, "sift")
 
 
 def flat(posed: PinholeCamera | None = None) -> Views:
@@ -132,7 +132,7 @@ def test_the_same_bits_again_for_any_number_of_threads(planes: Views, found: Fir
         for count in (1, 3):
             torch.set_num_threads(count)
             cv2.setNumThreads(count)
-            again = first_points(planes, seed=count)
+            again = first_points(planes, "sift", seed=count)
             assert torch.equal(again.points, found.points)
             assert torch.equal(again.colors, found.colors)
     finally:
@@ -183,7 +183,7 @@ def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched() -> None:
 
 def test_few_matches_fall_back_to_random_points_with_a_warning() -> None:
     with pytest.warns(UserWarning, match=r"SIFT found 0 in 3 training views.*500 random points"):
-        result = first_points(flat(), count=500)
+        result = first_points(flat(), "sift", count=500)
     assert result.kind == "random"
     assert result.points.shape == (500, 3)
     assert torch.allclose(result.colors, torch.tensor([0.2, 0.4, 0.6]).expand(500, 3), atol=1e-6)
@@ -366,7 +366,7 @@ def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> Non
     alone = torch.tensor([[0.2, 0.1, 3.2]])
     monkeypatch.setattr("kgs.fit.initialize.find_tracks", lambda _: exact_tracks(torch.cat([wall, alone])))
     posed = cameras()
-    found = first_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)))
+    found = first_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
     assert found.kind == "sift"
     torch.testing.assert_close(found.points, wall, rtol=1e-4, atol=1e-4)
 
@@ -391,7 +391,7 @@ def test_real_scene_gives_enough_points(kgs_data: Path, name: str, train_views: 
     from kgs.datasets import load_scene
 
     views = load_scene(kgs_data / name, train_views=train_views).train
-    assert len(first_points(views).points) >= 0.9 * expected
+    assert len(first_points(views, "sift").points) >= 0.9 * expected
 
 
 @pytest.mark.slow
@@ -404,7 +404,7 @@ def test_real_points_agree_with_the_full_model(kgs_data: Path, name: str, bound:
     differences = []
     for i in range(3):
         pixels, depths = [], []
-        for points in (first_points(scene.train).points, scene.points):
+        for points in (first_points(scene.train, "sift").points, scene.points):
             camera = scene.train.camera(i)
             local = points @ camera.rotation_matrix[0].T + camera.translation_vector[0, :, 0]
             pixels.append(camera.project(points[local[:, 2] > 0][None])[0])

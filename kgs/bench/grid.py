@@ -13,6 +13,8 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +52,8 @@ def run_grid(
         The lines of the given cells, in their order.
 
     Raises:
-        ValueError: two cells are equal, `processes` is below 1, or no scheduler answers within ten seconds.
+        ValueError: two cells are equal, `processes` is below 1, another run has the file, or no scheduler answers
+            within ten seconds.
         RuntimeError: cells failed; the message has the first error. All others are done and kept.
         ConnectionError: the scheduler was lost; finished cells are kept.
     """
@@ -59,20 +62,21 @@ def run_grid(
     keys = [_key(cell) for cell in cells]
     if len(set(keys)) < len(keys):
         raise ValueError("cells: expected each one once, got two that are equal")
-    done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
-    missing = [cell for cell, key in zip(cells, keys, strict=True) if key not in done]
-    say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
     failures: list[str] = []
-    if missing:
-        places = local_processes(work, processes) if scheduler is None else dask_workers(work, scheduler, say)
-        with places as (start, limit):
-            for count, (cell, outcome) in enumerate(_outcomes(missing, start, limit), 1):
-                if isinstance(outcome, BaseException):
-                    failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
-                    say(f"failed: {failures[-1]}")
-                    continue
-                _append(path, {"cell": cell, "result": outcome})
-                say(f"{count} of {len(missing)}: {_key(cell)}")
+    with _alone(path):
+        done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
+        missing = [cell for cell, key in zip(cells, keys, strict=True) if key not in done]
+        say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
+        if missing:
+            places = local_processes(work, processes) if scheduler is None else dask_workers(work, scheduler, say)
+            with places as (start, limit):
+                for count, (cell, outcome) in enumerate(_outcomes(missing, start, limit), 1):
+                    if isinstance(outcome, BaseException):
+                        failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
+                        say(f"failed: {failures[-1]}")
+                        continue
+                    _append(path, {"cell": cell, "result": outcome})
+                    say(f"{count} of {len(missing)}: {_key(cell)}")
     if failures:
         raise RuntimeError(f"{len(failures)} of {len(missing)} cells failed, the first one: {failures[0]}")
     return finished_rows(cells, path)
@@ -149,8 +153,24 @@ def _key(cell: Cell) -> str:
     return json.dumps(cell, sort_keys=True)
 
 
-def _append(path: Path, row: dict[str, Any]) -> None:
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Holds the file, made if it is not there, against other runs; they would repeat cells and cut lines."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as file:
+        try:
+            fcntl = import_module("fcntl")
+        except ImportError:  # Windows
+            yield
+            return
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"{path}: expected no other run to write this file, but one does") from error
+        yield
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row, sort_keys=True) + "\n")
         file.flush()

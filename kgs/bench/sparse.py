@@ -113,7 +113,9 @@ def measure_sparse(
     finally:
         rows = finished_rows(cells, path)
         if rows:
-            write_report(rows, out, f"kgs bench sparse --preset {preset}", len(cells))
+            scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
+            weighed = "" if lpips_weights is None else " --lpips-weights WEIGHTS"
+            write_report(rows, out, f"{scenes}kgs bench sparse --preset {preset}{weighed} -o OUT", len(cells))
     return rows
 
 

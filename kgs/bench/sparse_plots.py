@@ -41,7 +41,14 @@ STYLES: dict[str, tuple[str, str]] = {
 }
 _OTHER = ("#777777", "x")
 # How a start fills its markers.
-_FILLS = {"dense": "full", "sift": "none", "random": "left", "model-points": "bottom", "full-model": "top", "scene": "right"}
+_FILLS = {
+    "dense": "full",
+    "sift": "none",
+    "random": "left",
+    "model-points": "bottom",
+    "full-model": "top",
+    "scene": "right",
+}
 PANEL = (3.9, 3.2)  # inches
 DPI = 110
 

@@ -47,7 +47,7 @@ class FirstPoints:
 
 def first_points(
     views: Views,
-    kind: str = "sift",
+    kind: str = "dense",
     *,
     seed: int = 0,
     count: int = 10_000,

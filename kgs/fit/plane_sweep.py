@@ -6,6 +6,7 @@ Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equation
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -55,8 +56,15 @@ def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES) ->
         views: posed; one from whose place no other differs has no depths, and scores of -1.
         near: depth of the nearest plane, > 0.
         far: of the farthest, > near.
-        planes: how many, evenly spread over inverse depth.
+        planes: how many, evenly spread over inverse depth; at least 3.
+
+    Raises:
+        ValueError: the range is empty or not in front of the cameras, or there are too few planes.
     """
+    if not 0 < near < far < math.inf:
+        raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
+    if planes < 3:
+        raise ValueError(f"planes: expected at least 3, got {planes}")
     grey = rgb_to_grayscale(views.images.cpu().float())
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
     depth = 1 / float(inverse.mean())
