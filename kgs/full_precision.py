@@ -18,7 +18,9 @@ from torch import Tensor
 
 __all__ = ["full_precision", "in_full_precision"]
 
-_EACH_BACKEND = hasattr(torch.backends.mkldnn, "matmul")  # torch before 2.9 has one setting for all
+_BACKENDS: list[Any] = (  # torch before 2.9 has one setting for all
+    [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if hasattr(torch.backends.mkldnn, "matmul") else []
+)
 _lock = threading.Lock()
 _inside = 0
 _put_back: Callable[[], None]  # set by who enters first
@@ -84,8 +86,7 @@ class _InFullPrecision(torch.autograd.Function):
 def _forbid_rounding() -> Callable[[], None]:
     """Full precision for the process; returns what puts the setting back, unless somebody has changed it meanwhile."""
     level = _level()
-    backends = [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if _EACH_BACKEND else []
-    settings = [] if level == "highest" else [_own_setting(backend) for backend in backends]
+    settings = [] if level == "highest" else [_own_setting(backend) for backend in _BACKENDS]
     if level != "highest":
         torch.set_float32_matmul_precision("highest")
 
@@ -94,7 +95,7 @@ def _forbid_rounding() -> Callable[[], None]:
             return
         if level is not None:
             torch.set_float32_matmul_precision(level)
-        for backend, setting in zip(backends, settings, strict=True):
+        for backend, setting in zip(_BACKENDS, settings, strict=True):
             backend.fp32_precision = setting
 
     return put_back
