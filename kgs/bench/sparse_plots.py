@@ -70,7 +70,7 @@ def write_plots(groups: Groups, out: Path) -> list[Plot]:
     pair = f"{OFF} and {PAPER}"
     plots: dict[str, tuple[Callable[[Groups, Path], bool], str]] = {
         "forest.png": (_forest, "Paired differences of test PSNR over off, with 95 % intervals; n pairs"),
-        "curves.png": (_curves, f"Test PSNR during the fit, {pair}: mean over seeds, band of one sd"),
+        "curves.png": (_curves, f"Test PSNR during the fit, {', '.join(MAIN)}: mean over seeds, band of one sd"),
         "gap.png": (_gap, "PSNR of training views less that of test views: each seed, and the mean as a bar"),
         "cost.png": (
             _cost,
@@ -139,7 +139,7 @@ def _curves(groups: Groups, path: Path) -> bool:
             axis.fill_between(steps, values.mean(0) - spread, values.mean(0) + spread, color=colour, alpha=0.15, lw=0)
         return True
 
-    return _panels(groups, path, (OFF, PAPER), draw, "step", "test PSNR [dB]")
+    return _panels(groups, path, MAIN, draw, "step", "test PSNR [dB]")
 
 
 def _curve(result: Any) -> dict[int, float]:
