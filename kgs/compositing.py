@@ -98,9 +98,8 @@ def composite(
     per_entry = bytes_per_entry(features.shape[1], tile_size, features.dtype)
     bands = spans.bands(max(1, max_bytes // per_entry))
     left = max_bytes - per_entry * int(spans.entries_per_row.sum()) if len(bands) == 1 else 0
-    rules = Rules(
-        alpha_threshold, transmittance_stop, median_depth, chunk_size or choose_chunk_size(spans), alpha_bytes=left
-    )
+    size = chunk_size or choose_chunk_size(spans)
+    rules = Rules(alpha_threshold, transmittance_stop, median_depth, size, alpha_bytes=left)
     sums, transmittance, median = _Composite.apply(*inputs, projected, spans, bands, rules, keep)
     return Composited(sums, transmittance, median if median_depth else None)
 

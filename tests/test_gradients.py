@@ -213,9 +213,12 @@ def test_functional_gradients_are_right_or_refused():
 
     try:
         found = torch.func.grad(loss)(inputs[0].detach())
-    except RuntimeError:
-        return  # torch's own refusal, in words that change with its version
-    assert torch.allclose(found, expected)
+    except RuntimeError as refused:
+        error = str(refused)
+    else:
+        error = "" if torch.allclose(found, expected) else "wrong"
+    refusals = ("setup_context", "functorch", "Tensor that doesn't have storage")  # the last: torch 2.6
+    assert error == "" or any(words in error for words in refusals)
 
 
 @pytest.mark.parametrize("name", INPUTS)

@@ -70,13 +70,7 @@ def run_grid(
         if missing:
             places = local_processes(work, processes) if scheduler is None else dask_workers(work, scheduler, say)
             with places as (start, limit):
-                for count, (cell, outcome) in enumerate(_outcomes(missing, start, limit), 1):
-                    if isinstance(outcome, BaseException):
-                        failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
-                        say(f"failed: {failures[-1]}")
-                        continue
-                    _append(path, {"cell": cell, "result": outcome})
-                    say(f"{count} of {len(missing)}: {_key(cell)}")
+                failures = _keep(_outcomes(missing, start, limit), len(missing), path, say)
     if failures:
         raise RuntimeError(f"{len(failures)} of {len(missing)} cells failed, the first one: {failures[0]}")
     return finished_rows(cells, path)
@@ -137,6 +131,21 @@ def _outcomes(
                 yield cell, outcome
         if any(isinstance(outcome, CancelledError) for _, outcome in ended):
             raise ConnectionError(LOST)
+
+
+def _keep(
+    outcomes: Iterator[tuple[Cell, Result | BaseException]], total: int, path: Path, say: Callable[[str], None]
+) -> list[str]:
+    """Appends the results to the file as they come; returns what failed."""
+    failures: list[str] = []
+    for count, (cell, outcome) in enumerate(outcomes, 1):
+        if isinstance(outcome, BaseException):
+            failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
+            say(f"failed: {failures[-1]}")
+            continue
+        _append(path, {"cell": cell, "result": outcome})
+        say(f"{count} of {total}: {_key(cell)}")
+    return failures
 
 
 def _collect(running: dict[Future[Result], Cell]) -> list[tuple[Cell, Result | BaseException]]:

@@ -86,14 +86,12 @@ def _start(
     elif data is None:
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
-        kind = "model-points" if start in ("model-points", FULL) else "none"
+        kind = "model-points" if start == "model-points" else "none"
         scene = load_scene(Path(data) / name, views, downscale, points=kind)
     begin = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a start that fell back says so by its kind
-        points = choose_points(scene, _config(start, seed))
-    if start == FULL:
-        points = _full_model(Path(data or "") / name, scene, seed)
+        points = _full_model(scene, seed) if start == FULL else choose_points(scene, _config(start, seed))
     return scene, points, time.process_time() - begin
 
 
@@ -101,9 +99,9 @@ def _config(start: str, seed: int, **fit: Any) -> FitConfig:
     return FitConfig(init="model-points" if start == FULL else start, seed=seed, **fit)
 
 
-def _full_model(root: Path, scene: Scene, seed: int) -> FirstPoints:
-    """Of photos that the fit never sees: those between its views and the test views."""
-    everything = load_scene(root, points="model-points")
+def _full_model(scene: Scene, seed: int) -> FirstPoints:
+    """Points of the model that two photos observe, also such as lie between the fit's few views; no test views."""
+    everything = load_scene(scene.root, points="model-points")
     chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
     points = everything.points[chosen].double() + (everything.offset - scene.offset)
     return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
