@@ -9,13 +9,13 @@ from pathlib import Path
 
 from kgs.errors import DataError
 
-from .blender import load_blender
-from .colmap import load_colmap
-from .colmap_model import find_model
 from .frames import BACKGROUNDS
 from .images import image_folder, list_images
-from .llff import load_llff
-from .nerfstudio import load_nerfstudio
+from .layouts.blender import load_blender
+from .layouts.colmap import load_colmap
+from .layouts.colmap_model import find_model
+from .layouts.llff import load_llff
+from .layouts.nerfstudio import load_nerfstudio
 from .scene import Scene
 
 __all__ = ["load_scene"]

@@ -1,14 +1,14 @@
 """Differentiable 3D Gaussian splatting for sparse views, in PyTorch and Kornia, with DropGaussian as a layer."""
 
-from .compositing import composite
 from .densify import Densifier, DensifyReport, camera_extent
 from .drop import DropGaussian, drop_gaussian
 from .errors import DataError, TrainingDiverged
 from .model import GaussianModel
 from .ply import load_ply, save_ply
 from .projection import project
+from .raster import composite
+from .raster.tiles import bin_to_tiles
 from .renderer import GaussianRenderer
-from .tiles import bin_to_tiles
 from .types import Gaussians, PosedCamera, ProjectedGaussians, Rendering, TileBins
 
 __all__ = [

@@ -205,7 +205,7 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         device: cpu, cuda, ...
     """
-    from .fit.report import write_json
+    from .fit.outputs import write_json
     from .fit.run import CHECKPOINT, measure
     from .fit.settings import read_settings
     from .fit.trainer import Trainer

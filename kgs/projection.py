@@ -10,10 +10,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .camera import Lens, image_size, intrinsics, lenses
 from .covariance import footprint_factors, variances
 from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
-from .lenses import Lens, image_size, intrinsics, lenses
 from .types import Cameras, Gaussians, ProjectedGaussians
 
 __all__ = ["cut_squared", "project"]

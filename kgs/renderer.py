@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .compositing import check_options, composite
 from .projection import project
+from .raster import check_options, composite
 from .types import Cameras, Gaussians, Rendering
 
 __all__ = ["GaussianRenderer"]

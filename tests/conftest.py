@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from kgs.datasets import synthetic_scene
-from kgs.fit.initialize import FirstPoints
+from kgs.fit.starts import FirstPoints
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))

@@ -18,7 +18,7 @@ from kgs.bench.sparse_cell import FULL, sparse_cell
 from kgs.bench.thresholds import BINS, count_over_threshold
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FitConfig
-from kgs.fit.initialize import first_points
+from kgs.fit.starts import first_points
 from kgs.fit.trainer import Trainer
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel

@@ -13,9 +13,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import kgs
 import kgs.reference
 from kgs import GaussianRenderer, ProjectedGaussians, composite, project
-from kgs.chunks import Band
-from kgs.compositing import bytes_per_entry
-from kgs.tiles import tile_spans
+from kgs.raster import bytes_per_entry
+from kgs.raster.tasks import Band
+from kgs.raster.tiles import tile_spans
 
 TH, STOP = 1 / 255, 1e-4
 DTYPES = [torch.float32, torch.float64]
@@ -347,7 +347,7 @@ def test_bands_of_layers_change_nothing(dtype, bound, thresholds, tight, monkeyp
         entries.append(band.bins.entries.shape[0])
 
     monkeypatch.setattr(Band, "__init__", noted)
-    monkeypatch.setattr("kgs.compositing._LAYERS", 6)
+    monkeypatch.setattr("kgs.raster._LAYERS", 6)
     layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
     assert len(entries) > (6 if tight else 3)
     if thresholds[1] == 0.1:  # what lies behind the end of the light is not listed
@@ -367,9 +367,9 @@ def as_on_a_gpu(monkeypatch):
         band.by_layer = False
 
     monkeypatch.setattr(Band, "__init__", init)
-    monkeypatch.setattr("kgs.chunks._STEP_PAIRS", {"cpu": 2**24})
-    monkeypatch.setattr("kgs.chunks._PAIRS_TO_SHARE", 2**60)
-    monkeypatch.setattr("kgs.compositing.choose_chunk_size", lambda _: 32)
+    monkeypatch.setattr("kgs.raster.tasks._STEP_PAIRS", {"cpu": 2**24})
+    monkeypatch.setattr("kgs.raster.tasks._PAIRS_TO_SHARE", 2**60)
+    monkeypatch.setattr("kgs.raster.choose_chunk_size", lambda _: 32)
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])

@@ -8,7 +8,7 @@ from kornia.geometry.camera import PinholeCamera
 from oracles import random_camera, random_gaussians
 
 from kgs import DropGaussian, GaussianRenderer, Gaussians
-from kgs.threads import run_all
+from kgs.raster.threads import run_all
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")

@@ -9,8 +9,8 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
-from kgs.fit.evaluate import evaluate
 from kgs.fit.lpips import Lpips
+from kgs.fit.metrics import evaluate
 
 KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
 

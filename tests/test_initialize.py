@@ -13,9 +13,9 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
-from kgs.fit.initialize import FirstPoints, first_points, typical_depths
-from kgs.fit.tracks import Tracks, find_tracks
-from kgs.fit.triangulate import triangulate, triangulate_certain
+from kgs.fit.starts import FirstPoints, first_points, typical_depths
+from kgs.fit.starts.tracks import Tracks, find_tracks
+from kgs.fit.starts.triangulate import triangulate, triangulate_certain
 
 WIDTH, HEIGHT = 240, 180
 SMALL = (80, 60)
@@ -364,7 +364,7 @@ def test_uncertain_points_go() -> None:
 def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = torch.rand(80, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 5.0])
     alone = torch.tensor([[0.2, 0.1, 3.2]])
-    monkeypatch.setattr("kgs.fit.initialize.find_tracks", lambda _: exact_tracks(torch.cat([wall, alone])))
+    monkeypatch.setattr("kgs.fit.starts.find_tracks", lambda _: exact_tracks(torch.cat([wall, alone])))
     posed = cameras()
     found = first_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
     assert found.kind == "sift"

@@ -10,7 +10,7 @@ from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 
 from kgs import PosedCamera
-from kgs.lenses import image_size, lenses
+from kgs.camera import image_size, lenses
 
 HEIGHT, WIDTH = 48, 64
 INTRINSICS = [50.0, 55.0, 30.0, 25.0]  # fx fy cx cy, off centre

@@ -7,10 +7,10 @@ import torch
 import trimesh
 from kornia.geometry.depth import warp_frame_depth
 
-from kgs.datasets.raycast import raycast
 from kgs.datasets.scene import Scene
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
-from kgs.datasets.synthetic_world import make_world, shade
+from kgs.datasets.synthetic.raycast import raycast
+from kgs.datasets.synthetic.world import make_world, shade
 
 SMALL = (42, 56)
 

@@ -6,7 +6,7 @@ import threading
 import pytest
 import torch
 
-from kgs.threads import run_all
+from kgs.raster.threads import run_all
 
 CPU = torch.device("cpu")
 

@@ -8,7 +8,7 @@ from oracles import pinhole, random_camera, random_gaussians
 
 import kgs
 from kgs import Gaussians, ProjectedGaussians, bin_to_tiles, project
-from kgs.tiles import tile_spans
+from kgs.raster.tiles import tile_spans
 
 THRESHOLD = 1 / 255
 INTEGERS = ("offsets", "entries", "ids", "by_gaussian", "gaussian_offsets")

@@ -11,13 +11,13 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.compositing import composite
 from kgs.fit.trainer import move_camera
 from kgs.losses import photometric_loss, target_moments
 from kgs.model import GaussianModel
 from kgs.projection import project
+from kgs.raster import composite
+from kgs.raster.tiles import bin_to_tiles
 from kgs.renderer import GaussianRenderer
-from kgs.tiles import bin_to_tiles
 from kgs.types import Gaussians
 
 from .scenes import layered_scene

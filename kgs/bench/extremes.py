@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 import kgs.reference
-from kgs.fit.report import versions, write_json
+from kgs.fit.outputs import versions, write_json
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 

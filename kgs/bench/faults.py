@@ -22,7 +22,7 @@ from typing import Any
 
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.report import versions, write_json
+from kgs.fit.outputs import versions, write_json
 
 from .output import markdown_table, write_csv
 

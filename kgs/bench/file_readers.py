@@ -13,10 +13,10 @@ import torch
 from kgs.datasets import Scene, synthetic_scene
 from kgs.datasets.images import read_image
 from kgs.fit.config import FitConfig, timetable
-from kgs.fit.initialize import FirstPoints
 from kgs.fit.lpips import Lpips
-from kgs.fit.report import write_json
+from kgs.fit.outputs import write_json
 from kgs.fit.settings import read_settings
+from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
 from kgs.model import GaussianModel
 from kgs.ply import load_ply, save_ply

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.errors import DataError
-from kgs.fit.report import versions, write_json
+from kgs.fit.outputs import versions, write_json
 
 from .file_readers import FILE_READERS
 from .output import markdown_table, write_csv

@@ -20,9 +20,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 import kgs.reference
-from kgs.compositing import composite
-from kgs.fit.report import versions, write_json
+from kgs.fit.outputs import versions, write_json
 from kgs.projection import project
+from kgs.raster import composite
 from kgs.types import Gaussians
 
 from .output import markdown_table, write_csv

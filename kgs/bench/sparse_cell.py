@@ -14,11 +14,11 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
-from kgs.fit.evaluate import MEASURES
-from kgs.fit.initialize import FirstPoints
 from kgs.fit.lpips import Lpips
-from kgs.fit.report import peak_rss_mb
+from kgs.fit.metrics import MEASURES
+from kgs.fit.outputs import peak_rss_mb
 from kgs.fit.run import choose_points, measure
+from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
 
 from .coadaptation import coadaptation

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from kgs.fit.evaluate import MEASURES
+from kgs.fit.metrics import MEASURES
 
 from .output import latex_escape, latex_table, markdown_table, write_csv
 from .published import PAPER

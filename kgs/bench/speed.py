@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kgs.fit.report import peak_rss_mb, versions, write_json
+from kgs.fit.outputs import peak_rss_mb, versions, write_json
 
 from .cases import Cases
 from .output import markdown_table, write_csv

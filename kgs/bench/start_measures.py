@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.fit.triangulate import camera_centers, project_all, unproject
+from kgs.fit.starts.triangulate import camera_centers, project_all, unproject
 
 __all__ = ["CLOSE", "NEAR", "complete_pixels", "depth_errors", "front_depths", "model_errors", "seen_twice"]
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.fit.initialize import FirstPoints, first_points
-from kgs.fit.report import versions, write_json
+from kgs.fit.outputs import versions, write_json
+from kgs.fit.starts import FirstPoints, first_points
 
 from .output import markdown_table, write_csv
 from .scenes import check_scenes

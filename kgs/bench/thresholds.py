@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs.fit.starts.triangulate import camera_centers
 from kgs.fit.trainer import Trainer
-from kgs.fit.triangulate import camera_centers
 
 __all__ = ["count_over_threshold"]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from kgs.fit.config import FAST, FitConfig
-from kgs.fit.report import versions
+from kgs.fit.outputs import versions
 
 from .grid import run_grid
 from .output import markdown_table, write_csv

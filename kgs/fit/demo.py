@@ -10,7 +10,7 @@ from typing import Any
 from kgs.datasets.scene import Scene
 
 from .config import FitConfig, Recipe
-from .report import side_by_side, write_curve, write_json, write_png
+from .outputs import side_by_side, write_curve, write_json, write_png
 from .run import choose_points, measure, train
 from .trainer import Trainer
 

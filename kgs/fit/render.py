@@ -11,8 +11,8 @@ from kgs.ply import load_ply
 from kgs.renderer import GaussianRenderer
 
 from .config import Recipe
-from .initialize import typical_depths
-from .report import png_name, write_png
+from .outputs import png_name, write_png
+from .starts import typical_depths
 from .trainer import move_camera
 
 __all__ = ["render_views"]

@@ -20,10 +20,10 @@ from kgs.ply import save_ply
 
 from .checkpoint import previous
 from .config import FitConfig
-from .evaluate import evaluate
-from .initialize import FirstPoints, first_points
 from .lpips import Lpips
-from .report import png_name, run_metrics, write_curve, write_json, write_png
+from .metrics import evaluate
+from .outputs import png_name, run_metrics, write_curve, write_json, write_png
+from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
 __all__ = ["CHECKPOINT", "choose_points", "fit_scene", "measure", "train"]

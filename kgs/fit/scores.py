@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kgs.densify import Densifier
 
-from .triangulate import camera_centers
+from .starts.triangulate import camera_centers
 
 __all__ = ["gaussian_scores"]
 

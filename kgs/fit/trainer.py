@@ -28,8 +28,8 @@ from kgs.renderer import GaussianRenderer
 from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
-from .initialize import FirstPoints, typical_depths
 from .scores import gaussian_scores
+from .starts import FirstPoints, typical_depths
 from .state import check_state, restore, trainer_state
 
 __all__ = ["Trainer", "move_camera"]

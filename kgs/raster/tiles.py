@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .covariance import variances
-from .projection import cut_squared
-from .types import ProjectedGaussians, TileBins
+from kgs.covariance import variances
+from kgs.projection import cut_squared
+from kgs.types import ProjectedGaussians, TileBins
 
 __all__ = ["TileSpans", "bin_to_tiles", "tile_spans"]
 

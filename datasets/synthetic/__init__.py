@@ -18,9 +18,10 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs.datasets.scene import Scene, Views
+
 from .raycast import Array, raycast
-from .scene import Scene, Views
-from .synthetic_world import CENTER, World, make_world, shade
+from .world import CENTER, World, make_world, shade
 
 __all__ = ["synthetic_depths", "synthetic_scene"]
 

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs.datasets.frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
+from kgs.datasets.images import Intrinsics, image_folder, list_images
+from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 
 from .colmap import camera_to_world, track_points
 from .colmap_model import find_model, model_file, read_images
-from .frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
-from .images import Intrinsics, image_folder, list_images
-from .scene import Scene
 
 __all__ = ["load_llff"]
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from .chunks import Band
+    from .tasks import Band
 
 __all__ = ["ALPHA_MAX", "Backward", "Forward", "Group", "Step"]
 

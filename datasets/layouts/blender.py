@@ -9,12 +9,12 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
+from kgs.datasets.frames import Frame, PointCloud, build_scene, check_unique, path_inside
+from kgs.datasets.images import Intrinsics, read_size
+from kgs.datasets.scene import Scene
+from kgs.datasets.splits import BLENDER_TRAIN_FRAMES, select_evenly
 from kgs.errors import DataError
 
-from .frames import Frame, PointCloud, build_scene, check_unique, path_inside
-from .images import Intrinsics, read_size
-from .scene import Scene
-from .splits import BLENDER_TRAIN_FRAMES, select_evenly
 from .transforms import opencv_pose, read_focal, read_frames, read_text
 
 __all__ = ["load_blender"]

@@ -14,10 +14,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .steps import ALPHA_MAX, Backward, Forward, Group
+from kgs.types import TileBins
+
 from .threads import run_all
 from .tiles import TileSpans
-from .types import TileBins
+from .torch_passes import ALPHA_MAX, Backward, Forward, Group
 
 __all__ = ["Band", "Rules", "choose_chunk_size"]
 

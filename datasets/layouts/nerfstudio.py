@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from kgs.datasets.frames import Frame, build_scene, path_inside, split_frames
+from kgs.datasets.images import Intrinsics, read_size
+from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 
-from .frames import Frame, build_scene, path_inside, split_frames
-from .images import Intrinsics, read_size
-from .scene import Scene
 from .transforms import opencv_pose, read_focal, read_frames, read_number, read_text
 
 __all__ = ["load_nerfstudio"]

@@ -34,11 +34,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .chunks import Band, Rules, choose_chunk_size
-from .covariance import columns, variances, whitening
-from .full_precision import full_precision
+from kgs.covariance import columns, variances, whitening
+from kgs.full_precision import full_precision
+from kgs.types import ProjectedGaussians, TileBins
+
+from .tasks import Band, Rules, choose_chunk_size
 from .tiles import TileSpans, tile_spans
-from .types import ProjectedGaussians, TileBins
 
 __all__ = ["Composited", "composite"]
 

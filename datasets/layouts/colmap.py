@@ -11,12 +11,12 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
+from kgs.datasets.frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
+from kgs.datasets.images import Intrinsics, image_folder
+from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 
 from .colmap_model import ColmapCamera, ColmapImage, find_model, model_file, read_cameras, read_images, read_points
-from .frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
-from .images import Intrinsics, image_folder
-from .scene import Scene
 
 __all__ = ["camera_to_world", "load_colmap", "track_points"]
 

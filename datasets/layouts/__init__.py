@@ -1,0 +1,1 @@
+"""The file layouts that `load_scene` reads, one file each."""
