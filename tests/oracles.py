@@ -1,4 +1,4 @@
-"""Oracles and scenes for tests, none of which uses a formula of the package."""
+"""Oracles for tests, none of which uses a formula of the package."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 import mpmath
 import torch
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from mpmath import mpf
 from torch import Tensor
@@ -15,78 +16,8 @@ from torch import Tensor
 from kgs import Gaussians
 from kgs.reference import layers
 
-__all__ = ["enumerate_drops", "mpmath_pixels", "near_threshold", "pinhole", "random_camera", "random_gaussians"]
-__all__ += ["real_harmonic", "theta_mass"]
-
-
-def pinhole(
-    height: int,
-    width: int,
-    focal: float | tuple[float, float],
-    centre: tuple[float, float] | None = None,
-    skew: float = 0.0,
-    extrinsics: Tensor | None = None,
-    dtype: torch.dtype = torch.float64,
-) -> PinholeCamera:
-    """One camera; centred and at the origin unless told otherwise."""
-    fx, fy = focal if isinstance(focal, tuple) else (focal, focal)
-    cx, cy = ((width - 1) / 2, (height - 1) / 2) if centre is None else centre
-    intrinsics = torch.eye(4, dtype=torch.float64)
-    intrinsics[:2, :3] = torch.tensor([[fx, skew, cx], [0.0, fy, cy]], dtype=torch.float64)
-    extrinsics = torch.eye(4, dtype=dtype) if extrinsics is None else extrinsics
-    size = torch.tensor([height]), torch.tensor([width])
-    return PinholeCamera(intrinsics[None].to(dtype), extrinsics[None].to(dtype), *size)
-
-
-def random_camera(height: int, width: int, seed: int, dtype: torch.dtype = torch.float64) -> PinholeCamera:
-    """A slightly turned and shifted camera with an off-centre principal point, about 50 degrees wide."""
-    generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(10, generator=generator, dtype=torch.float64) * 2 - 1
-    twist = 0.1 * draw[:3]
-    generators = torch.linalg.cross(torch.eye(3, dtype=torch.float64), twist.expand(3, 3))
-    extrinsics = torch.eye(4, dtype=torch.float64)
-    extrinsics[:3, :3] = torch.linalg.matrix_exp(generators)
-    extrinsics[:3, 3] = 0.1 * draw[3:6]
-    fx, fy = (max(height, width) * (1 + 0.05 * draw[6:8])).tolist()
-    cx, cy = float((width - 1) / 2 + 0.1 * width * draw[8]), float((height - 1) / 2 + 0.1 * height * draw[9])
-    return pinhole(height, width, (fx, fy), (cx, cy), 0.0, extrinsics, dtype)
-
-
-def random_gaussians(
-    n: int,
-    seed: int,
-    dtype: torch.dtype = torch.float64,
-    sh_degree: int | None = 0,
-    image_size: int = 64,
-    opacities: tuple[float, float] = (0.05, 0.95),
-) -> Gaussians:
-    """An ordinary scene in front of `random_camera`: z in 2 to 6, anisotropic footprints of 1 to 6 px.
-
-    Drawn in float64 and then rounded to `dtype`.
-
-    Args:
-        n: how many.
-        seed: of a generator of its own.
-        dtype: of the result.
-        sh_degree: degree of the harmonics, or None for RGB.
-        image_size: larger side of the image in pixels, to which the footprints refer.
-        opacities: range of the uniform opacities.
-    """
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    z = uniform(2, 6, n, 1)
-    means = torch.cat([uniform(-0.6, 0.6, n, 2) * z, z], 1)
-    quats = torch.randn(n, 4, generator=generator, dtype=torch.float64)
-    scales = uniform(1, 6, n, 3) * z / image_size
-    opacity = uniform(*opacities, n)
-    if sh_degree is None:
-        colors = uniform(0, 1, n, 3)
-    else:
-        colors = 0.3 * torch.randn(n, (sh_degree + 1) ** 2, 3, generator=generator, dtype=torch.float64)
-    return Gaussians(*(value.to(dtype) for value in (means, quats, scales, opacity, colors)))
+__all__ = ["enumerate_drops", "mpmath_pixels", "near_threshold", "quaternion_product", "real_harmonic", "theta_mass"]
+__all__ += ["pinhole", "random_camera", "random_gaussians"]  # of factories, until every test takes them from there
 
 
 def near_threshold(
@@ -160,9 +91,13 @@ def real_harmonic(index: int, polar: mpf, azimuth: mpf) -> mpf:
     return value.real if m == 0 else mpmath.sqrt(2) * (value.real if m > 0 else value.imag)
 
 
-def _mp_covariance(  # type: ignore[no-untyped-def]
-    gaussians: Gaussians, i: int, point, k, pose, camera: PinholeCamera, eps2d: float
-):
+def quaternion_product(p: Tensor, q: Tensor) -> Tensor:
+    """Hamilton's product of quaternions w, x, y, z."""
+    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + torch.linalg.cross(p[..., 1:], q[..., 1:], dim=-1)
+    return torch.cat([p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdim=True), vector], -1)
+
+
+def _mp_covariance(gaussians: Gaussians, i: int, point, k, pose, camera: PinholeCamera, eps2d: float):
     w, x, y, z = (mpf(value) for value in gaussians.quats[i].tolist())
     first = [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)]
     second = [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)]
@@ -178,7 +113,7 @@ def _mp_covariance(  # type: ignore[no-untyped-def]
     return jacobian * turn * square * turn.T * jacobian.T + mpf(eps2d) * mpmath.eye(2)
 
 
-def _mp_color(color: Tensor, direction) -> list[mpf]:  # type: ignore[no-untyped-def]
+def _mp_color(color: Tensor, direction) -> list[mpf]:
     if color.ndim == 1:
         return [mpf(value) for value in color.tolist()]
     polar = mpmath.acos(direction[2] / mpmath.norm(direction))
@@ -187,7 +122,7 @@ def _mp_color(color: Tensor, direction) -> list[mpf]:  # type: ignore[no-untyped
     return [max(mpf(1) / 2 + value, mpf(0)) for value in sums]
 
 
-def _mp_pixel(drawn, row: int, column: int, background, threshold: float, stop: float) -> list[float]:  # type: ignore[no-untyped-def]
+def _mp_pixel(drawn, row: int, column: int, background, threshold: float, stop: float) -> list[float]:
     light, total = mpf(1), [mpf(0)] * 3
     for centre, conic, opacity, color in drawn:
         d = mpmath.matrix([column, row]) - centre
