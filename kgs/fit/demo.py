@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from kgs.datasets.scene import Scene
+from kgs.ply import save_ply
 
 from .config import FitConfig, Recipe
-from .outputs import side_by_side, write_curve, write_json, write_png
+from .figures import side_by_side, write_curve
+from .outputs import check_folder, write_json, write_png
 from .run import choose_points, measure, train
 from .trainer import Trainer
 
@@ -36,7 +38,7 @@ def run_demo(
 
     Args:
         scene: what to fit, with test views.
-        out: folder for demo.png, curve.png and metrics.json.
+        out: folder for demo.png, curve.png, metrics.json and splat.ply (of the fit with DropGaussian).
         config: the fit with DropGaussian; the other has drop = 0 and is equal otherwise, the first points and the
             order of views included.
         say: where lines for the user go.
@@ -44,7 +46,7 @@ def run_demo(
     Returns:
         What metrics.json holds: `{"without": run, "with": run}`.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
     points = choose_points(scene, config)
     say(
         f"{len(scene.train)} training and {len(scene.test)} test views of "
@@ -59,6 +61,7 @@ def run_demo(
         runs[name] = measure(trainer)
         renders[f"{name} DropGaussian"] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
         curves[f"{name} DropGaussian"] = trainer.curve
+    save_ply(out / "splat.ply", trainer.model)
     write_json(out / "metrics.json", runs)
     write_curve(out / "curve.png", curves)
     worst = sorted(range(len(scene.test)), key=lambda i: runs["without"]["test"]["views"][i]["psnr"])[:2]

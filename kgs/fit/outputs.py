@@ -1,41 +1,48 @@
-"""What a fit leaves behind: metrics.json, PNGs and the curve."""
+"""What a command leaves behind: metrics.json and PNGs, whole or not at all, and never in place of a user's file."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import platform
-import resource
-import sys
-from pathlib import Path, PurePosixPath
-from typing import Any
+import re
+import unicodedata
+import zlib
+from collections import Counter
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
-import kornia
 import numpy as np
-import torch
 from torch import Tensor
 
-from kgs import __version__
-from kgs.datasets.scene import Views
+from kgs.datasets.images import list_images
 from kgs.errors import DataError
-from kgs.json_files import read_json
 
-from .trainer import Trainer
+from .machine import peak_rss_mb, versions
+
+if TYPE_CHECKING:
+    from .trainer import Trainer
 
 __all__ = [
+    "check_folder",
+    "is_own",
     "peak_rss_mb",
-    "png_name",
-    "read_json",
+    "png_names",
+    "remove_others",
     "run_metrics",
-    "side_by_side",
     "versions",
-    "write_curve",
     "write_json",
     "write_png",
+    "write_whole",
 ]
 
-LEGIBLE = 200  # pixels; narrower pictures are enlarged on a sheet
+PNG_MARK = b"Software\0kgs"
+_MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
+_SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
+_ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
+_LONGEST = 120  # bytes of a picture's name
 
 
 def run_metrics(
@@ -47,7 +54,7 @@ def run_metrics(
         "train": train,
         "curve": trainer.curve,
         "seconds": round(trainer.seconds, 2),
-        "peak_rss_mb": peak_rss_mb(),
+        "peak_rss_mb": peak_rss_mb() or None,
         "gaussians": len(trainer.model),
         "steps": trainer.step,
         "seed": trainer.config.seed,
@@ -58,95 +65,95 @@ def run_metrics(
     }
 
 
-def versions() -> dict[str, str]:
-    """Versions of what decides the result."""
-    return {
-        "kgs": __version__,
-        "torch": torch.__version__,
-        "kornia": kornia.__version__,
-        "opencv": cv2.__version__,
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-    }
+def check_folder(out: Path, files: Iterable[str], scene: Path | None = None) -> None:
+    """Make the folder for results, once it is sure that this command can write there and overwrites no user's file.
+
+    Args:
+        out: the folder.
+        files: what the command is going to write, relative to `out`.
+        scene: the scene's folder; no results go where it keeps its own files.
+
+    Raises:
+        DataError: `out` is a scene, holds photos of `scene`, or has one of `files` that kgs did not write.
+        OSError: the folder cannot be made or written to.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    advice = "choose another folder with -o"
+    inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
+    photos = [path for path in list_images(out) if not is_own(path)] if inside else []
+    if photos or any((out / name).exists() for name in _SCENES):
+        raise DataError(out, "", f"holds files of a scene: {advice}")
+    for name in files:
+        if (out / name).exists() and not is_own(out / name):
+            raise DataError(out / name, "", f"was not written by kgs and would be overwritten: {advice}")
+    write_whole(out / ".kgs", b"")
+    (out / ".kgs").unlink()
 
 
-def peak_rss_mb() -> int:
-    """Largest resident memory of this process so far, in MiB."""
-    status = Path("/proc/self/status")
-    if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return round(int(line.split()[1]) / 2**10)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
+def is_own(path: Path) -> bool:
+    """Whether kgs wrote this PNG, PLY or JSON file."""
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        content = file.read(2**26 if path.suffix == ".json" else 2**12)
+    return any(mark in content for mark in _MARKS.get(path.suffix, ()))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all; a link stays one.
+
+    Raises:
+        OSError: it cannot be written; what was there is untouched.
+    """
+    path = path.resolve()
+    temporary = path.with_name(f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def png_name(view: str) -> str:
-    """A file name for a render of a view: folders in the view's name become part of it."""
-    return str(PurePosixPath(view).with_suffix(".png")).replace("/", "_")
+def png_names(views: Iterable[str]) -> dict[str, str]:
+    """A file name of its own for a render of each view.
+
+    Folders in a view's name become part of it, and the ending becomes .png. Where that gives two views the same name
+    (capitals do not count), or one that is too long, a hash of the view's name is added.
+    """
+    plain = {view: re.sub(r"[\\/\x00-\x1f]", "_", re.sub(_ENDING, "", view)) for view in views}
+    folded = {view: unicodedata.normalize("NFC", stem).casefold() for view, stem in plain.items()}
+    counts = Counter(folded.values())
+    names = {}
+    for view, stem in plain.items():
+        if counts[folded[view]] > 1 or len(os.fsencode(stem)) > _LONGEST:
+            short = os.fsencode(stem)[: _LONGEST - 13].decode(errors="ignore")
+            stem = f"{short}-{hashlib.sha256(os.fsencode(view)).hexdigest()[:12]}"
+        names[view] = f"{stem}.png"
+    return names
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write an RGB image `(3, H, W)`, clamped to [0, 1] and rounded to 8 bits."""
+    """Write an RGB image `(3, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs."""
     array = (image.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
     ok, content = cv2.imencode(".png", np.ascontiguousarray(array[:, :, ::-1]))
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")
-    path.write_bytes(content.tobytes())
+    chunk = b"tEXt" + PNG_MARK
+    mark = (len(PNG_MARK)).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    data = content.tobytes()
+    header = 33  # the signature and the first chunk
+    write_whole(path, data[:header] + mark + data[header:])
 
 
-def side_by_side(views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> Tensor:
-    """Pictures of some views, one row a view: the photo, then one column a method, each with its title.
-
-    Args:
-        views: where the photos are.
-        columns: title to renders `(3, H, W)` of all views.
-        indices: the views to show.
-
-    Returns:
-        `(3, H', W')`; small pictures are enlarged by a whole factor.
-    """
-    gap, header, rows = 4, 18, []
-    enlarge = max(1, -(-LEGIBLE // views.images.shape[-1]))
-    for i in indices:
-        pictures = torch.stack([views.images[i], *(renders[i].cpu().clamp(0, 1) for renders in columns.values())])
-        pictures = torch.nn.functional.interpolate(pictures, scale_factor=enlarge, mode="bicubic").clamp(0, 1)
-        rows.append(torch.cat([torch.nn.functional.pad(p, (0, gap, 0, gap), value=1.0) for p in pictures], 2))
-    sheet = torch.nn.functional.pad(torch.cat(rows, 1)[:, :-gap, :-gap], (0, 0, header, 0), value=1.0)
-    canvas = np.ascontiguousarray((sheet.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
-    width = views.images.shape[-1] * enlarge + gap
-    for k, title in enumerate(["photo, not used in training", *columns]):
-        cv2.putText(canvas, title, (k * width + 2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
-    return torch.from_numpy(canvas).permute(2, 0, 1) / 255
-
-
-def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
-    """Plot test and training PSNR against seconds of training, one colour a run.
-
-    Raises:
-        ImportError: matplotlib is missing.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
-    for k, (name, curve) in enumerate(runs.items()):
-        seconds = [point["seconds"] for point in curve]
-        for key, style in (("test_psnr", "-o"), ("train_psnr", ":")):
-            values = [np.nan if point[key] is None else point[key] for point in curve]
-            label = f"{name} {key.split('_')[0]}".strip()
-            axes.plot(seconds, values, style, color=f"C{k}", markersize=3, label=label)
-    axes.set_xlabel("seconds of training")
-    axes.set_ylabel("PSNR [dB]")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+def remove_others(folder: Path, keep: Collection[str]) -> None:
+    """Remove the pictures of a former run: PNGs that kgs wrote, but for those named in `keep`."""
+    for path in folder.glob("*.png"):
+        if path.name not in keep and is_own(path):
+            path.unlink()

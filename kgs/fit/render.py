@@ -11,7 +11,7 @@ from kgs.ply import load_ply
 from kgs.renderer import GaussianRenderer
 
 from .config import Recipe
-from .outputs import png_name, write_png
+from .outputs import check_folder, png_names, write_png
 from .starts import typical_depths
 from .trainer import move_camera
 
@@ -19,27 +19,24 @@ __all__ = ["render_views"]
 
 
 def render_views(ply: Path, scene: Scene, out: Path, device: str = "cpu") -> int:
-    """Render a PLY from all training and test cameras of a scene into `out`, one PNG a view; returns how many.
+    """Render a PLY from all training and test cameras of a scene into `out`, one PNG per view; returns how many.
 
     The near plane is the recipe's, from the depths of the Gaussians themselves.
 
     Raises:
-        DataError: the PLY is broken.
+        DataError: the PLY is broken, or `out` holds files that kgs did not write and would overwrite.
     """
+    names = png_names([*scene.train.names, *scene.test.names])
+    check_folder(out, names.values(), scene.root)
     model = load_ply(ply)
     with torch.no_grad():
         model.means.sub_(scene.offset.to(model.means))
     near_plane = Recipe().near_plane * typical_depths(scene.train, model.means.detach())[0]
     renderer = GaussianRenderer(near_plane=near_plane).eval()
-    out.mkdir(parents=True, exist_ok=True)
-    model = model.to(device)
-    background = scene.background.to(device)
-    count = 0
+    model, background = model.to(device), scene.background.to(device)
     for views in (scene.train, scene.test):
         for i, name in enumerate(views.names):
-            camera = views.camera(i)
+            camera = move_camera(views.camera(i), torch.device(device))
             with torch.no_grad():
-                image = renderer(model(), move_camera(camera, torch.device(device)), background).image[0]
-            write_png(out / png_name(name), image)
-            count += 1
-    return count
+                write_png(out / names[name], renderer(model(), camera, background).image[0])
+    return len(names)

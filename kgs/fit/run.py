@@ -20,9 +20,10 @@ from kgs.ply import save_ply
 
 from .checkpoint import previous
 from .config import FitConfig
+from .figures import write_curve
 from .lpips import Lpips
 from .metrics import evaluate
-from .outputs import png_name, run_metrics, write_curve, write_json, write_png
+from .outputs import check_folder, png_names, remove_others, run_metrics, write_json, write_png
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
@@ -57,11 +58,14 @@ def fit_scene(
         What metrics.json holds, and the signal that interrupted the fit or 0 (its results are valid all the same).
 
     Raises:
-        DataError: the checkpoint is damaged or belongs to another fit.
+        DataError: the checkpoint is damaged or belongs to another fit, or `out` holds files that kgs did not write
+            and would overwrite.
         TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
         OSError: a result cannot be written.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    names = png_names([*scene.train.names, *scene.test.names])
+    pictures = [f"test/{names[view]}" for view in scene.test.names]
+    check_folder(out, ["splat.ply", "config.json", "metrics.json", "curve.png", *pictures], scene.root)
     checkpoint = out / CHECKPOINT
     if resume and (checkpoint.exists() or previous(checkpoint).exists()):
         trainer = Trainer.resume(scene, config, checkpoint)
@@ -93,7 +97,8 @@ def fit_scene(
     write_curve(out / "curve.png", {"": trainer.curve})
     (out / "test").mkdir(exist_ok=True)
     for i, name in enumerate(scene.test.names):
-        write_png(out / "test" / png_name(name), trainer.render(scene.test.camera(i))[0])
+        write_png(out / "test" / names[name], trainer.render(scene.test.camera(i))[0])
+    remove_others(out / "test", names.values())
     metrics = measure(trainer, lpips)
     write_json(out / "metrics.json", metrics)
     return metrics, stopped_by

@@ -1,0 +1,56 @@
+"""What a fit runs on: versions, memory, and whether the device that is asked for is there."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+import kornia
+import torch
+
+from kgs import __version__
+
+__all__ = ["check_device", "peak_rss_mb", "versions"]
+
+
+def check_device(name: str) -> torch.device:
+    """The device of that name, once it has held a number.
+
+    Raises:
+        ValueError: torch knows no such device, or this machine has none.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()  # the meta device has no numbers
+    except Exception as error:  # RuntimeError, AssertionError or ImportError, by the backend
+        reason = str(error).partition(". ")[0].splitlines()[0]
+        raise ValueError(f"device: expected cpu or a GPU of this machine, got {name!r} ({reason:.120})") from error
+    return device
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides a result; numba is left out where it is not installed."""
+    found = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
+    with contextlib.suppress(PackageNotFoundError):
+        found["numba"] = version("numba")
+    machine = f"{platform.machine()}, {os.cpu_count()} cores"
+    return {**found, "python": platform.python_version(), "machine": machine}
+
+
+def peak_rss_mb() -> int:
+    """Largest resident memory of this process so far, in MiB; 0 where the system does not tell (Windows)."""
+    status = Path("/proc/self/status")
+    if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return round(int(line.split()[1]) / 2**10)
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))

@@ -1,0 +1,83 @@
+"""Figures and facts about the machine, without a display and without touching what is the caller's."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kgs.fit.figures import side_by_side, write_curve
+from kgs.fit.machine import check_device, peak_rss_mb, versions
+
+CURVE = [{"step": k, "seconds": 0.1 * k, "test_psnr": 20.0 + k, "train_psnr": None} for k in range(3)]
+
+
+def test_the_callers_backend_stays(tmp_path):
+    import matplotlib
+    from matplotlib import pyplot
+
+    before = matplotlib.get_backend()
+    try:
+        matplotlib.use("svg")
+        figure = pyplot.figure()
+        write_curve(tmp_path / "curve.png", {"one": CURVE})
+        assert matplotlib.get_backend() == "svg"
+        assert pyplot.get_fignums() == [figure.number]
+    finally:
+        pyplot.close("all")
+        matplotlib.use(before)
+    assert cv2.imread(str(tmp_path / "curve.png")).shape == (480, 720, 3)
+
+
+def test_a_curve_has_a_colour_for_each_run(tmp_path):
+    write_curve(tmp_path / "curve.png", {"one": CURVE, "two": [{**point, "test_psnr": 18.0} for point in CURVE]})
+    pixels = cv2.imread(str(tmp_path / "curve.png")).reshape(-1, 3)
+    for color in ((180, 119, 31), (14, 127, 255)):  # matplotlib's first two, blue first
+        assert int((pixels == color).all(1).sum()) > 50
+
+
+def test_a_sheet_shows_the_photo_and_each_render(scene):
+    views = scene.test
+    renders = [torch.full_like(image, 0.5) for image in views.images]
+    sheet = side_by_side(views, {"grey": renders}, [0, 1])
+    height, width = views.images.shape[-2:]
+    enlarge = -(-200 // width)
+    assert sheet.shape == (3, 18 + 2 * height * enlarge + 4, 2 * width * enlarge + 4)
+    cell = sheet[:, 18 : 18 + height * enlarge, width * enlarge + 4 :]
+    assert float((cell - 0.5).abs().max()) < 1 / 255
+    photo = sheet[:, 18 : 18 + height * enlarge, : width * enlarge]
+    small = torch.nn.functional.avg_pool2d(photo[None], enlarge)[0]
+    pair = torch.stack([small.flatten(), views.images[0].flatten()])
+    assert float(torch.corrcoef(pair)[0, 1]) > 0.95
+
+
+def test_no_module_of_one_system_alone():
+    """Windows has no `resource`: a fit can still be imported, and its memory is not known where nothing tells it."""
+    code = (
+        "import sys; sys.modules['resource'] = None\n"
+        "import kgs.fit.run, kgs.fit.demo, kgs.fit.machine\n"
+        "from pathlib import Path\n"
+        "exists = Path.exists\n"
+        "Path.exists = lambda path: False if str(path).startswith('/proc') else exists(path)\n"
+        "print(kgs.fit.machine.peak_rss_mb())"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (result.stdout.strip(), result.returncode) == ("0", 0), result.stderr
+
+
+def test_memory_and_versions():
+    block = np.ones(2**26, np.uint8)
+    assert peak_rss_mb() > 64
+    assert block.sum() == 2**26
+    assert {"kgs", "torch", "kornia", "opencv", "python", "machine"} <= versions().keys()
+    assert versions()["torch"] == torch.__version__
+
+
+@pytest.mark.parametrize("name", ["foo", "", "cuda:x", "meta", "cuda:99", "privateuseone"])
+def test_a_device_that_is_not_there_is_one_line(name):
+    with pytest.raises(ValueError, match=r"^device: expected cpu or a GPU of this machine, got .*$") as caught:
+        check_device(name)
+    assert "\n" not in str(caught.value)
+    assert check_device("cpu") == torch.device("cpu")

@@ -1,0 +1,69 @@
+"""`kgs render`: pictures of a splat, and no photo of the user's lost."""
+
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import kgs
+from kgs.datasets import synthetic_scene
+from kgs.errors import DataError
+from kgs.fit.render import render_views
+
+
+@pytest.fixture(scope="module")
+def splat(tmp_path_factory):
+    path = tmp_path_factory.mktemp("splat") / "splat.ply"
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(50, 3, generator=generator) + torch.tensor([-0.5, -0.5, 4.0])
+    kgs.save_ply(path, kgs.GaussianModel.from_points(points, torch.rand(50, 3, generator=generator), 0))
+    return path
+
+
+@pytest.fixture
+def llff(tmp_path):
+    """An LLFF folder with ten PNGs."""
+    scene = synthetic_scene(train_views=8, test_views=2, size=(30, 40), seed=0)
+    root = tmp_path / "llff"
+    (root / "images").mkdir(parents=True)
+    rows = []
+    for k, image in enumerate([*scene.train.images, *scene.test.images]):
+        cv2.imwrite(str(root / "images" / f"{k}.png"), (image.permute(1, 2, 0) * 255).byte().numpy())
+        pose = np.array([[0, 1, 0, 0.1 * k, 30], [1, 0, 0, 0, 40], [0, 0, -1, 0, 35]], dtype=float)
+        rows.append([*pose.ravel(), 3.0, 8.0])
+    np.save(root / "poses_bounds.npy", np.array(rows))
+    return root
+
+
+def hashes(folder):
+    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("out", ["images", "."])
+def test_photos_are_never_overwritten(splat, llff, out):
+    before = hashes(llff)
+    with pytest.raises(DataError, match="holds files of a scene"):
+        render_views(splat, kgs.datasets.load_scene(llff), llff / out)
+    assert hashes(llff) == before
+
+
+def test_a_copy_of_the_photos_is_not_overwritten_either(splat, llff, tmp_path):
+    photo = (llff / "images" / "3.png").read_bytes()
+    (tmp_path / "copy").mkdir()
+    (tmp_path / "copy" / "3.png").write_bytes(photo)
+    with pytest.raises(DataError, match=r"3\.png: was not written by kgs"):
+        render_views(splat, kgs.datasets.load_scene(llff), tmp_path / "copy")
+    assert hashes(tmp_path / "copy").keys() == {tmp_path / "copy" / "3.png"}
+    assert (tmp_path / "copy" / "3.png").read_bytes() == photo
+
+
+def test_a_second_render_replaces_the_first(splat, llff):
+    scene = kgs.datasets.load_scene(llff)
+    out = llff / "renders"  # below the scene, with nothing of it inside
+    assert render_views(splat, scene, out) == 10
+    first = hashes(out)
+    assert len(first) == 10
+    assert render_views(splat, scene, out) == 10
+    assert hashes(out) == first
