@@ -42,15 +42,15 @@ def trainer(scene: Any) -> Trainer:
 
 def at_step(trainer: Trainer, step: int, act: Any) -> None:
     """Do something in the middle of a step."""
-    plain = trainer._train_step
+    plain = trainer._descend
 
-    def train_step() -> float:
+    def descend() -> float:
         loss = plain()
         if trainer.step == step:
             act()
         return loss
 
-    trainer._train_step = train_step  # type: ignore[method-assign]
+    trainer._descend = descend  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,1 +1,31 @@
-"""The application: turns a scene into a splat."""
+"""Fits: turns a scene into a splat, with one call or in a loop of one's own.
+
+Example:
+    >>> from kgs.fit import FitConfig, Trainer, first_points
+    >>> from kgs.datasets import synthetic_scene
+    >>> scene = synthetic_scene(train_views=2, size=(16, 16))
+    >>> trainer = Trainer(scene, FitConfig(steps=2), first_points(scene.train, "random", count=50))
+    >>> while trainer.step < trainer.config.steps:
+    ...     loss = trainer.train_step()
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from .config import FitConfig
+
+if TYPE_CHECKING:
+    from .run import fit_scene
+    from .starts import FirstPoints, first_points
+    from .trainer import Trainer
+
+__all__ = ["FirstPoints", "FitConfig", "Trainer", "first_points", "fit_scene"]
+
+_HOMES = {"FirstPoints": "starts", "Trainer": "trainer", "first_points": "starts", "fit_scene": "run"}
+
+
+def __getattr__(name: str) -> Any:
+    """The other names are loaded when they are asked for: they bring OpenCV and trimesh with them."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_HOMES[name]}", __name__), name)

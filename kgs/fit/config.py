@@ -1,4 +1,4 @@
-"""Every number of a fit, as frozen dataclasses.
+"""Every number of a fit, as frozen dataclasses; each is checked here, and only here.
 
 Source: the official release of "DropGaussian" (CVPR 2025) for the recipe, which is that of Kerbl et al. 2023 with
 another densification threshold and without pruning by size.
@@ -7,17 +7,41 @@ another densification threshold and without pruning by size.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
+from functools import lru_cache
 from itertools import pairwise
+from numbers import Integral, Real
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-__all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
+import torch
+
+__all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable", "usable_device"]
 
 _MIN_DENSIFICATIONS = 20
-_MOST_STEPS = 10_000_000
-_SEEDS = 2**59  # ten times a seed is one of torch's
-_DROP_BY = ("random", "high-gradient", "low-gradient", "near", "far")
-_OPACITY_L1_BY = ("gradient", "distance")
+
+
+class _Range(NamedTuple):
+    """What a number may be; `ends` says which of the two limits belong to it, "[" and "]" that they do."""
+
+    least: float
+    most: float = 1e300
+    ends: str = "[]"
+
+    def holds(self, value: float) -> bool:
+        above = self.least <= value if self.ends[0] == "[" else self.least < value
+        return above and (value <= self.most if self.ends[1] == "]" else value < self.most)
+
+    def __str__(self) -> str:
+        if self.most == 1e300:
+            return f"of at least {self.least:g}" if self.ends[0] == "[" else f"above {self.least:g}"
+        return f"in {self.ends[0]}{self.least:.12g}, {self.most:.12g}{self.ends[1]}"
+
+
+_Steps = Annotated[int, _Range(1, 10_000_000)]
+_Positive = Annotated[float, _Range(0, ends="(]")]
+_Weight = Annotated[float, _Range(0)]
+_Share = Annotated[float, _Range(0, 1)]
 
 
 @dataclass(frozen=True)
@@ -25,134 +49,115 @@ class Recipe:
     """The recipe for `steps` = 10 000; a shorter fit scales the counts and keeps the rates.
 
     Args:
-        steps: iterations, counted from 1; one training view each.
+        steps: steps of the whole recipe, counted from 1; each one renders one training view.
         lr_means: learning rate of the centres at the start, times the extent of the training cameras.
         lr_means_final: the same at the end, reached log-linearly.
-        lr_sh_dc: of the colour without direction.
-        lr_sh_rest: of the higher harmonics.
-        lr_opacity: of the opacity logits.
-        lr_scales: of the logarithms of the scales.
-        lr_quats: of the quaternions.
+        lr_sh_dc: learning rate of the colour without direction.
+        lr_sh_rest: learning rate of the higher harmonics.
+        lr_opacity: learning rate of the opacity logits.
+        lr_scales: learning rate of the logarithms of the scales.
+        lr_quats: learning rate of the quaternions.
         adam_eps: Adam's epsilon; torch's default would stall the small gradients.
-        sh_interval: every so many steps one more degree of the harmonics is switched on.
+        sh_interval: steps after which one more degree of the harmonics is switched on.
         dssim_weight: loss = L1 + dssim_weight (1 - SSIM).
         densify_from: no densification up to this step.
         densify_interval: steps between two densifications.
         grad_threshold: mean gradient in normalised device coordinates from which a Gaussian is densified.
         percent_dense: largest scale, relative to the extent, up to which it is cloned rather than split.
-        prune_opacity: Gaussians below are removed.
+        prune_opacity: Gaussians below this opacity are removed.
         reset_interval: steps between two resets of all opacities.
         reset_opacity: what they are lowered to.
         reset_recovery: a reset is left out where fewer steps than this follow before the next one or the end.
         near_plane: times the 1st percentile of the first points' depths.
     """
 
-    steps: int = 10_000
-    lr_means: float = 1.6e-4
-    lr_means_final: float = 1.6e-6
-    lr_sh_dc: float = 2.5e-3
-    lr_sh_rest: float = 1.25e-4
-    lr_opacity: float = 0.05
-    lr_scales: float = 0.005
-    lr_quats: float = 0.001
-    adam_eps: float = 1e-15
-    sh_interval: int = 1000
-    dssim_weight: float = 0.2
-    densify_from: int = 500
-    densify_interval: int = 100
-    grad_threshold: float = 5e-4
-    percent_dense: float = 0.01
-    prune_opacity: float = 0.005
-    reset_interval: int = 3000
-    reset_opacity: float = 0.01
-    reset_recovery: int = 300
-    near_plane: float = 0.05
+    steps: _Steps = 10_000
+    lr_means: _Positive = 1.6e-4
+    lr_means_final: _Positive = 1.6e-6
+    lr_sh_dc: _Weight = 2.5e-3
+    lr_sh_rest: _Weight = 1.25e-4
+    lr_opacity: _Weight = 0.05
+    lr_scales: _Weight = 0.005
+    lr_quats: _Weight = 0.001
+    adam_eps: _Weight = 1e-15
+    sh_interval: _Steps = 1000
+    dssim_weight: _Weight = 0.2
+    densify_from: Annotated[int, _Range(0, 10_000_000)] = 500
+    densify_interval: _Steps = 100
+    grad_threshold: _Weight = 5e-4
+    percent_dense: _Positive = 0.01
+    prune_opacity: _Share = 0.005
+    reset_interval: _Steps = 3000
+    reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
+    reset_recovery: Annotated[int, _Range(0, 10_000_000)] = 300
+    near_plane: _Positive = 0.05
 
     def __post_init__(self) -> None:
-        _check_types(self)
-        for name in ("steps", "sh_interval", "densify_interval", "reset_interval", "lr_means", "lr_means_final"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
+        _check(self)
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """What one fit is asked to do.
+    """What one fit is asked to do. NumPy's numbers are taken as Python's.
 
     Args:
-        steps: iterations; other numbers than the recipe's 10 000 scale its counts, see :func:`timetable`.
+        steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
-        drop_schedule: "linear" (the paper's) or "constant".
-        drop_by: "random" (the method), or by scores those with the highest or lowest mean gradient ("high-gradient",
-            "low-gradient"), those nearest to or farthest from the camera ("near", "far").
-        opacity_l1: weight of the L1 penalty on opacities, see :func:`kgs.losses.opacity_l1`; 0 leaves it out.
-        opacity_l1_by: it is heavier on Gaussians with a low mean "gradient", or at a great "distance".
-        sh_degree: degree of the harmonics, 0 to 3.
-        coarse: share of the steps, the first ones, that see the training views in half the pixels a side; in [0, 1].
-        seed: views, splits, masks and random points are drawn from streams that derive from it.
-        init: first points: "dense", "sift", "random", "scene" (the random ones that Blender's layout prescribes),
-            "model-points" (positions refined with test views), or "file".
-        init_file: point cloud for "file".
-        init_points: how many points "random" gives, and "dense" at most; at least 1.
-        max_gaussians: densification stops there; None: 10 a step, and at least twice the first points.
-        growth: share of the steps over which the limit rises to that, evenly, from the first points; 0 sets it at
-            once. In [0, 1].
-        max_bytes: bound for the working memory of a render, see :class:`GaussianRenderer`; it changes
-            rounding alone.
+        drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
+        drop_by: random is the method. The others drop by scores, for comparison: the Gaussians with the highest or
+            lowest mean gradient, those nearest to or farthest from the camera.
+        opacity_l1: weight of the L1 penalty on opacities; 0 leaves it out.
+        opacity_l1_by: the penalty is heavier on Gaussians with a low mean gradient, or at a great distance.
+        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3.
+        coarse: share of the steps, the first ones, that see the training views at half their width; in [0, 1].
+        seed: everything random derives from it: first points, order of views, splits and masks.
+        init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
+            view. sift: from matches of their keypoints. random: where at least two images see. scene: the random points
+            that Blender's layout prescribes. model-points: those of a COLMAP model, refined with the test views too.
+            file: those of init_file.
+        init_file: a point cloud (PLY, OBJ, ...) for the init "file".
+        init_points: how many first points random gives, and dense at most.
+        max_gaussians: densification stops at this number; unless given 10 per step, and at least twice the first
+            points.
+        growth: share of the steps over which the limit rises evenly from the first points to max_gaussians; 0 sets it
+            at once. In [0, 1].
+        max_bytes: bound for the working memory of a render in bytes; it changes rounding alone.
         evaluations: how often the curve is measured, the last time at the end.
-        device: "cpu", "cuda", ...
+        device: cpu, cuda, cuda:1, ...
         recipe: all the other numbers.
+
+    Raises:
+        ValueError: an entry is out of range or of another kind; the message begins with its name.
     """
 
-    steps: int = 2000
-    drop: float = 0.2
-    drop_schedule: str = "linear"
-    drop_by: str = "random"
-    opacity_l1: float = 0.0
-    opacity_l1_by: str = "gradient"
-    sh_degree: int = 3
-    coarse: float = 0.0
-    seed: int = 0
-    init: str = "dense"
+    steps: _Steps = 2000
+    drop: Annotated[float, _Range(0, 1, "[)")] = 0.2
+    drop_schedule: Literal["linear", "constant"] = "linear"
+    drop_by: Literal["random", "high-gradient", "low-gradient", "near", "far"] = "random"
+    opacity_l1: _Weight = 0.0
+    opacity_l1_by: Literal["gradient", "distance"] = "gradient"
+    sh_degree: Annotated[int, _Range(0, 3)] = 3
+    coarse: _Share = 0.0
+    seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed is one of torch's
+    init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"
     init_file: Path | None = None
-    init_points: int = 10_000
-    max_gaussians: int | None = None
-    growth: float = 0.0
-    max_bytes: int = 2**30
-    evaluations: int = 8
+    init_points: Annotated[int, _Range(1, 10**9)] = 10_000
+    max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
+    growth: _Share = 0.0
+    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30
+    evaluations: _Steps = 8
     device: str = "cpu"
     recipe: Recipe = field(default_factory=Recipe)
 
     def __post_init__(self) -> None:
-        _check_types(self)
-        for name in ("steps", "evaluations"):
-            if not 1 <= getattr(self, name) <= _MOST_STEPS:
-                raise ValueError(f"{name}: expected at least 1 and at most {_MOST_STEPS}, got {getattr(self, name)}")
-        if not isinstance(self.max_gaussians, int | None):
-            raise ValueError(f"max_gaussians: expected a whole number, got {self.max_gaussians!r}")
-        if abs(self.seed) >= _SEEDS:
-            raise ValueError(f"seed: expected a number below 2^59, got {self.seed}")
-        if not 0.0 <= self.drop < 1.0:
-            raise ValueError(f"drop: expected a rate in [0, 1), got {self.drop}")
-        for name, choices in (("drop_by", _DROP_BY), ("opacity_l1_by", _OPACITY_L1_BY)):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name}: expected one of {list(choices)}, got {getattr(self, name)!r}")
-        if self.opacity_l1 < 0.0:
-            raise ValueError(f"opacity_l1: expected a weight of at least 0, got {self.opacity_l1}")
-        for name in ("coarse", "growth"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")
-        for name in ("init_points", "max_bytes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
+        _check(self)
+        if (self.init == "file") != (self.init_file is not None):
+            wanted = "a point cloud for" if self.init == "file" else "none without"
+            raise ValueError(f'init_file: expected {wanted} the init "file", got {self.init_file}')
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers as plain values, for JSON and checkpoints."""
-        values = asdict(self)
-        values["init_file"] = None if self.init_file is None else str(self.init_file)
-        return values
+        return asdict(self) | {"init_file": None if self.init_file is None else str(self.init_file)}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> FitConfig:
@@ -161,28 +166,22 @@ class FitConfig:
         Raises:
             ValueError: an entry is unknown or out of range.
         """
-        if not isinstance(values, dict) or not isinstance(values.get("recipe", {}), dict):
-            raise ValueError("values: expected the entries of a FitConfig, got others")
-        init_file = values.get("init_file")
-        if not isinstance(init_file, str | None):
-            raise ValueError(f"init_file: expected a path, got {init_file!r}")
         try:
-            recipe = Recipe(**values.get("recipe", {}))
-            return cls(**{**values, "init_file": None if init_file is None else Path(init_file), "recipe": recipe})
-        except TypeError as error:
+            return cls(**{**values, "recipe": Recipe(**values.get("recipe", {}))})
+        except (AttributeError, TypeError) as error:
             raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
 
 
 @dataclass(frozen=True)
 class Timetable:
-    """The iterations at which things happen in a fit of a given length.
+    """The steps at which things happen in a fit of a given length.
 
     Args:
         sh: before these steps one more degree of harmonics is switched on.
         densify: after these steps Gaussians are cloned, split and pruned.
         reset: after these steps all opacities are lowered.
         evaluate: after these steps the curve is measured (before a densification).
-        coarse: up to this step the training views are seen in half the pixels a side.
+        coarse: up to this step the training views are seen at half their width.
     """
 
     sh: tuple[int, ...]
@@ -214,18 +213,50 @@ def timetable(config: FitConfig) -> Timetable:
     )
 
 
-def _check_types(config: FitConfig | Recipe) -> None:
-    """Raise a ValueError where an entry is not of its default's kind: a whole number, a finite number or a text."""
+def usable_device(name: str) -> torch.device:
+    """The device of that name, after a number was written to it and read again.
+
+    Raises:
+        ValueError: torch knows no such device, or it cannot be used here.
+    """
+    try:
+        device = torch.device(name)
+        torch.ones(1, device=device).item()
+    except (AssertionError, NotImplementedError, RuntimeError) as error:  # torch has one for each reason
+        reason = str(error).split("\n")[0][:100]
+        raise ValueError(f"device: expected one that can be used here, got {name!r} ({reason})") from error
+    return device
+
+
+@lru_cache
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls, include_extras=True)
+
+
+def _check(config: FitConfig | Recipe) -> None:
+    """Hold each entry against its annotation; NumPy's numbers and paths given as text become Python's own."""
     for entry in fields(config):
-        value, default = getattr(config, entry.name), entry.default
-        if isinstance(default, float):
-            is_right = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
-        elif isinstance(default, int):
-            is_right = type(value) is int and abs(value) < 2**62
-        else:
-            is_right = not isinstance(default, str) or isinstance(value, str)
-        if not is_right:
-            raise ValueError(f"{entry.name}: expected a value like {default!r}, got {str(value)[:60]!r}")
+        value, hint = getattr(config, entry.name), _hints(type(config))[entry.name]
+        plain, expected = _plain(value, hint)
+        if plain is None and value is not entry.default:
+            raise ValueError(f"{entry.name}: expected {expected}, got {str(value)[:60]!r}")
+        object.__setattr__(config, entry.name, plain)
+
+
+def _plain(value: Any, hint: Any) -> tuple[Any, str]:
+    """The value as the hint has it, None where it does not fit; and what the hint expects, in words."""
+    if get_origin(hint) is Literal:
+        return value if isinstance(value, str) and value in get_args(hint) else None, f"one of {list(get_args(hint))}"
+    if get_origin(hint) is not Annotated:
+        if hint == Path | None:
+            return Path(value) if isinstance(value, (str, PathLike)) and str(value) else None, "a path"
+        return value if isinstance(value, hint) else None, "a name" if hint is str else f"a {hint.__name__}"
+    kind, limits = get_args(hint)
+    is_whole = kind is not float
+    expected = f"a {'whole' if is_whole else 'finite'} number {limits}"
+    if isinstance(value, bool) or not isinstance(value, Integral if is_whole else Real) or not limits.holds(value):
+        return None, expected
+    return int(value) if is_whole else float(value), expected
 
 
 # A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps at twice the

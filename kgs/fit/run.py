@@ -24,12 +24,12 @@ from .figures import write_curve
 from .lpips import Lpips
 from .metrics import evaluate
 from .outputs import check_folder, png_names, remove_others, run_metrics, write_json, write_png
+from .settings import CHECKPOINT
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
 __all__ = ["CHECKPOINT", "choose_points", "fit_scene", "measure", "train"]
 
-CHECKPOINT = "checkpoint.pt"
 _SAVE_SECONDS = 60.0
 
 

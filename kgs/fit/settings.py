@@ -1,16 +1,27 @@
-"""The config.json of a fit: how its scene was loaded and what it was asked to do."""
+"""A fit as its folder has it: how its scene was loaded, what it was asked to do, and the Gaussians."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
 from kgs.errors import DataError
 from kgs.json_files import read_json
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
 
+from .checkpoint import newest_checkpoint
 from .config import FitConfig
+from .trainer import move_camera
 
-__all__ = ["read_settings"]
+__all__ = ["CHECKPOINT", "SavedFit", "load_fit", "read_settings"]
+
+CHECKPOINT = "checkpoint.pt"
 
 _CHOICES: dict[str, tuple[Any, ...]] = {"background": ("black", "white"), "points": ("none", "model-points")}
 
@@ -48,3 +59,46 @@ def _is_downscale(value: Any) -> bool:
     if value is None:
         return True
     return isinstance(value, (int, float)) and not isinstance(value, bool) and 1 <= value < 1e300
+
+
+@dataclass(frozen=True)
+class SavedFit:
+    """A fit for pictures and measures, without what training needs.
+
+    Args:
+        request: the arguments of `load_scene`, see :func:`read_settings`.
+        config: what the fit was asked to do.
+        model: the Gaussians, in the frame of the scene (world coordinates less `Scene.offset`).
+        near_plane: that of the fit's renders, in world units.
+        step: how many steps are done.
+    """
+
+    request: dict[str, Any]
+    config: FitConfig
+    model: GaussianModel
+    near_plane: float
+    step: int
+
+    @torch.no_grad()
+    def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
+        """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
+        renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=self.config.max_bytes).eval()
+        device = self.model.means.device
+        image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
+        return image
+
+
+def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
+    """Read what a fit left in its folder, without optimiser, densifier and the scene.
+
+    Raises:
+        DataError: config.json or the checkpoint is missing or damaged.
+    """
+    request, config = read_settings(out / "config.json")
+    path = out / CHECKPOINT
+    state, _ = newest_checkpoint(path)
+    try:
+        model = GaussianModel(**state["model"], sh_degree=state["sh_degree"]).to(device)
+        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error

@@ -144,34 +144,45 @@ class Trainer:
                 changed by that step, and the error names the last good checkpoint.
         """
         while self.step < self.config.steps:
-            start = time.perf_counter()
-            loss = self._train_step()
-            step = self.step
-            self.seconds += time.perf_counter() - start
-            if step in self.times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
-                self.curve.append(
-                    {
-                        "step": step,
-                        "seconds": round(self.seconds, 3),
-                        "test_psnr": self.psnr(self.scene.test),
-                        "train_psnr": self.psnr(self.scene.train),
-                    }
-                )
-            start = time.perf_counter()
-            if step in self.times.densify:
-                self._stop_if(scale_fault(self.model, self.extent))
-                self.densifier.max_gaussians = limit = self._limit()
-                capped = self.densifier.step().capped
-                if capped and limit == self.max_gaussians and not any("max_gaussians" in note for note in self.notes):
-                    self.notes.append(
-                        f"step {step}: {capped} Gaussians were not densified, to keep their number at "
-                        f"max_gaussians = {self.max_gaussians}; raise it with --max-gaussians"
-                    )
-            if step in self.times.reset:
-                self.densifier.reset_opacity(self.config.recipe.reset_opacity)
-            self.seconds += time.perf_counter() - start
+            loss = self.train_step()
             if callback is not None and callback(self, loss):
                 return
+
+    def train_step(self) -> float:
+        """One step and all that is due after it: a point of the curve, a densification, a reset of the opacities.
+
+        Returns:
+            The loss.
+
+        Raises:
+            TrainingDiverged: see :meth:`fit`.
+            ValueError: all steps of the configuration are done.
+        """
+        if self.step >= self.config.steps:
+            raise ValueError(f"steps: expected a step of {self.config.steps} to be left, got none")
+        start = time.perf_counter()
+        loss = self._descend()
+        step = self.step
+        self.seconds += time.perf_counter() - start
+        if step in self.times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
+            point = {"step": step, "seconds": round(self.seconds, 3)}
+            self.curve.append(
+                point | {"test_psnr": self.psnr(self.scene.test), "train_psnr": self.psnr(self.scene.train)}
+            )
+        start = time.perf_counter()
+        if step in self.times.densify:
+            self._stop_if(scale_fault(self.model, self.extent))
+            self.densifier.max_gaussians = limit = self._limit()
+            capped = self.densifier.step().capped
+            if capped and limit == self.max_gaussians and not any("max_gaussians" in note for note in self.notes):
+                self.notes.append(
+                    f"step {step}: {capped} Gaussians were not densified, to keep their number at "
+                    f"max_gaussians = {self.max_gaussians}; raise it with --max-gaussians"
+                )
+        if step in self.times.reset:
+            self.densifier.reset_opacity(self.config.recipe.reset_opacity)
+        self.seconds += time.perf_counter() - start
+        return loss
 
     def render(self, camera: PinholeCamera) -> Tensor:
         """All Gaussians from one camera, `(1, 3, H, W)`; what `evaluate` wants."""
@@ -228,7 +239,7 @@ class Trainer:
             trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         return trainer
 
-    def _train_step(self) -> float:
+    def _descend(self) -> float:
         config, recipe = self.config, self.config.recipe
         self.step += 1
         progress = self.step / config.steps
