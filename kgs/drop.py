@@ -4,14 +4,15 @@ Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sp
 CVPR 2025: o_i <- M_i o_i with M_i = 1/(1 - r) for kept and 0 for dropped Gaussians, r_t = gamma t / T.
 
 The layer needs nothing but torch and fits any splatting pipeline: put it between the activated opacities and the
-rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render. That of
-a subset chosen by scores (`DropGaussian.scores`, for the paper's comparison) is not.
+rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render.
 """
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Callable
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -29,16 +30,17 @@ def drop_gaussian(
     an opacity of 0.5). The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
 
     Args:
-        opacities: activated opacities of any shape; each element is drawn on its own. `(N,)` gives one mask for all
-            cameras, `(C, N)` one a camera.
+        opacities: activated opacities of any shape and floating point dtype; each element is drawn on its own. `(N,)`
+            gives one mask for all cameras, `(C, N)` one per camera.
         p: the drop rate, in [0, 1).
         training: if False, the same tensor object comes back.
-        generator: a generator on the device of `opacities`; None takes torch's default one.
+        generator: draws the mask on its own device, whatever that of `opacities`; None takes torch's default one.
 
     Returns:
         A tensor like `opacities`; the same object where nothing is to be dropped (p = 0 or not training).
 
     Raises:
+        TypeError: `opacities` is no floating point tensor.
         ValueError: p is outside [0, 1). The rate 1 is refused, other than in `nn.Dropout`: it would leave no image.
 
     Example:
@@ -49,10 +51,12 @@ def drop_gaussian(
     _check_rate("p", p)
     if not training or p == 0.0:
         return opacities
+    if not isinstance(opacities, Tensor) or not opacities.is_floating_point():
+        raise TypeError(f"opacities: expected a floating point tensor, got {getattr(opacities, 'dtype', opacities)!r}")
     if generator is None:
         return nn.functional.dropout(opacities, p, training=True)
-    mask = torch.empty_like(opacities).bernoulli_(1.0 - p, generator=generator).div_(1.0 - p)
-    return opacities * mask
+    mask = torch.empty_like(opacities, device=generator.device).bernoulli_(1.0 - p, generator=generator).div_(1.0 - p)
+    return opacities * mask.to(opacities.device)
 
 
 def linear(progress: float) -> float:
@@ -72,21 +76,24 @@ class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
     The rate of a call is `p * schedule(progress)`. `progress` is a plain attribute in [0, 1] that the training loop
-    sets; it defaults to 1, so that a layer whose progress is never set is plain dropout at p.
+    sets; it defaults to 1, so that a layer whose progress is never set is plain dropout at p. The `state_dict` is
+    empty, whatever is assigned to the layer.
 
-    `scores` is a plain attribute too, None unless set: a tensor of the shape of the opacities. With it nothing is
-    random: the call drops the share of the rate with the highest scores, of each camera's row in `(C, N)`, and scales
-    the rest by 1/(1 - rate) as ever. It stays until it is replaced; the layer does not know what the scores mean.
+    A layer warns once if its progress was never set, and once if opacities on the CPU lie outside [0, 1]: those are
+    probably logits.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
         seed: None draws from torch's default generator of the tensor's device, as `nn.Dropout` does. An integer gives
-            the layer a stream of its own, kept through `.to`, deepcopy and pickle; such a layer must not run inside
-            `torch.utils.checkpoint`, which restores only the default generators before it recomputes.
+            the layer a stream of its own, the same on every device, kept through `.to`, deepcopy and pickle. The
+            replicas of `nn.DataParallel` get streams that are drawn from it; in `DistributedDataParallel` give each
+            rank another seed. Such a layer must not run inside `torch.utils.checkpoint`, which restores only the
+            default generators before it recomputes.
 
     Raises:
-        ValueError: p or the resulting rate is outside [0, 1), or the schedule's name is unknown.
+        ValueError: p or the resulting rate is outside [0, 1), the schedule's name is unknown, or the seed is no integer
+            from -2^63 to 2^64 - 1.
 
     Example:
         >>> drop = DropGaussian(p=0.2)
@@ -106,13 +113,16 @@ class DropGaussian(nn.Module):
             raise ValueError(f"schedule: expected one of {sorted(SCHEDULES)} or a callable, got {schedule!r}")
         if not isinstance(schedule, str) and not callable(schedule):
             raise ValueError(f"schedule: expected a name or a callable, got {schedule!r}")
+        integer = isinstance(seed, Integral) and not isinstance(seed, bool)
+        if seed is not None and not (integer and -(2**63) <= seed < 2**64):
+            raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = float(p)
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
         self.seed = seed
-        self.scores: Tensor | None = None
         self._progress: float | None = None
-        self._warned = False
-        self._generator: torch.Generator | None = None
+        # Objects, not values: shallow copies such as the replicas of nn.DataParallel share and advance them.
+        self._warned: set[str] = set()
+        self._stream = None if seed is None else torch.Generator("cpu").manual_seed(int(seed))
 
     @property
     def progress(self) -> float:
@@ -121,8 +131,8 @@ class DropGaussian(nn.Module):
 
     @progress.setter
     def progress(self, value: float) -> None:
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"progress: expected a number in [0, 1], got {value}")
+        if not isinstance(value, Real | Tensor) or not 0.0 <= value <= 1.0:
+            raise ValueError(f"progress: expected a number in [0, 1], got {value!r}")
         self._progress = float(value)
 
     @property
@@ -133,41 +143,38 @@ class DropGaussian(nn.Module):
         return rate
 
     def forward(self, opacities: Tensor) -> Tensor:
-        """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`.
-
-        Raises:
-            ValueError: `scores` is set and has another shape than `opacities`.
-        """
+        """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
         if not self.training:
             return opacities
-        if self._progress is None and not self._warned and self.schedule is not constant:
-            self._warned = True
-            warnings.warn(
+        if self._progress is None and self.schedule is not constant:
+            self._warn_once(
+                "progress",
                 f"DropGaussian: progress was never set, so the schedule has no effect and the rate is {self.rate:g} "
                 "throughout; set `drop.progress = step / total_steps` in the loop, or schedule='constant'",
-                stacklevel=2,
             )
-        if self.scores is not None:
-            return _drop_highest(opacities, self.scores, self.rate)
-        generator = None if self.seed is None else self._own_generator(opacities.device)
-        return drop_gaussian(opacities, self.rate, True, generator)
+        dropped = drop_gaussian(opacities, self.rate, True, self._stream)
+        if "values" not in self._warned and opacities.device.type == "cpu" and not torch.compiler.is_compiling():
+            with contextlib.suppress(RuntimeError, IndexError):  # none, or inside vmap: no values to look at
+                low, high = opacities.detach().aminmax()
+                if low < 0 or high > 1:
+                    self._warn_once(
+                        "values",
+                        f"DropGaussian: expected opacities in [0, 1], got {low:.3g} to {high:.3g}; the layer belongs "
+                        "behind their activation (sigmoid), not on logits",
+                    )
+        return dropped
 
     def get_rng_state(self) -> Tensor:
-        """The state of the layer's own generator, for a checkpoint.
+        """The state of the layer's own stream, a tensor on the CPU, for a checkpoint.
 
         Raises:
-            ValueError: the layer has no generator of its own (seed is None).
+            ValueError: the layer has no stream of its own (seed is None).
         """
-        if self.seed is None:
-            raise ValueError("seed: expected an integer to have a state of one's own, got None")
-        device = torch.device("cpu") if self._generator is None else self._generator.device
-        return self._own_generator(device).get_state()
+        return self._own_stream().get_state()
 
-    def set_rng_state(self, state: Tensor, device: torch.device | str = "cpu") -> None:
-        """Continue the stream that `get_rng_state` saw, on the device where the opacities will be."""
-        if self.seed is None:
-            raise ValueError("seed: expected an integer to have a state of one's own, got None")
-        self._own_generator(torch.device(device)).set_state(state)
+    def set_rng_state(self, state: Tensor) -> None:
+        """Continue the stream that `get_rng_state` saw, on whatever device the opacities are now."""
+        self._own_stream().set_state(state.cpu())
 
     def extra_repr(self) -> str:
         """What `print` shows."""
@@ -176,37 +183,27 @@ class DropGaussian(nn.Module):
         seed = "" if self.seed is None else f", seed={self.seed}"
         return f"p={self.p:g}, schedule={name}, progress={progress}{seed}"
 
-    def _own_generator(self, device: torch.device) -> torch.Generator:
-        if self._generator is None or self._generator.device != device:
-            self._generator = torch.Generator(device).manual_seed(self.seed or 0)
-        return self._generator
+    def _own_stream(self) -> torch.Generator:
+        if self._stream is None:
+            raise ValueError("seed: expected an integer to have a state of one's own, got None")
+        return self._stream
 
-    def __getstate__(self) -> dict[str, Any]:
-        state = self.__dict__.copy()
-        if self._generator is not None:
-            state["_generator"] = (str(self._generator.device), self._generator.get_state())
-        return state
+    def _warn_once(self, kind: str, message: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
+            warnings.warn(message, stacklevel=3)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        if isinstance(state["_generator"], tuple):
-            device, generator_state = state["_generator"]
-            self._generator = torch.Generator(device)
-            self._generator.set_state(generator_state)
+    def _replicate_for_data_parallel(self) -> DropGaussian:
+        replica: DropGaussian = super()._replicate_for_data_parallel()
+        if self._stream is not None and self.training:  # in order here; the replicas' threads would race for one stream
+            seed = int(torch.randint(2**62, (), generator=self._stream, device="cpu"))
+            replica._stream = torch.Generator("cpu").manual_seed(seed)
+        return replica
 
-
-def _drop_highest(opacities: Tensor, scores: Tensor, rate: float) -> Tensor:
-    """Without randomness: the round(rate N) highest scores go; of equal ones the first."""
-    if scores.shape != opacities.shape:
-        raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
-    if rate == 0.0:
-        return opacities
-    rows = scores.reshape(-1, scores.shape[-1]) if scores.ndim > 1 and scores.shape[-1] > 1 else scores.reshape(1, -1)
-    dropped = rows.argsort(dim=1, descending=True, stable=True)[:, : round(rate * rows.shape[1])]
-    mask = torch.full_like(rows, 1.0 / (1.0 - rate), dtype=opacities.dtype).scatter_(1, dropped, 0.0)
-    return opacities * mask.reshape(opacities.shape)
+    def __setattr__(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value.detach() if isinstance(value, Tensor) else value)
 
 
 def _check_rate(name: str, rate: float) -> None:
-    if not 0.0 <= rate < 1.0:
-        raise ValueError(f"{name}: expected a rate in [0, 1), got {rate}")
+    if not isinstance(rate, Real | Tensor) or not 0.0 <= rate < 1.0:
+        raise ValueError(f"{name}: expected a rate in [0, 1), got {rate!r}")

@@ -12,12 +12,12 @@ from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
-from kgs import GaussianModel, Gaussians, PosedCamera, ProjectedGaussians
+from kgs import DropGaussian, GaussianModel, Gaussians, PosedCamera, ProjectedGaussians
 from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "footprints", "join", "leaves", "one_gaussian", "pinhole"]
 __all__ += ["posed", "random_camera", "random_gaussians", "random_model", "random_scene", "random_views", "replace"]
-__all__ += ["select", "with_camera", "wide_footprints"]
+__all__ += ["drop_layer", "random_opacities", "select", "with_camera", "wide_footprints"]
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -233,6 +233,21 @@ def wide_footprints(
     m = len(opacities)
     factors = torch.eye(2, 3, dtype=dtype).mul(1e9).expand(m, 2, 3)
     return footprints(torch.zeros(m, 2, dtype=dtype), factors, opacities, size, 0.0, **changes)
+
+
+# -- the layer -----------------------------------------------------------------------------------------------------
+
+
+def random_opacities(n: int = 1000, dtype: torch.dtype = torch.float32, seed: int = 0) -> Tensor:
+    """Uniform in [0, 1)."""
+    return torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def drop_layer(progress: float, **options: Any) -> DropGaussian:
+    """The layer at some progress, in `train()`."""
+    layer = DropGaussian(**options)
+    layer.progress = progress
+    return layer
 
 
 # -- models and views ----------------------------------------------------------------------------------------------

@@ -1,31 +1,20 @@
-"""DropGaussian against `torch.nn.Dropout`, exact enumeration of its masks, and closed forms of binomial statistics."""
+"""DropGaussian against `torch.nn.Dropout`: what it does to values and gradients, its rates and its warnings."""
 
 import copy
-import io
-import itertools
 import math
-import pickle
 import warnings
 
 import pytest
 import torch
+from factories import drop_layer as at
+from factories import random_opacities as draw
 from torch import nn
-from torch.utils.checkpoint import checkpoint
 
 import kgs
 from kgs import DropGaussian, drop_gaussian
 
-BAD_RATES = [-0.1, 1, 1.0, 1.5, math.inf, -math.inf, math.nan]
-
-
-def draw(n=1000, dtype=torch.float32, seed=0):
-    return torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
-def at(progress, **options):
-    layer = DropGaussian(**options)
-    layer.progress = progress
-    return layer
+CPU = {"device": "cpu", "dtype": torch.float32}
+BAD_RATES = [-0.1, 1, 1.0, 1.5, math.inf, -math.inf, math.nan, "0.2", None]
 
 
 def halved(progress):
@@ -117,217 +106,45 @@ def test_the_layer_adds_nothing_to_the_state_dict():
     nn.Sequential(nn.Linear(1, 1), layer).load_state_dict(nn.Sequential(nn.Linear(1, 1), nn.Identity()).state_dict())
 
 
-def test_activation_checkpointing_recomputes_the_same_mask():
-    layer = at(1.0, p=0.5)
-    weight = draw(seed=2).requires_grad_()
-
-    def loss(x):
-        return (layer(x.sigmoid()) * weight).square().sum()
-
-    gradients = []
-    for reentrant in (None, False, True):
-        x = draw(seed=1).requires_grad_()
-        weight.grad = None
-        torch.manual_seed(7)
-        (loss(x) if reentrant is None else checkpoint(loss, x, use_reentrant=reentrant)).backward()
-        gradients.append((x.grad, weight.grad))
-    for x_grad, weight_grad in gradients[1:]:
-        assert torch.equal(x_grad, gradients[0][0])
-        assert torch.equal(weight_grad, gradients[0][1])
-
-
-def _compiled(backend):
-    torch._dynamo.reset()
-    layer = DropGaussian(p=0.4)
-    step = torch.compile(lambda x: layer(x) * 2, backend=backend)
-    outputs = []
-    for progress in (0.25, 0.5, 1.0):
-        layer.progress = progress
-        x = torch.ones(20_000, requires_grad=True)
-        out = step(x)
-        out.sum().backward()
-        outputs.append((0.4 * progress, out.detach(), x.grad))
-    layer.eval()
-    return outputs, torch.equal(step(torch.ones(8)), torch.full((8,), 2.0))
-
-
-def _check_compiled(backend):
-    outputs, identity_in_eval = _compiled(backend)
-    for rate, out, grad in outputs:
-        kept = out != 0
-        torch.testing.assert_close(out[kept], torch.full_like(out[kept], 2 / (1 - rate)))
-        torch.testing.assert_close(grad, out)
-        assert abs(kept.double().mean() - (1 - rate)) < 5 * math.sqrt(rate * (1 - rate) / len(out))
-    assert identity_in_eval
-
-
-def test_torch_compile_follows_the_progress():
-    _check_compiled("eager")
-
-
-@pytest.mark.slow
-def test_torch_compile_with_inductor_follows_the_progress():
-    try:
-        torch.compile(lambda x: x + 1)(torch.ones(2))
-    except Exception as error:
-        pytest.skip(f"no compiler works here: {type(error).__name__}")
-    _check_compiled("inductor")
-
-
-# -- a stream of its own -------------------------------------------------------------------------------------------
-
-
-def stream(layer, calls=3):
-    return torch.stack([layer(draw()) for _ in range(calls)])
-
-
-def test_own_stream_is_repeatable_and_advances():
-    first = stream(at(1.0, p=0.5, seed=3))
-    assert torch.equal(first, stream(at(1.0, p=0.5, seed=3)))
-    assert not torch.equal(first[0], first[1])
-    assert not torch.equal(first, stream(at(1.0, p=0.5, seed=4)))
-
-
-@pytest.mark.parametrize("seed", [0, 3, -1, 2**63])
-def test_own_stream_and_the_global_one_do_not_touch(seed):
-    torch.manual_seed(0)
-    first = stream(at(1.0, p=0.5, seed=seed))
-    torch.manual_seed(1)
-    before = torch.get_rng_state()
-    assert torch.equal(stream(at(1.0, p=0.5, seed=seed)), first)
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_own_stream_does_not_depend_on_the_number_of_threads():
-    threads = torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            torch.manual_seed(0)
-            results.append((at(1.0, p=0.5, seed=3)(draw(100_000)), at(1.0, p=0.5)(draw(100_000))))
-    finally:
-        torch.set_num_threads(threads)
-    for own, default in results[1:]:
-        assert torch.equal(own, results[0][0])
-        assert torch.equal(default, results[0][1])
-
-
-def _through_pickle(layer):
-    return pickle.loads(pickle.dumps(layer))
-
-
-def _through_torch_save(layer):
-    buffer = io.BytesIO()
-    torch.save(layer, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=False)
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, _through_pickle, _through_torch_save, lambda layer: layer.to("cpu")])
-@pytest.mark.parametrize("calls_before", [0, 2])
-@pytest.mark.parametrize("schedule", ["linear", "constant", halved])
-def test_copies_continue_the_stream(copied, calls_before, schedule):
-    layer = at(0.75, p=0.5, schedule=schedule, seed=3)
-    stream(layer, max(calls_before, 1)) if calls_before else None
-    twin = copied(layer)
-    if twin is not layer:
-        assert (twin.p, twin.progress, twin.rate, twin.seed) == (layer.p, layer.progress, layer.rate, layer.seed)
-        assert torch.equal(stream(twin), stream(layer))
-    else:
-        reference = at(0.75, p=0.5, schedule=schedule, seed=3)
-        stream(reference, calls_before) if calls_before else None
-        assert torch.equal(stream(twin), stream(reference))
-
-
-def test_a_deepcopy_draws_from_a_generator_of_its_own():
-    layer = at(1.0, p=0.5, seed=3)
-    stream(layer)
-    twin = copy.deepcopy(layer)
-    stream(twin, 5)
-    untouched = at(1.0, p=0.5, seed=3)
-    stream(untouched)
-    assert torch.equal(stream(layer), stream(untouched))
-
-
-def test_rng_state_continues_the_stream_in_another_layer():
-    layer = at(1.0, p=0.5, seed=3)
-    stream(layer)
-    state = layer.get_rng_state()
-    expected = stream(layer)
-    other = at(1.0, p=0.5, seed=99)
-    other.set_rng_state(state)
-    assert torch.equal(stream(other), expected)
-    layer.set_rng_state(state)
-    assert torch.equal(stream(layer), expected)
-
-
-def test_rng_state_before_the_first_call_is_the_seeds():
-    layer, other = at(1.0, p=0.5, seed=3), at(1.0, p=0.5, seed=4)
-    other.set_rng_state(layer.get_rng_state())
-    assert torch.equal(stream(other), stream(at(1.0, p=0.5, seed=3)))
-
-
-def test_a_layer_on_the_default_generator_has_no_state():
-    layer = DropGaussian()
-    with pytest.raises(ValueError, match="seed"):
-        layer.get_rng_state()
-    with pytest.raises(ValueError, match="seed"):
-        layer.set_rng_state(torch.get_rng_state())
-
-
-def test_the_functions_generator_argument_is_used():
-    x = draw()
-    first = drop_gaussian(x, 0.5, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(first, drop_gaussian(x, 0.5, generator=torch.Generator().manual_seed(1)))
-    assert not torch.equal(first, drop_gaussian(x, 0.5, generator=torch.Generator().manual_seed(2)))
-
-
-# -- statistics ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("value", [torch.ones(3), nn.Parameter(torch.ones(3)), torch.ones(3, requires_grad=True) * 2])
+def test_nothing_that_is_assigned_becomes_state(value):
+    layer = at(0.4, p=0.2, seed=3)
+    layer.note, layer.net = value, nn.Linear(1, 1)
+    assert layer.state_dict() == {}
+    assert list(layer.parameters()) == []
+    assert torch.equal(copy.deepcopy(layer).note, value)
 
 
 @pytest.mark.parametrize("seed", [None, 3])
-@pytest.mark.parametrize("p", [0.2, 0.7])
-def test_kept_fraction_and_mean_factor_lie_within_five_sigma(p, seed):
-    n = 1_000_000
-    torch.manual_seed(11)
-    factors = at(1.0, p=p, seed=seed)(torch.ones(n))
-    kept = (factors != 0).double().mean().item()
-    assert abs(kept - (1 - p)) < 5 * math.sqrt(p * (1 - p) / n)
-    assert abs(factors.double().mean().item() - 1) < 5 * math.sqrt(p / (1 - p) / n)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_stays_itself(dtype, seed):
+    out = at(1.0, p=0.5, seed=seed)(torch.full((1000,), 0.5, dtype=dtype))
+    assert out.dtype == dtype
+    assert set(out.tolist()) == {0.0, 1.0}
 
 
-def composite(opacities, weights, colors):
-    """Front-to-back alpha blending of one pixel: sum c_i a_i prod_{j<i} (1 - a_j)."""
-    color, light = torch.zeros(3, dtype=torch.float64), 1.0
-    for alpha, rgb in zip(opacities * weights, colors, strict=True):
-        color = color + light * alpha * rgb
-        light = light * (1 - alpha)
-    return color
+@pytest.mark.parametrize("seed", [None, 3])
+def test_default_device_default_dtype_and_autocast_do_not_reach_the_layer(seed):
+    torch.manual_seed(0)
+    expected = at(1.0, p=0.5, seed=seed)(draw())
+    try:
+        torch.set_default_device("meta")
+        torch.set_default_dtype(torch.float64)
+        torch.manual_seed(0)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            layer, x = at(1.0, p=0.5, seed=seed), torch.rand(1000, generator=torch.Generator().manual_seed(0), **CPU)
+            out = layer(x)
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(out, expected)
 
 
-def test_the_expectation_over_all_masks_is_the_undropped_pixel(monkeypatch):
-    n, p = 8, 0.2
-    opacities, weights = draw(n, torch.float64, 1) * 0.75, draw(n, torch.float64, 2)
-    colors = draw(3 * n, torch.float64, 3).reshape(n, 3)
-    expectation = torch.zeros(3, dtype=torch.float64)
-    for kept in itertools.product((0.0, 1.0), repeat=n):
-        mask = torch.tensor(kept, dtype=torch.float64)
-        monkeypatch.setattr(torch.Tensor, "bernoulli_", lambda self, q, generator, mask=mask: self.copy_(mask))
-        dropped = drop_gaussian(opacities, p, generator=torch.Generator())
-        probability = math.prod(1 - p if k else p for k in kept)
-        expectation += probability * composite(dropped, weights, colors)
-    torch.testing.assert_close(expectation, composite(opacities, weights, colors), rtol=0, atol=1e-14)
-
-
-def test_the_mean_of_many_random_pixels_is_the_undropped_pixel():
-    n, p, draws = 8, 0.2, 20_000
-    opacities, weights = draw(n, torch.float64, 1) * 0.75, draw(n, torch.float64, 2)
-    alphas = at(1.0, p=p, seed=0)(opacities.expand(draws, n)) * weights
-    light = torch.cumprod(torch.cat([torch.ones(draws, 1, dtype=torch.float64), 1 - alphas], 1), 1)
-    brightness = (light[:, :-1] * alphas).sum(1)
-    exact = composite(opacities, weights, torch.ones(n, 3, dtype=torch.float64))[0]
-    assert abs(brightness.mean() - exact) < 5 * brightness.std() / math.sqrt(draws)
+@pytest.mark.parametrize("seed", [None, 3])
+def test_other_than_floating_point_tensors_are_refused(seed):
+    for wrong in (torch.ones(3, dtype=torch.int64), [0.5, 0.5]):
+        with pytest.raises(TypeError, match="opacities: expected a floating point tensor"):
+            at(1.0, p=0.5, seed=seed)(wrong)
 
 
 # -- gradients -----------------------------------------------------------------------------------------------------
@@ -407,7 +224,7 @@ def test_unknown_schedules_are_refused(schedule):
         DropGaussian(schedule=schedule)
 
 
-@pytest.mark.parametrize("progress", [-1e-9, 1.0000001, 2, math.nan, math.inf])
+@pytest.mark.parametrize("progress", [-1e-9, 1.0000001, 2, math.nan, math.inf, "0.5", None])
 def test_progress_outside_zero_to_one_is_refused_and_the_old_one_stays(progress):
     layer = at(0.5)
     with pytest.raises(ValueError, match="progress"):
@@ -441,6 +258,34 @@ def test_the_warning_points_at_the_calling_line():
     with pytest.warns(UserWarning, match="never set") as caught:
         DropGaussian().forward(draw())
     assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("values", [[-2.2, 0.3], [0.5, 1.5], [math.inf, 0.1]])
+def test_logits_are_warned_about_once_for_each_layer(values, seed):
+    layer, x = at(1.0, seed=seed), torch.tensor(values)
+    with pytest.warns(UserWarning, match=r"expected opacities in \[0, 1\]"):
+        layer(x)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        layer(x)
+        layer._replicate_for_data_parallel()(x)
+        for fine in (torch.tensor([0.0, 1.0]), torch.empty(0), torch.tensor([math.nan]), torch.ones(2, device="meta")):
+            at(1.0, seed=seed)(fine)
+
+
+def test_replicas_share_the_warning_about_progress():
+    layer = DropGaussian()
+    with pytest.warns(UserWarning, match="never set"):
+        layer._replicate_for_data_parallel()(draw())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        layer._replicate_for_data_parallel()(draw())
+
+
+def test_vmap_draws_a_mask_for_each_sample():
+    out = torch.func.vmap(at(1.0, p=0.5), randomness="different")(torch.ones(2, 1000))
+    assert 300 < (out[0] != out[1]).sum() < 700
 
 
 def test_repr_says_what_will_happen():

@@ -1,4 +1,4 @@
-"""DropGaussian.scores: which Gaussians go when a selection replaces chance."""
+"""SelectiveDrop: which Gaussians go when a selection replaces chance."""
 
 import copy
 import pickle
@@ -6,11 +6,11 @@ import pickle
 import pytest
 import torch
 
-from kgs import DropGaussian
+from kgs.fit.scores import SelectiveDrop
 
 
 def layer(rate, scores):
-    drop = DropGaussian(p=rate, schedule="constant")
+    drop = SelectiveDrop(p=rate, schedule="constant")
     drop.scores = scores
     return drop
 
@@ -37,7 +37,7 @@ def test_the_number_is_the_rounded_share(rate, count):
 
 
 def test_it_follows_the_schedule():
-    drop = DropGaussian(p=0.5)
+    drop = SelectiveDrop(p=0.5)
     drop.scores = torch.arange(100.0)
     dropped = []
     for progress in (0.0, 0.5, 1.0):
@@ -67,7 +67,7 @@ def test_gradients_are_the_factor_or_zero():
 
 
 def test_scores_do_not_touch_the_stream_of_masks():
-    plain, scored = (DropGaussian(p=0.4, schedule="constant", seed=3) for _ in range(2))
+    plain, scored = (SelectiveDrop(p=0.4, schedule="constant", seed=3) for _ in range(2))
     scored.scores = torch.arange(50.0)
     scored(torch.ones(50))
     scored.scores = None
@@ -80,9 +80,13 @@ def test_scores_of_another_shape_are_refused(shape):
         layer(0.2, torch.zeros(shape))(torch.ones(5))
 
 
-def test_they_are_plain_attributes():
-    drop = layer(0.5, torch.arange(4.0))
+@pytest.mark.parametrize(
+    "scores", [torch.arange(4.0), torch.nn.Parameter(torch.arange(4.0)), torch.arange(4.0, requires_grad=True) * 2]
+)
+def test_they_are_plain_attributes_without_a_graph(scores):
+    drop = layer(0.5, scores)
     assert drop.state_dict() == {}
+    assert list(drop.parameters()) == []
     for twin in (copy.deepcopy(drop), pickle.loads(pickle.dumps(drop))):
         assert twin(torch.ones(4)).tolist() == [2.0, 2.0, 0.0, 0.0]
-    assert DropGaussian().scores is None
+    assert SelectiveDrop().scores is None

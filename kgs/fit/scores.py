@@ -6,14 +6,47 @@ distance" and defines none of them. These are this project's readings, in both d
 
 from __future__ import annotations
 
+import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.densify import Densifier
+from kgs.drop import DropGaussian
 
 from .starts.triangulate import camera_centers
 
-__all__ = ["gaussian_scores"]
+__all__ = ["SelectiveDrop", "gaussian_scores"]
+
+
+class SelectiveDrop(DropGaussian):
+    """`DropGaussian` that drops the Gaussians with the highest `scores` where it has scores, and is random without.
+
+    `scores` is a plain attribute: a tensor of the shape of the opacities that stays until it is replaced, or None. The
+    call drops the share of the rate with the highest scores, of each camera's row in `(C, N)`, equal ones in order,
+    and scales the rest by 1/(1 - rate). Unlike that of a random subset this render is no unbiased estimate.
+    """
+
+    scores: Tensor | None = None
+
+    def forward(self, opacities: Tensor) -> Tensor:
+        """Drop and rescale in `train()`, return `opacities` itself in `eval()`.
+
+        Raises:
+            ValueError: `scores` has another shape than `opacities`.
+        """
+        scores = self.scores
+        if not self.training or scores is None:
+            return super().forward(opacities)
+        if scores.shape != opacities.shape:
+            raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
+        rate = self.rate
+        if rate == 0.0:
+            return opacities
+        per_camera = scores.ndim > 1 and scores.shape[-1] > 1
+        rows = scores.reshape(-1, scores.shape[-1]) if per_camera else scores.reshape(1, -1)
+        dropped = rows.argsort(dim=1, descending=True, stable=True)[:, : round(rate * rows.shape[1])]
+        mask = torch.full_like(rows, 1.0 / (1.0 - rate), dtype=opacities.dtype).scatter_(1, dropped, 0.0)
+        return opacities * mask.reshape(opacities.shape)
 
 
 def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Tensor:

@@ -56,7 +56,7 @@ def restore(trainer: Trainer, state: dict[str, Any]) -> None:
     trainer.densifier.load_state_dict(state["densifier"])
     trainer.order.set_state(state["order"])
     if trainer.drop is not None:
-        trainer.drop.set_rng_state(state["drop"], trainer.device)
+        trainer.drop.set_rng_state(state["drop"])
     trainer.step, trainer.seconds = state["step"], state["seconds"]
     trainer.curve, trainer.notes, trainer.stack = state["curve"], state["notes"], state["stack"]
 

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
-from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged
 from kgs.losses import TargetMoments, opacity_l1, photometric_loss, target_moments
 from kgs.model import GaussianModel
@@ -28,7 +27,7 @@ from kgs.renderer import GaussianRenderer
 from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
-from .scores import gaussian_scores
+from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
 from .state import check_state, restore, trainer_state
 
@@ -95,7 +94,7 @@ class Trainer:
             for name, rate in _GROUPS.items()
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
-        self.drop = DropGaussian(config.drop, config.drop_schedule, seed=_seed(config, 1)) if config.drop else None
+        self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=_seed(config, 1)) if config.drop else None
         self.renderer = GaussianRenderer(self.drop, near_plane=near_plane, max_bytes=config.max_bytes).train()
         self.densifier = Densifier(
             self.model,

@@ -1,0 +1,241 @@
+"""DropGaussian's own stream of masks, and the statistics of masks against enumeration and binomial closed forms."""
+
+import copy
+import io
+import itertools
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from factories import drop_layer as at
+from factories import random_opacities as draw
+from torch import nn
+
+from kgs import DropGaussian, drop_gaussian
+
+
+def halved(progress):
+    return progress / 2
+
+
+# -- a stream of its own -------------------------------------------------------------------------------------------
+
+
+def stream(layer, calls=3):
+    return torch.stack([layer(draw()) for _ in range(calls)])
+
+
+def test_own_stream_is_repeatable_and_advances():
+    first = stream(at(1.0, p=0.5, seed=3))
+    assert torch.equal(first, stream(at(1.0, p=0.5, seed=3)))
+    assert not torch.equal(first[0], first[1])
+    assert not torch.equal(first, stream(at(1.0, p=0.5, seed=4)))
+
+
+@pytest.mark.parametrize("seed", [0, 3, -1, 2**63])
+def test_own_stream_and_the_global_one_do_not_touch(seed):
+    torch.manual_seed(0)
+    first = stream(at(1.0, p=0.5, seed=seed))
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    assert torch.equal(stream(at(1.0, p=0.5, seed=seed)), first)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_own_stream_does_not_depend_on_the_number_of_threads():
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            torch.manual_seed(0)
+            results.append((at(1.0, p=0.5, seed=3)(draw(100_000)), at(1.0, p=0.5)(draw(100_000))))
+    finally:
+        torch.set_num_threads(threads)
+    for own, default in results[1:]:
+        assert torch.equal(own, results[0][0])
+        assert torch.equal(default, results[0][1])
+
+
+def _through_pickle(layer):
+    return pickle.loads(pickle.dumps(layer))
+
+
+def _through_torch_save(layer):
+    buffer = io.BytesIO()
+    torch.save(layer, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=False)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, _through_pickle, _through_torch_save, lambda layer: layer.to("cpu")])
+@pytest.mark.parametrize("calls_before", [0, 2])
+@pytest.mark.parametrize("schedule", ["linear", "constant", halved])
+def test_copies_continue_the_stream(copied, calls_before, schedule):
+    layer = at(0.75, p=0.5, schedule=schedule, seed=3)
+    stream(layer, max(calls_before, 1)) if calls_before else None
+    twin = copied(layer)
+    if twin is not layer:
+        assert (twin.p, twin.progress, twin.rate, twin.seed) == (layer.p, layer.progress, layer.rate, layer.seed)
+        assert torch.equal(stream(twin), stream(layer))
+    else:
+        reference = at(0.75, p=0.5, schedule=schedule, seed=3)
+        stream(reference, calls_before) if calls_before else None
+        assert torch.equal(stream(twin), stream(reference))
+
+
+def test_a_deepcopy_draws_from_a_generator_of_its_own():
+    layer = at(1.0, p=0.5, seed=3)
+    stream(layer)
+    twin = copy.deepcopy(layer)
+    stream(twin, 5)
+    untouched = at(1.0, p=0.5, seed=3)
+    stream(untouched)
+    assert torch.equal(stream(layer), stream(untouched))
+
+
+def test_rng_state_continues_the_stream_in_another_layer():
+    layer = at(1.0, p=0.5, seed=3)
+    stream(layer)
+    state = layer.get_rng_state()
+    expected = stream(layer)
+    other = at(1.0, p=0.5, seed=99)
+    other.set_rng_state(state)
+    assert torch.equal(stream(other), expected)
+    layer.set_rng_state(state)
+    assert torch.equal(stream(layer), expected)
+
+
+def test_rng_state_before_the_first_call_is_the_seeds():
+    layer, other = at(1.0, p=0.5, seed=3), at(1.0, p=0.5, seed=4)
+    other.set_rng_state(layer.get_rng_state())
+    assert torch.equal(stream(other), stream(at(1.0, p=0.5, seed=3)))
+
+
+def test_a_layer_on_the_default_generator_has_no_state():
+    layer = DropGaussian()
+    with pytest.raises(ValueError, match="seed"):
+        layer.get_rng_state()
+    with pytest.raises(ValueError, match="seed"):
+        layer.set_rng_state(torch.get_rng_state())
+
+
+@pytest.mark.parametrize("seed", [1.5, "a", True, 2**64, -(2**63) - 1, torch.tensor(1)])
+def test_a_seed_that_is_none_is_refused_when_the_layer_is_made(seed):
+    with pytest.raises(ValueError, match="seed: expected None or an integer"):
+        DropGaussian(seed=seed)
+
+
+def test_a_numpy_seed_is_an_integer():
+    assert torch.equal(stream(at(1.0, p=0.5, seed=np.int64(3))), stream(at(1.0, p=0.5, seed=3)))
+
+
+@pytest.mark.parametrize("shape", [(1000,), (3, 50)])
+def test_the_stream_is_that_of_bernoulli_on_the_cpu_for_tensors_on_any_device(shape):
+    reference = torch.Generator().manual_seed(3)
+    expected = [torch.empty(shape).bernoulli_(0.8, generator=reference) / 0.8 for _ in range(3)]
+    layer = at(1.0, p=0.2, seed=3)
+    assert torch.equal(layer(torch.ones(shape)), expected[0])
+    assert layer(torch.ones(shape, device="meta")).device.type == "meta"  # stands for an accelerator
+    state = layer.get_rng_state()
+    assert state.device.type == "cpu"
+    layer.set_rng_state(state)
+    assert torch.equal(layer(torch.ones(shape)), expected[2])
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_stream_continues_from_cuda_to_the_cpu_and_back():
+    layer, reference = (at(1.0, p=0.5, seed=3) for _ in range(2))
+    for device in ("cuda", "cpu", "cuda"):
+        other = at(1.0, p=0.5, seed=9)
+        other.set_rng_state(layer.get_rng_state())
+        layer = other
+        assert torch.equal(layer(draw().to(device)).cpu(), reference(draw()))
+
+
+def shallow_copy(layer):
+    replica = layer.__new__(type(layer))
+    replica.__dict__ = layer.__dict__.copy()
+    return replica
+
+
+@pytest.mark.parametrize("replicate", [shallow_copy, copy.copy, DropGaussian._replicate_for_data_parallel])
+def test_replicas_made_for_each_call_draw_new_masks_that_differ(replicate):
+    def calls():
+        layer = nn.Sequential(at(1.0, p=0.5, seed=3))
+        return [replicate(layer[0])(draw()) for _ in range(3) for _ in range(2)]
+
+    masks = calls()
+    assert len({tuple(mask.tolist()) for mask in masks}) == 6
+    assert all(torch.equal(one, two) for one, two in zip(masks, calls(), strict=True))
+
+
+def test_replicas_may_run_in_any_order_and_those_in_eval_leave_the_stream_alone():
+    def step(layer, order):
+        replicas = [layer._replicate_for_data_parallel() for _ in range(2)]
+        masks = {i: replicas[i](draw()) for i in order}
+        return masks[0], masks[1]
+
+    one, two = (at(1.0, p=0.5, seed=3) for _ in range(2))
+    step(two.eval(), (0, 1))
+    two.train()
+    for order in ((0, 1), (1, 0)):
+        for a, b in zip(step(one, (0, 1)), step(two, order), strict=True):
+            assert torch.equal(a, b)
+
+
+def test_the_functions_generator_argument_is_used():
+    x = draw()
+    first = drop_gaussian(x, 0.5, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(first, drop_gaussian(x, 0.5, generator=torch.Generator().manual_seed(1)))
+    assert not torch.equal(first, drop_gaussian(x, 0.5, generator=torch.Generator().manual_seed(2)))
+
+
+# -- statistics ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("p", [0.2, 0.7])
+def test_kept_fraction_and_mean_factor_lie_within_five_sigma(p, seed):
+    n = 1_000_000
+    torch.manual_seed(11)
+    factors = at(1.0, p=p, seed=seed)(torch.ones(n))
+    kept = (factors != 0).double().mean().item()
+    assert abs(kept - (1 - p)) < 5 * math.sqrt(p * (1 - p) / n)
+    assert abs(factors.double().mean().item() - 1) < 5 * math.sqrt(p / (1 - p) / n)
+
+
+def composite(opacities, weights, colors):
+    """Front-to-back alpha blending of one pixel: sum c_i a_i prod_{j<i} (1 - a_j)."""
+    color, light = torch.zeros(3, dtype=torch.float64), 1.0
+    for alpha, rgb in zip(opacities * weights, colors, strict=True):
+        color = color + light * alpha * rgb
+        light = light * (1 - alpha)
+    return color
+
+
+def test_the_expectation_over_all_masks_is_the_undropped_pixel(monkeypatch):
+    n, p = 8, 0.2
+    opacities, weights = draw(n, torch.float64, 1) * 0.75, draw(n, torch.float64, 2)
+    colors = draw(3 * n, torch.float64, 3).reshape(n, 3)
+    expectation = torch.zeros(3, dtype=torch.float64)
+    for kept in itertools.product((0.0, 1.0), repeat=n):
+        mask = torch.tensor(kept, dtype=torch.float64)
+        monkeypatch.setattr(torch.Tensor, "bernoulli_", lambda self, q, generator, mask=mask: self.copy_(mask))
+        dropped = drop_gaussian(opacities, p, generator=torch.Generator())
+        probability = math.prod(1 - p if k else p for k in kept)
+        expectation += probability * composite(dropped, weights, colors)
+    torch.testing.assert_close(expectation, composite(opacities, weights, colors), rtol=0, atol=1e-14)
+
+
+def test_the_mean_of_many_random_pixels_is_the_undropped_pixel():
+    n, p, draws = 8, 0.2, 20_000
+    opacities, weights = draw(n, torch.float64, 1) * 0.75, draw(n, torch.float64, 2)
+    alphas = at(1.0, p=p, seed=0)(opacities.expand(draws, n)) * weights
+    light = torch.cumprod(torch.cat([torch.ones(draws, 1, dtype=torch.float64), 1 - alphas], 1), 1)
+    brightness = (light[:, :-1] * alphas).sum(1)
+    exact = composite(opacities, weights, torch.ones(n, 3, dtype=torch.float64))[0]
+    assert abs(brightness.mean() - exact) < 5 * brightness.std() / math.sqrt(draws)
