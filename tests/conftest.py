@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
 from kgs.datasets import synthetic_scene
 from kgs.fit.starts import FirstPoints

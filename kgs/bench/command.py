@@ -11,7 +11,7 @@ __all__ = ["bench"]
 
 
 def bench(
-    what: Literal["speed", "precision", "training", "sparse", "starts", "extremes", "hostile", "faults"],
+    what: Literal["speed", "precision", "training", "sparse", "starts", "extremes"],
     /,
     *,
     out: Annotated[Path, alias("-o")],
@@ -32,8 +32,6 @@ def bench(
             sparse: DropGaussian on and off, its schedules and rivals, and the starts (goes on where it stopped).
             starts: depth errors, completeness and times of first points (20 minutes).
             extremes: errors, bounds and times of stiff and extreme cases; exit code 1 where a bound is missed.
-            hostile: damaged files against every reader; exit code 1 where one is taken for sound.
-            faults: fits that are killed or whose disk is full; exit code 1 where anything is lost.
             With KGS_DATA, a folder of scenes, training, sparse and starts measure on real ones.
         out: folder for the results.
         quick: less of it, in about a minute; for sparse its preset of that name.
@@ -69,16 +67,8 @@ def bench(
         from .starts import measure_starts
 
         measure_starts(out, quick=quick)
-    elif what == "extremes":
+    else:
         from .extremes import measure_extremes
 
         return int(measure_extremes(out, quick=quick)["missed"] > 0)
-    elif what == "hostile":
-        from .hostile import measure_hostile
-
-        return int(bool(measure_hostile(out, quick=quick)["failures"]))
-    else:
-        from .faults import measure_faults
-
-        return int(measure_faults(out, quick=quick)["failed"] > 0)
     return 0

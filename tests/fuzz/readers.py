@@ -12,9 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from mutations import Mutator
 from torch import Tensor
-
-from .mutations import Mutator
 
 __all__ = ["Reader", "Target", "Unsound", "check_range", "inside_checkpoint", "inside_png", "inside_zip"]
 
@@ -29,7 +28,7 @@ class Target:
 
     Args:
         path: relative to the set's folder.
-        mutate: the damage, see `kgs.bench.mutations`.
+        mutate: the damage, see `mutations.py`.
     """
 
     path: str

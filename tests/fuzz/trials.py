@@ -16,18 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from readers import Reader
+
 from kgs.errors import DataError
-from kgs.fit.outputs import versions, write_json
 
-from .file_readers import FILE_READERS
-from .output import markdown_table, write_csv
-from .readers import Reader
-from .scene_readers import SCENE_READERS
+__all__ = ["Outcome", "is_cheap", "table_row", "try_reader"]
 
-__all__ = ["READERS", "Outcome", "measure_hostile", "try_reader"]
-
-READERS: tuple[Reader, ...] = (*SCENE_READERS, *FILE_READERS)
-_TRIALS, _QUICK_TRIALS = 1500, 100
 _SLOWEST, _MEMORY_FACTOR, _MEMORY = 1.0, 4, 64 * 2**20
 
 
@@ -48,33 +42,6 @@ class Outcome:
     seconds: float
     memory: int | None
     allowed: int
-
-
-def measure_hostile(out: Path, *, quick: bool = False, say: Callable[[str], None] = print) -> dict[str, Any]:
-    """Try damaged files on every reader, and write hostile.csv, hostile.json and hostile.md.
-
-    Args:
-        out: folder for the results, made if it is not there.
-        quick: fewer files, in 15 seconds instead of some 70.
-        say: where lines for the user go.
-
-    Returns:
-        What hostile.json holds: "rows", one a reader, and "failures", each trial that broke a rule, in words.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    rows, failures = [], []
-    for reader in READERS:
-        outcomes = try_reader(reader, range(round((_QUICK_TRIALS if quick else _TRIALS) * reader.share)))
-        rows.append(_row(reader, outcomes))
-        failures += [outcome.what for outcome in outcomes if outcome.kind == "other" or not _is_cheap(outcome)]
-        say(f"{reader.name}: {rows[-1]['tried']} tried, {rows[-1]['other']} other than sound or DataError")
-    total = {key: sum(row[key] for row in rows) for key in ("tried", "sound", "DataError", "other")}
-    result = {"rows": rows, "total": total, "failures": failures, "versions": versions()}
-    write_csv(out / "hostile.csv", rows)
-    write_json(out / "hostile.json", result)
-    (out / "hostile.md").write_text(table := _markdown(rows, total), encoding="utf-8")
-    say(table)
-    return result
 
 
 def try_reader(reader: Reader, seeds: Sequence[int]) -> list[Outcome]:
@@ -100,6 +67,27 @@ def try_reader(reader: Reader, seeds: Sequence[int]) -> list[Outcome]:
     return outcomes
 
 
+def is_cheap(outcome: Outcome) -> bool:
+    """Whether the read kept to the bounds of time and memory."""
+    return outcome.seconds < _SLOWEST and (outcome.memory or 0) < outcome.allowed
+
+
+def table_row(reader: Reader, outcomes: list[Outcome]) -> dict[str, Any]:
+    """What `tables.py` shows of one reader."""
+    kinds = [outcome.kind for outcome in outcomes]
+    memory = [outcome.memory for outcome in outcomes if outcome.memory is not None]
+    return {
+        "reader": reader.name,
+        "tried": len(outcomes),
+        "sound": kinds.count("sound"),
+        "DataError": kinds.count("refused"),
+        "other": kinds.count("other"),
+        "slowest_s": round(max(outcome.seconds for outcome in outcomes), 4),
+        "memory": max(memory, default=None),
+        "allowed": min(outcome.allowed for outcome in outcomes),
+    }
+
+
 def _try(reader: Reader, folder: Path, what: str) -> Outcome:
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     before, start, kind = _reset_peak(), time.perf_counter(), "sound"
@@ -116,51 +104,6 @@ def _try(reader: Reader, folder: Path, what: str) -> Outcome:
 
 def _time(outcome: Outcome) -> float:
     return outcome.seconds
-
-
-def _is_cheap(outcome: Outcome) -> bool:
-    return outcome.seconds < _SLOWEST and (outcome.memory or 0) < outcome.allowed
-
-
-def _row(reader: Reader, outcomes: list[Outcome]) -> dict[str, Any]:
-    kinds = [outcome.kind for outcome in outcomes]
-    memory = [outcome.memory for outcome in outcomes if outcome.memory is not None]
-    return {
-        "reader": reader.name,
-        "tried": len(outcomes),
-        "sound": kinds.count("sound"),
-        "DataError": kinds.count("refused"),
-        "other": kinds.count("other"),
-        "slowest_s": round(max(outcome.seconds for outcome in outcomes), 4),
-        "memory": max(memory, default=None),
-        "allowed": min(outcome.allowed for outcome in outcomes),
-    }
-
-
-def _markdown(rows: list[dict[str, Any]], total: dict[str, int]) -> str:
-    def mib(value: int | None) -> str:
-        return "not measured" if value is None else f"{value / 2**20:.1f}"
-
-    lines = [
-        [
-            r["reader"],
-            r["tried"],
-            r["sound"],
-            r["DataError"],
-            r["other"],
-            r["slowest_s"],
-            mib(r["memory"]),
-            mib(r["allowed"]),
-        ]
-        for r in rows
-    ]
-    memory = max((row["memory"] for row in rows if row["memory"] is not None), default=None)
-    lines.append(["all", *total.values(), max(row["slowest_s"] for row in rows), mib(memory), ""])
-    title = (
-        "Damaged files (seeded mutations of valid ones): loaded with sound numbers, refused with DataError, or other"
-    )
-    heads = ["tried", "loaded, sound", "DataError", "other", "slowest [s]", "memory [MiB]", "allowed [MiB]"]
-    return markdown_table(title, heads, lines, first="reader")
 
 
 def _reset_peak() -> int | None:

@@ -1,11 +1,13 @@
-"""The readers of scenes, each with a tiny valid scene: three photos of 16 x 12 pixels and one point."""
+"""Tiny valid scenes, one in each layout, and tiny valid files: what reader tests begin with.
+
+A scene has three photos of 16 x 12 pixels and, in a COLMAP model, two points.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import struct
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,14 @@ import cv2
 import numpy as np
 import torch
 
-from kgs.datasets import Scene, Views, load_scene
+from kgs.fit.config import FitConfig
+from kgs.fit.lpips import Lpips
+from kgs.fit.outputs import write_json
+from kgs.model import GaussianModel
+from kgs.ply import save_ply
 
-from .mutations import mutate_bytes, mutate_json, mutate_words
-from .readers import Reader, Target, Unsound, check_range
-
-__all__ = ["SCENE_READERS", "write_colmap"]
+__all__ = ["write_blender", "write_colmap", "write_llff", "write_nerfstudio", "write_photos"]
+__all__ += ["write_config", "write_image", "write_lpips", "write_ply"]
 
 _SIZE = (16, 12)
 _NAMES = ("0.png", "1.png", "2.png")
@@ -27,49 +31,25 @@ _OPENCV = (14.0, 14.5, 8.2, 6.1, -0.05, 0.01, 0.001, -0.001)
 _RADIAL = (14.0, 8.0, 6.0, -0.02)
 
 
-def check_scene(scene: Scene) -> None:
-    """Raise Unsound where a scene holds numbers that are not finite or not valid."""
-    for views in filter(None, (scene.train, scene.test, scene.finer)):
-        _check_views(views)
-    check_range("points", scene.points)
-    check_range("point_colors", scene.point_colors, 0, 1)
-    check_range("offset", scene.offset)
-    check_range("background", scene.background, 0, 1)
-
-
-def _check_views(views: Views) -> None:
-    check_range("images", views.images, 0, 1)
-    if views.masks is not None:
-        check_range("masks", views.masks, 0, 1)
-    check_range("intrinsics", views.cameras.intrinsics)
-    check_range("extrinsics", views.cameras.extrinsics)
-    check_range("focal lengths", torch.stack([views.cameras.fx, views.cameras.fy]), 1e-30)
-    rotation = views.cameras.extrinsics[:, :3, :3].double()
-    if float((rotation.mT @ rotation - torch.eye(3)).abs().max()) > 1e-5 or float(torch.linalg.det(rotation).min()) < 0:
-        raise Unsound("extrinsics: expected right-handed rotations")
-    if len(set(views.names)) < len(views.names):
-        raise Unsound("names: expected each one once")
-
-
-def _write_photos(folder: Path, channels: int = 3) -> None:
+def write_photos(folder: Path, channels: int = 3) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     noise = np.random.default_rng(0).integers(0, 255, (len(_NAMES), *_SIZE[::-1], channels), np.uint8)
     for name, image in zip(_NAMES, noise, strict=True):
         cv2.imwrite(str(folder / name), image)
 
 
-def _write_llff(root: Path) -> None:
+def write_llff(root: Path) -> None:
     rows = np.tile(np.array([0, 1, 0, 0, 12, 1, 0, 0, 0, 16, 0, 0, -1, 0, 14, 1, 9], dtype=float), (3, 1))
     rows[:, 3] = (0, 0.5, 1)
     np.save(root / "poses_bounds.npy", rows)
-    _write_photos(root / "images")
+    write_photos(root / "images")
 
 
 def write_colmap(root: Path, text: bool = False) -> None:
     """Two lenses, three photos, two points; as COLMAP writes them."""
     folder = root / "sparse" / "0"
     folder.mkdir(parents=True)
-    _write_photos(root / "images")
+    write_photos(root / "images")
     cameras = {1: ("OPENCV", 4, _OPENCV), 2: ("SIMPLE_RADIAL", 2, _RADIAL)}
     poses = [
         ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
@@ -112,15 +92,15 @@ def _matrix(i: int) -> list[list[float]]:
     return [[c, 0.0, s, 0.5 * i], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, 4.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def _write_blender(root: Path) -> None:
+def write_blender(root: Path) -> None:
     for split in ("train", "test"):
-        _write_photos(root / split, channels=4)
+        write_photos(root / split, channels=4)
         frames = [{"file_path": f"./{split}/{i}", "transform_matrix": _matrix(i)} for i in range(3)]
         (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
 
 
-def _write_nerfstudio(root: Path) -> None:
-    _write_photos(root / "images")
+def write_nerfstudio(root: Path) -> None:
+    write_photos(root / "images")
     lens: dict[str, Any] = {
         "camera_model": "OPENCV",
         "fl_x": 14.0,
@@ -135,30 +115,32 @@ def _write_nerfstudio(root: Path) -> None:
     (root / "transforms.json").write_text(json.dumps({**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001, "frames": frames}))
 
 
-def _read(root: Path, points: str = "none", downscale: float | None = None) -> None:
-    check_scene(load_scene(root, downscale=downscale, points=points))
+def write_image(folder: Path, suffix: str, channels: int = 3) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (12, 16, channels), np.uint8)
+    cv2.imwrite(str(folder / f"image.{suffix}"), noise)
 
 
-_MODEL = ("cameras", "images", "points3D")
-SCENE_READERS = (
-    Reader("LLFF", _write_llff, partial(_read, downscale=2), (Target("poses_bounds.npy", mutate_bytes),)),
-    Reader(
-        "COLMAP, binary",
-        write_colmap,
-        partial(_read, points="model-points"),
-        tuple(Target(f"sparse/0/{stem}.bin", mutate_bytes) for stem in _MODEL),
-    ),
-    Reader(
-        "COLMAP, text",
-        partial(write_colmap, text=True),
-        partial(_read, points="model-points"),
-        tuple(Target(f"sparse/0/{stem}.txt", mutate_words) for stem in _MODEL),
-    ),
-    Reader(
-        "Blender",
-        _write_blender,
-        partial(_read, downscale=1.5),
-        tuple(Target(f"transforms_{split}.json", mutate_json) for split in ("train", "test")),
-    ),
-    Reader("nerfstudio", _write_nerfstudio, _read, (Target("transforms.json", mutate_json),)),
-)
+def write_ply(folder: Path, text: bool = False) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points, colors = torch.rand(2, 5, 3, generator=generator)
+    path = folder / "splat.ply"
+    save_ply(path, GaussianModel.from_points(points, colors, sh_degree=1))
+    if text:
+        head, body = path.read_bytes().split(b"end_header\n")
+        rows = np.frombuffer(body, "<f4").reshape(5, -1).tolist()
+        lines = "\n".join(" ".join(map(repr, row)) for row in rows)
+        path.write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode() + b"\n")
+
+
+def write_config(folder: Path) -> None:
+    request = {"scene": "/photos/fern", "train_views": 3, "downscale": 8.0, "background": "black", "points": "none"}
+    write_json(folder / "config.json", {"request": request, "fit": FitConfig().to_dict()})
+
+
+def write_lpips(folder: Path) -> None:
+    with torch.device("meta"):
+        shapes = {name: tuple(value.shape) for name, value in Lpips("alexnet").state_dict().items()}
+    features = {name: np.zeros(shape, np.float16) for name, shape in shapes.items() if name.startswith("features")}
+    heads = {name: np.linspace(0, 1, shape[0], dtype=np.float32) for name, shape in shapes.items() if "lin" in name}
+    np.savez_compressed(folder / "alexnet_features.npz", **features)  # type: ignore[arg-type]  # numpy's stubs
+    np.savez(folder / "lpips_lin_alexnet.npz", **heads)  # type: ignore[arg-type]

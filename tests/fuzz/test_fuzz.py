@@ -6,33 +6,30 @@ import json
 import random
 import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mutations import mutate_bytes, mutate_json
+from readers import Reader, Target, check_range
+from targets import READERS
+from trials import is_cheap, table_row, try_reader
 
-from kgs.bench import hostile
-from kgs.bench.hostile import READERS, measure_hostile, try_reader
-from kgs.bench.mutations import mutate_bytes, mutate_json
-from kgs.bench.readers import Reader, Target, check_range
 from kgs.errors import DataError
 
 
+@pytest.mark.parametrize("trials", [40, pytest.param(1500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_damaged_files_are_sound_or_refused(reader: Reader) -> None:
-    outcomes = try_reader(reader, range(max(10, round(40 * reader.share))))
+def test_damaged_files_are_sound_or_refused(
+    reader: Reader, trials: int, record_property: Callable[[str, object], None]
+) -> None:
+    outcomes = try_reader(reader, range(round(trials * reader.share)))
+    record_property("hostile", table_row(reader, outcomes))
     assert [o.what for o in outcomes if o.kind == "other"] == []
-    assert [o.what for o in outcomes if o.memory is not None and o.memory >= o.allowed] == []
-    assert any(o.kind == "refused" for o in outcomes)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_many_damaged_files(reader: Reader) -> None:
-    outcomes = try_reader(reader, range(1000, 1000 + round(1500 * reader.share)))
-    assert [o.what for o in outcomes if o.kind == "other"] == []
+    assert [o.what for o in outcomes if not is_cheap(o)] == []
     assert {o.kind for o in outcomes} == {"sound", "refused"}
 
 
@@ -58,6 +55,7 @@ def test_damage_is_the_same_for_the_same_seed(data: bytes, seed: int) -> None:
 def test_damage_to_json_mostly_keeps_it_json() -> None:
     text = json.dumps({"a": [1, 2.5, {"b": "c"}], "d": None}).encode()
     kinds: Counter[bool] = Counter()
+    unchanged = 0
     for seed in range(200):
         damaged, _ = mutate_json(text, random.Random(seed))
         try:
@@ -66,7 +64,8 @@ def test_damage_to_json_mostly_keeps_it_json() -> None:
             kinds[False] += 1
         else:
             kinds[True] += 1
-        assert damaged != text or seed  # most seeds change something
+        unchanged += damaged == text
+    assert unchanged < 10
     assert kinds[True] > 60
     assert kinds[False] > 10
 
@@ -107,14 +106,10 @@ def _write(folder: Path) -> None:
     (folder / "a.bin").write_bytes(bytes(4))
 
 
-def test_the_program_counts_and_names_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_counts_what_was_tried(tmp_path: Path) -> None:
     reader = Reader("careless", _write, careless, (overwrite(200), overwrite(3)))
-    monkeypatch.setattr(hostile, "READERS", (reader,))
-    result = measure_hostile(tmp_path, quick=True, say=lambda line: None)
-    (row,) = result["rows"]
+    outcomes = try_reader(reader, range(100))
+    row = table_row(reader, outcomes)
     assert row["tried"] == row["other"] + row["sound"] == 100
-    assert len(result["failures"]) == row["other"] > 10
-    assert "KeyError" in result["failures"][0]
-    assert json.loads((tmp_path / "hostile.json").read_text())["rows"] == result["rows"]
-    assert "careless" in (tmp_path / "hostile.md").read_text()
-    assert (tmp_path / "hostile.csv").is_file()
+    assert row["other"] > 10
+    assert "KeyError" in next(outcome.what for outcome in outcomes if outcome.kind == "other")

@@ -1,4 +1,4 @@
-"""The readers of single files, each with a tiny valid file."""
+"""The readers of scenes and of single files that are fuzzed, each with a tiny valid set of files."""
 
 from __future__ import annotations
 
@@ -6,54 +6,66 @@ import json
 from functools import cache, partial
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
+from mutations import mutate_bytes, mutate_json, mutate_words
+from readers import Reader, Target, Unsound, check_range, inside_checkpoint, inside_png, inside_zip
+from tiny_scenes import (
+    write_blender,
+    write_colmap,
+    write_config,
+    write_image,
+    write_llff,
+    write_lpips,
+    write_nerfstudio,
+    write_ply,
+)
 
-from kgs.datasets import Scene, synthetic_scene
+from kgs.datasets import Scene, Views, load_scene, synthetic_scene
 from kgs.datasets.images import read_image
 from kgs.fit.config import FitConfig, timetable
 from kgs.fit.lpips import Lpips
-from kgs.fit.outputs import write_json
 from kgs.fit.settings import read_settings
 from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
-from kgs.model import GaussianModel
-from kgs.ply import load_ply, save_ply
+from kgs.ply import load_ply
 
-from .mutations import mutate_bytes, mutate_json, mutate_words
-from .readers import Reader, Target, check_range, inside_checkpoint, inside_png, inside_zip
-
-__all__ = ["FILE_READERS"]
+__all__ = ["READERS"]
 
 _CONFIG = FitConfig(steps=3, evaluations=1, seed=1, sh_degree=1)
 _POINTS = 12
-
-
-def _write_image(folder: Path, suffix: str, channels: int = 3) -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (12, 16, channels), np.uint8)
-    cv2.imwrite(str(folder / f"image.{suffix}"), noise)
 
 
 def _read_image(folder: Path, suffix: str) -> None:
     check_range("image", torch.from_numpy(read_image(folder / f"image.{suffix}")), 0, 1)
 
 
-def _write_ply(folder: Path, text: bool = False) -> None:
-    generator = torch.Generator().manual_seed(0)
-    points, colors = torch.rand(2, 5, 3, generator=generator)
-    path = folder / "splat.ply"
-    save_ply(path, GaussianModel.from_points(points, colors, sh_degree=1))
-    if text:
-        head, body = path.read_bytes().split(b"end_header\n")
-        rows = np.frombuffer(body, "<f4").reshape(5, -1).tolist()
-        lines = "\n".join(" ".join(map(repr, row)) for row in rows)
-        path.write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode() + b"\n")
-
-
 def _read_ply(folder: Path) -> None:
     for name, value in load_ply(folder / "splat.ply").state_dict().items():
         check_range(name, value, -3.5e38, 3.5e38)
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise Unsound where a scene holds numbers that are not finite or not valid."""
+    for views in filter(None, (scene.train, scene.test, scene.finer)):
+        _check_views(views)
+    check_range("points", scene.points)
+    check_range("point_colors", scene.point_colors, 0, 1)
+    check_range("offset", scene.offset)
+    check_range("background", scene.background, 0, 1)
+
+
+def _check_views(views: Views) -> None:
+    check_range("images", views.images, 0, 1)
+    if views.masks is not None:
+        check_range("masks", views.masks, 0, 1)
+    check_range("intrinsics", views.cameras.intrinsics)
+    check_range("extrinsics", views.cameras.extrinsics)
+    check_range("focal lengths", torch.stack([views.cameras.fx, views.cameras.fy]), 1e-30)
+    rotation = views.cameras.extrinsics[:, :3, :3].double()
+    if float((rotation.mT @ rotation - torch.eye(3)).abs().max()) > 1e-5 or float(torch.linalg.det(rotation).min()) < 0:
+        raise Unsound("extrinsics: expected right-handed rotations")
+    if len(set(views.names)) < len(views.names):
+        raise Unsound("names: expected each one once")
 
 
 @cache
@@ -77,24 +89,10 @@ def _read_checkpoint(folder: Path) -> None:
             check_range(name, value.expand(parameter.shape), -3.5e38, 3.5e38)
 
 
-def _write_config(folder: Path) -> None:
-    request = {"scene": "/photos/fern", "train_views": 3, "downscale": 8.0, "background": "black", "points": "none"}
-    write_json(folder / "config.json", {"request": request, "fit": FitConfig().to_dict()})
-
-
 def _read_config(folder: Path) -> None:
     _, config = read_settings(folder / "config.json")
     timetable(config)
     json.dumps(config.to_dict(), allow_nan=False)
-
-
-def _write_lpips(folder: Path) -> None:
-    with torch.device("meta"):
-        shapes = {name: tuple(value.shape) for name, value in Lpips("alexnet").state_dict().items()}
-    features = {name: np.zeros(shape, np.float16) for name, shape in shapes.items() if name.startswith("features")}
-    heads = {name: np.linspace(0, 1, shape[0], dtype=np.float32) for name, shape in shapes.items() if "lin" in name}
-    np.savez_compressed(folder / "alexnet_features.npz", **features)  # type: ignore[arg-type]  # numpy's stubs
-    np.savez(folder / "lpips_lin_alexnet.npz", **heads)  # type: ignore[arg-type]
 
 
 def _read_lpips(folder: Path) -> None:
@@ -106,17 +104,44 @@ def _image_reader(name: str, suffix: str, *targets: Target, channels: int = 3) -
     path = f"image.{suffix}"
     return Reader(
         name,
-        partial(_write_image, suffix=suffix, channels=channels),
+        partial(write_image, suffix=suffix, channels=channels),
         partial(_read_image, suffix=suffix),
         targets or (Target(path, mutate_bytes),),
     )
 
 
+def _read(root: Path, points: str = "none", downscale: float | None = None) -> None:
+    check_scene(load_scene(root, downscale=downscale, points=points))
+
+
+_MODEL = ("cameras", "images", "points3D")
+SCENE_READERS = (
+    Reader("LLFF", write_llff, partial(_read, downscale=2), (Target("poses_bounds.npy", mutate_bytes),)),
+    Reader(
+        "COLMAP, binary",
+        write_colmap,
+        partial(_read, points="model-points"),
+        tuple(Target(f"sparse/0/{stem}.bin", mutate_bytes) for stem in _MODEL),
+    ),
+    Reader(
+        "COLMAP, text",
+        partial(write_colmap, text=True),
+        partial(_read, points="model-points"),
+        tuple(Target(f"sparse/0/{stem}.txt", mutate_words) for stem in _MODEL),
+    ),
+    Reader(
+        "Blender",
+        write_blender,
+        partial(_read, downscale=1.5),
+        tuple(Target(f"transforms_{split}.json", mutate_json) for split in ("train", "test")),
+    ),
+    Reader("nerfstudio", write_nerfstudio, _read, (Target("transforms.json", mutate_json),)),
+)
 _PNG, _HEADS = "image.png", "lpips_lin_alexnet.npz"
 _CHECKPOINT = "checkpoint.pt"
 FILE_READERS = (
-    Reader("PLY, binary", _write_ply, _read_ply, (Target("splat.ply", mutate_bytes),)),
-    Reader("PLY, ascii", partial(_write_ply, text=True), _read_ply, (Target("splat.ply", mutate_words),)),
+    Reader("PLY, binary", write_ply, _read_ply, (Target("splat.ply", mutate_bytes),)),
+    Reader("PLY, ascii", partial(write_ply, text=True), _read_ply, (Target("splat.ply", mutate_words),)),
     Reader(
         "checkpoint",
         _write_checkpoint,
@@ -127,10 +152,10 @@ FILE_READERS = (
             *[Target(_CHECKPOINT, inside_checkpoint(mutate_json, 1))] * 3,
         ),
     ),
-    Reader("config.json", _write_config, _read_config, (Target("config.json", mutate_json),)),
+    Reader("config.json", write_config, _read_config, (Target("config.json", mutate_json),)),
     Reader(
         "LPIPS weights",
-        _write_lpips,
+        write_lpips,
         _read_lpips,
         (
             Target(_HEADS, mutate_bytes),
@@ -145,3 +170,4 @@ FILE_READERS = (
     _image_reader("BMP", "bmp"),
     _image_reader("TIFF", "tif"),
 )
+READERS = (*SCENE_READERS, *FILE_READERS)

@@ -1,0 +1,124 @@
+"""What a fit survives: kill -9 at random moments, SIGTERM, a full disk; and its memory over many steps.
+
+A fit that was killed and resumed, however often, must end in the very bits of one that was left alone.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+if sys.platform != "linux":
+    pytest.skip("limits and signals of POSIX, memory from /proc", allow_module_level=True)
+
+from fits import PATIENCE, Fit, memory_of
+
+from kgs.errors import DataError
+from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
+from kgs.fit.run import CHECKPOINT
+
+SHORT, LONG = 45, 450  # steps
+
+
+@pytest.fixture(scope="module", params=[SHORT, pytest.param(LONG, marks=pytest.mark.slow)])
+def alone(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, bytes]:
+    """Steps of a fit that is left alone, and what its splat.ply holds."""
+    return request.param, Fit(tmp_path_factory.mktemp("alone"), "alone", request.param).finish()
+
+
+@pytest.fixture
+def record(record_property: Callable[[str, object], None]) -> Callable[..., None]:
+    """Leaves a row of the table, then fails where it has to."""
+
+    def note(fault: str, trials: int, lost: int, found: str, met: bool) -> None:
+        verdict = "met" if met else "FAILED"
+        row = {"fault": fault, "trials": trials, "lost": lost, "found": found, "verdict": verdict}
+        record_property("faults", row)
+        assert met, found
+
+    return note
+
+
+def _bits(same: bool) -> str:
+    return "the same bits" if same else "other bits"
+
+
+def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
+    """One fit after the other, killed again and again, each time resumed from what it left."""
+    steps, expected = alone
+    trials, longest = (30, 0.6) if steps == LONG else (2, 0.1)
+    fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
+    path, corrupt, fallen_back, different, fits, kills = fit.out / CHECKPOINT, 0, 0, 0, 0, 0
+    while kills < trials:
+        process = fit.start()
+        if fit.wait_for_steps(process):
+            time.sleep(moments.uniform(0.0, longest))
+            process.kill()
+            kills += 1
+        process.join(PATIENCE)
+        if process.exitcode == 0:  # it was done before
+            different += (fit.out / "splat.ply").read_bytes() != expected
+            fits += 1
+            shutil.rmtree(fit.out)
+            continue
+        if not fit.out.exists() or not any(fit.out.glob(f"{path.stem}*{path.suffix}")):
+            continue
+        try:
+            load_checkpoint(path)
+        except DataError:
+            fallen_back += 1
+        try:
+            newest_checkpoint(path)
+        except DataError:
+            corrupt += 1
+    different += fit.finish() != expected
+    found = f"{fallen_back} times the previous checkpoint, {fits + 1} fits ended, {different} of them in other bits"
+    record("kill -9 at a random moment", trials, corrupt, found, corrupt == different == 0)
+
+
+def test_sigterm(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
+    fit = Fit(tmp_path, "terminated", alone[0])
+    process = fit.start()
+    running = fit.wait_for_steps(process)
+    process.terminate()
+    process.join(PATIENCE)
+    code, written = process.exitcode, (fit.out / "metrics.json").exists()
+    same = fit.finish() == alone[1]
+    found = f"exit code {code}, results {'' if written else 'not '}written; resumed: {_bits(same)}"
+    record("SIGTERM", 1, int(not same), found, running and written and same and code == 128 + signal.SIGTERM)
+
+
+def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
+    """From some step on no file may grow beyond 16 KiB: neither checkpoints nor results can be written."""
+    fit = Fit(tmp_path, "full", alone[0])
+    process = fit.start(limit=2**14)
+    process.join(PATIENCE)
+    code = process.exitcode
+    try:
+        step = newest_checkpoint(fit.out / CHECKPOINT)[0]["step"]
+    except DataError:
+        step = -1
+    partial = [path.name for path in fit.out.glob("*.partial")]
+    same = fit.finish() == alone[1]
+    found = f"the checkpoint of step {step} is whole, {len(partial)} partial files; resumed: {_bits(same)}"
+    record("full disk", 1, int(step < 0), found, code != 0 and step > 0 and not partial and same)
+
+
+@pytest.mark.slow
+def test_memory_over_many_steps(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
+    steps = 2000
+    slope, peak, ceiling = memory_of(tmp_path, steps)
+    growth = f"grows by {slope:+.2f} KiB per step over the second half"
+    most = f"at most {peak / 2**20:.0f} MiB over the start, {ceiling / 2**20:.0f} MiB foretold"
+    rows = [("memory", growth, slope < 1.0), ("memory ceiling", most, peak <= ceiling)]
+    for fault, found, met in rows:
+        row = {"fault": f"{fault}, {steps} steps", "trials": 1, "lost": 0, "found": found}
+        record_property("faults", {**row, "verdict": "met" if met else "FAILED"})
+    assert [found for _, found, met in rows if not met] == []
