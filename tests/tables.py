@@ -75,7 +75,9 @@ def _hostile(rows: list[Row]) -> str:
     memory = max((row["memory"] for row in rows if row["memory"] is not None), default=None)
     total = [sum(row[key] for row in rows) for key in counts]
     lines.append(["all", *total, max(row["slowest_s"] for row in rows), mib(memory), ""])
-    title = "Damaged files (valid ones changed with a seed): loaded with sound numbers, refused with DataError, or other"
+    title = (
+        "Damaged files (valid ones with seeded changes): loaded with sound numbers, refused with DataError, or other"
+    )
     heads = ("tried", "loaded, sound", "DataError", "other", "slowest [s]", "memory [MiB]", "allowed [MiB]")
     return markdown_table(title, heads, lines, first="reader")
 
