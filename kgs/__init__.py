@@ -1,5 +1,6 @@
 """Differentiable 3D Gaussian splatting for sparse views, in PyTorch and Kornia, with DropGaussian as a layer."""
 
+from .camera import PosedCamera, cameras
 from .densify import Densifier, DensifyReport, camera_extent
 from .drop import DropGaussian, drop_gaussian
 from .errors import DataError, TrainingDiverged
@@ -9,7 +10,7 @@ from .projection import project
 from .raster import composite
 from .raster.tiles import bin_to_tiles
 from .renderer import GaussianRenderer
-from .types import Gaussians, PosedCamera, ProjectedGaussians, Rendering, TileBins
+from .types import Gaussians, ProjectedGaussians, Rendering, TileBins
 
 __all__ = [
     "DropGaussian",
@@ -26,6 +27,7 @@ __all__ = [
     "save_ply",
     "load_ply",
     "PosedCamera",
+    "cameras",
     "ProjectedGaussians",
     "TileBins",
     "Rendering",

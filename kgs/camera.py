@@ -1,4 +1,4 @@
-"""Kornia's cameras one by one: the pixel of a point, and its derivative.
+"""All that knows a camera model: Kornia's cameras one by one, the pixel of a point and its derivative.
 
 Convention:
     World-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
@@ -7,28 +7,73 @@ The derivative is closed form for pinhole and orthographic cameras and two rever
 for distorted ones. Far outside the field of view the first-order footprint is meaningless and grows without bound;
 as in gsplat it is taken at a point clamped to 15 % of the image size beyond its borders (perspective models without
 a wide-angle mapping only). The limits are constants; the gradient follows the clamp exactly.
+
+A distorted lens sees up to the angle where the radius in the image stops growing: what lies behind this fold of the
+radial polynomial is not drawn.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.vector import Vector3
 from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel
 from kornia.sensors.camera.camera_model import CameraModelBase
 from kornia.sensors.camera.distortion_model import AffineTransform, BrownConradyTransform
 from kornia.sensors.camera.projection_model import OrthographicProjection
+from numpy.polynomial import Polynomial
 from torch import Tensor
 
 from .full_precision import in_full_precision
-from .types import Cameras, PosedCamera
 
-__all__ = ["Lens", "image_size", "intrinsics", "lenses"]
+__all__ = ["Cameras", "Lens", "PosedCamera", "cameras", "image_size", "intrinsics", "lenses", "move_camera"]
 
 _MARGIN = 0.15
+Pixels = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedCamera:
+    """One of Kornia's camera models together with its poses: for lenses that `PinholeCamera` cannot describe.
+
+    Its tensors are kept as they are, not cloned: a parameter that an optimiser has changed is used by the next render.
+
+    Convention:
+        - `model` projects points of the camera frame (x right, y down, z forward) to pixels with integer centres;
+          its `params` are `(P,)`, shared by all poses, or `(C, P)`, one row per pose.
+        - `extrinsics` are world-to-camera, `(C, 4, 4)`.
+
+    Args:
+        model: a `kornia.sensors.camera.CameraModel` of any of its four types.
+        extrinsics: shape `(C, 4, 4)`.
+
+    Raises:
+        TypeError: `model` is no Kornia camera model or `extrinsics` no tensor.
+        ValueError: shapes do not fit.
+    """
+
+    model: CameraModel
+    extrinsics: Tensor
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.model, "project") or not hasattr(self.model, "params"):
+            raise TypeError(f"model: expected a kornia.sensors.camera.CameraModel, got {type(self.model).__name__}")
+        if not isinstance(self.extrinsics, Tensor):
+            raise TypeError(f"extrinsics: expected a torch.Tensor, got {type(self.extrinsics).__name__}")
+        shape, params = tuple(self.extrinsics.shape), self.model.params
+        if len(shape) != 3 or shape[1:] != (4, 4):
+            raise ValueError(f"extrinsics: expected shape (C, 4, 4), got {shape}")
+        if params.ndim == 2 and params.shape[0] not in (1, shape[0]):
+            raise ValueError(f"model: expected params of 1 or {shape[0]} cameras as extrinsics, got {params.shape[0]}")
+
+
+Cameras = PinholeCamera | PosedCamera
 
 
 @dataclass(frozen=True)
@@ -40,12 +85,71 @@ class Lens:
         project: (world points, camera points), both `(M, 3)`, to pixels `(M, 2)`.
         jacobian: camera points `(M, 3)` to the derivative of the pixel, `(M, 2, 3)`.
         parallel: whether all rays have one direction (orthographic).
+        sees: camera points `(M, 3)` to whether they lie before the fold of the distortion, `(M,)`; None: all do.
     """
 
     extrinsics: Tensor
     project: Callable[[Tensor, Tensor], Tensor]
     jacobian: Callable[[Tensor], Tensor]
     parallel: bool = False
+    sees: Callable[[Tensor], Tensor] | None = None
+
+
+def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers: str = "integer") -> PinholeCamera:
+    """Kornia's pinhole cameras from matrices and plain sizes; differentiable.
+
+    A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make it anew in each step.
+
+    Convention:
+        World-to-camera, OpenCV axes.
+
+    Args:
+        viewmats: world-to-camera matrices, `(C, 4, 4)`, or `(4, 4)` for one.
+        Ks: intrinsics in pixels, `(C, 3, 3)` or `(C, 4, 4)`, or one matrix for all cameras.
+        width: of the images in pixels.
+        height: of the images in pixels.
+        pixel_centers: where the first pixel's centre lies in the coordinates of `Ks`: "integer" at (0, 0) as in Kornia
+            and OpenCV, "half" at (0.5, 0.5) as in COLMAP and gsplat.
+
+    Raises:
+        TypeError: no tensors, or of different dtypes or devices.
+        ValueError: shapes or sizes do not fit.
+
+    Example:
+        >>> import torch, kgs
+        >>> k = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]])
+        >>> kgs.cameras(torch.eye(4), k, width=32, height=24, pixel_centers="half").cx
+        tensor([15.5000])
+    """
+    for name, value in (("viewmats", viewmats), ("Ks", Ks)):
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
+    if (Ks.dtype, Ks.device) != (viewmats.dtype, viewmats.device):
+        raise TypeError(
+            f"Ks: expected {viewmats.dtype} on {viewmats.device} as viewmats, got {Ks.dtype} on {Ks.device}"
+        )
+    if viewmats.ndim not in (2, 3) or viewmats.shape[-2:] != (4, 4):
+        raise ValueError(f"viewmats: expected shape (C, 4, 4) or (4, 4), got {tuple(viewmats.shape)}")
+    poses = viewmats.reshape(-1, 4, 4)
+    count, side = poses.shape[0], Ks.shape[-1] if Ks.ndim else 0
+    if side not in (3, 4) or tuple(Ks.shape) not in ((side, side), (1, side, side), (count, side, side)):
+        raise ValueError(f"Ks: expected shape ({count}, 3, 3), ({count}, 4, 4) or one matrix, got {tuple(Ks.shape)}")
+    if pixel_centers not in ("integer", "half"):
+        raise ValueError(f'pixel_centers: expected "integer" or "half", got {pixel_centers!r}')
+    for name, size in (("width", width), ("height", height)):
+        if not (isinstance(size, int | np.integer) and size >= 1):
+            raise ValueError(f"{name}: expected an integer >= 1, got {size!r}")
+    shift = torch.zeros(4, 4, dtype=Ks.dtype, device=Ks.device)
+    shift[:2, 2] = 0.5 if pixel_centers == "half" else 0.0
+    full = torch.zeros_like(shift).fill_diagonal_(1.0).repeat(count, 1, 1)
+    full[:, :3, :3] = Ks[..., :3, :3]
+    sizes = (torch.full((count,), int(size), device=poses.device) for size in (height, width))
+    return PinholeCamera(full - shift, poses, *sizes)
+
+
+def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
+    """The same cameras on another device."""
+    return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
@@ -84,10 +188,9 @@ def lenses(cameras: Cameras) -> list[Lens]:
 def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
     one = slice(c, c + 1)
     camera = PinholeCamera(cameras.intrinsics[one], cameras.extrinsics[one], cameras.height[one], cameras.width[one])
-    height, width = int(camera.height), int(camera.width)
     k = camera.intrinsics[0, :2, :2]
     fx, fy, cx, cy = (camera.intrinsics[0, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    limits = _tangent_limits(fx, fy, cx, cy, height, width)
+    limits = _tangent_limits(fx, fy, cx, cy, int(camera.height), int(camera.width))
 
     def pixels(intrinsics: Tensor, extrinsics: Tensor, world: Tensor) -> Tensor:
         pixels: Tensor = PinholeCamera(intrinsics, extrinsics, camera.height, camera.width).project(world[None])[0]
@@ -102,13 +205,16 @@ def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
 
 def _modelled(cameras: PosedCamera, c: int) -> Lens:
     model = cameras.model
-    params = model.params if model.params.ndim == 1 else model.params[c if model.params.shape[0] > 1 else 0]
+    with torch.inference_mode(False):  # autograd takes a clone of what was made in inference mode
+        params, poses = (x.clone() if x.is_inference() else x for x in (model.params, cameras.extrinsics))
+    if params.ndim == 2:
+        params = params[c if params.shape[0] > 1 else 0]
     height, width = int(model.height), int(model.width)
     one = CameraModelBase(model.distortion, model.projection, ImageSize(height, width), params)
-    fx, fy, cx, cy = params[:4].unbind()
-    k = torch.diag(torch.stack([fx, fy]))
-    limits = _tangent_limits(fx, fy, cx, cy, height, width)
+    k = torch.diag(params[:2])
+    limits = _tangent_limits(*params[:4].unbind(), height, width)
     parallel = isinstance(model.projection, OrthographicProjection)
+    plain = parallel or isinstance(model.distortion, AffineTransform)
 
     def pixels(points: Tensor) -> Tensor:
         return one.project(Vector3(points)).data
@@ -116,38 +222,59 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
     def jacobian(points: Tensor) -> Tensor:
         if parallel:
             return torch.cat([k, k.new_zeros(2, 1)], 1).expand(points.shape[0], 2, 3)
-        if isinstance(model.distortion, AffineTransform):
+        if plain:
             return _perspective_jacobian(k, points, limits)
         if isinstance(model.distortion, BrownConradyTransform):
             points = _clamp_tangents(points, limits)
         return _reverse_jacobian(pixels, points)
 
     return Lens(
-        extrinsics=cameras.extrinsics[c],
+        extrinsics=poses[c],
         project=lambda _, points: pixels(points),
         jacobian=jacobian,
         parallel=parallel,
+        sees=None if plain else _before_fold(params.tolist(), isinstance(model.distortion, BrownConradyTransform)),
     )
 
 
-def _tangent_limits(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor, height: int, width: int) -> tuple[Tensor, ...]:
-    """Lower x, upper x, lower y, upper y of x/z and y/z, without gradient."""
-    fx, fy, cx, cy = fx.detach(), fy.detach(), cx.detach(), cy.detach()
-    mx, my = _MARGIN * width, _MARGIN * height
-    return (
-        -(cx + 0.5 + mx) / fx,
-        (width - 0.5 - cx + mx) / fx,
-        -(cy + 0.5 + my) / fy,
-        (height - 0.5 - cy + my) / fy,
-    )
+def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor], Tensor] | None:
+    """Which points lie at a smaller angle than the first where the radius in the image stops growing; None: all.
+
+    The radius is r P(r^2) / Q(r^2) of the tangent r (Brown-Conrady), or t P(t^2) of the angle t (Kannala-Brandt). Its
+    derivative has the sign of the polynomial (P + 2 s P') Q - 2 s P Q' in s, the square of r or t.
+    """
+    if brown_conrady:
+        k1, k2, _, _, k3, k4, k5, k6 = params[4:]
+        above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+    else:
+        above, below = Polynomial([1.0, *params[4:]]), Polynomial([1.0])
+    s = Polynomial([0.0, 1.0])
+    growth = (above + 2 * s * above.deriv()) * below - 2 * s * above * below.deriv()
+    if not np.isfinite(growth.coef).all():
+        return None
+    roots = np.concatenate([p.trim().roots() for p in (growth, below)])
+    fold = min((float(x.real) for x in roots if x.imag == 0 and x.real > 0), default=math.inf)
+    if brown_conrady:
+        return None if fold == math.inf else lambda points: points[:, :2].square().sum(1) < fold * points[:, 2].square()
+    angle = math.sqrt(fold)
+    return None if angle >= math.pi / 2 else lambda points: points[:, :2].norm(dim=1) < math.tan(angle) * points[:, 2]
 
 
-def _clamp_tangents(points: Tensor, limits: tuple[Tensor, ...]) -> Tensor:
+def _tangent_limits(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor, height: int, width: int) -> list[Tensor]:
+    """Lower x, upper x, lower y, upper y of x/z and y/z, without gradient; also where a focal length is negative."""
+    limits: list[Tensor] = []
+    for focal, centre, size in ((fx.detach(), cx.detach(), width), (fy.detach(), cy.detach(), height)):
+        first, last = -(centre + 0.5 + _MARGIN * size) / focal, (size - 0.5 - centre + _MARGIN * size) / focal
+        limits += [torch.minimum(first, last), torch.maximum(first, last)]
+    return limits
+
+
+def _clamp_tangents(points: Tensor, limits: list[Tensor]) -> Tensor:
     x, y, z = points.unbind(1)
     return torch.stack([(x / z).clamp(limits[0], limits[1]) * z, (y / z).clamp(limits[2], limits[3]) * z, z], 1)
 
 
-def _perspective_jacobian(k: Tensor, points: Tensor, limits: tuple[Tensor, ...]) -> Tensor:
+def _perspective_jacobian(k: Tensor, points: Tensor, limits: list[Tensor]) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
     x, y, z = points.unbind(1)
     inverse = 1.0 / z
@@ -157,7 +284,7 @@ def _perspective_jacobian(k: Tensor, points: Tensor, limits: tuple[Tensor, ...])
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
 
-def _reverse_jacobian(pixels: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+def _reverse_jacobian(pixels: Pixels, points: Tensor) -> Tensor:
     differentiable = torch.is_grad_enabled() and pixels(points[:1]).requires_grad
     with torch.inference_mode(False), torch.enable_grad():
         if not (differentiable and points.requires_grad):

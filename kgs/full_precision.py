@@ -79,7 +79,12 @@ class _InFullPrecision(torch.autograd.Function):
                 for x, n in zip(ctx.saved_tensors, needed, strict=True)
             ]
             wanted = [x for x, n in zip(inputs, needed, strict=True) if n]
-            found = iter(torch.autograd.grad(ctx.function(*inputs), wanted, grad, create_graph=again))
+            result = ctx.function(*inputs)
+            if result.requires_grad:  # Kornia's project, for one, returns early where there are no points
+                options = {"create_graph": again, "allow_unused": True, "materialize_grads": True}
+                found = iter(torch.autograd.grad(result, wanted, grad, **options))
+            else:
+                found = iter([torch.zeros_like(x) for x in wanted])
         return None, *(next(found) if n else None for n in needed)
 
 

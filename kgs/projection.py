@@ -10,11 +10,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .camera import Lens, image_size, intrinsics, lenses
+from .camera import Cameras, Lens, image_size, intrinsics, lenses
 from .covariance import footprint_factors, variances
 from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
-from .types import Cameras, Gaussians, ProjectedGaussians
+from .types import Gaussians, ProjectedGaussians
 
 __all__ = ["cut_squared", "project"]
 
@@ -120,6 +120,9 @@ def _project_one(
     with torch.no_grad():
         front = (gaussians.means @ rotation[2] + translation[2] > near_plane) & finite
         ids = front.nonzero()[:, 0]
+        if lens.sees is not None:
+            seen = lens.sees(torch.addmm(translation, _rows(gaussians.means, ids), rotation.T))
+            ids = _rows(ids, seen.nonzero()[:, 0])
 
     def footprints(ids: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         means = _rows(gaussians.means, ids)
@@ -173,16 +176,20 @@ def _touches_image(
     reach_x, reach_y = reach * xx.sqrt(), reach * yy.sqrt()
     height, width = size
     seen = (x + reach_x > -0.5) & (x - reach_x < width - 0.5) & (y + reach_y > -0.5) & (y - reach_y < height - 0.5)
-    overflow = ~torch.isfinite(largest + x + y)
+    overflow = ~torch.isfinite(det + largest + x + y)
     return seen & (det > 0), radii, overflow
 
 
 def _directions(means: Tensor, lens: Lens) -> Tensor:
-    """Unit vectors from the camera to the Gaussians, world axes."""
+    """Unit vectors from the camera to the Gaussians, world axes; the pose may be scaled or sheared."""
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
-    if lens.parallel:
-        return rotation[2].expand_as(means)
-    offsets = means + in_full_precision(torch.mv, rotation.T, translation)
+    product = rotation.detach() @ rotation.detach().T
+    turned = bool(((product - torch.eye(3, dtype=product.dtype, device=product.device)).abs() <= 1e-3).all())
+    inverse = rotation.T if turned else torch.linalg.inv(rotation)
+    if lens.parallel and turned:
+        return inverse[:, 2].expand_as(means)
+    camera = in_full_precision(torch.mv, inverse, translation)
+    offsets = inverse[:, 2].expand_as(means) if lens.parallel else means + camera
     lengths: Tensor = torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return offsets / lengths
 

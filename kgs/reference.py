@@ -120,7 +120,9 @@ def layers(
     light = torch.cat([torch.ones(1, height, width).to(alphas), torch.cumprod(1 - alphas, 0)])
     light = torch.where(light >= transmittance_stop, light, 0.0)
     if colors.ndim == 3:
-        directions = torch.nn.functional.normalize(means + rotation.T @ translation, dim=1)
+        turned = torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), rtol=0, atol=1e-3)
+        inverse = rotation.T if turned else torch.linalg.inv(rotation)
+        directions = torch.nn.functional.normalize(means + inverse @ translation, dim=1)
         colors = torch.einsum("lk,lkc->lc", _harmonics(directions, colors.shape[1]), colors) + 0.5
         colors = colors.masked_fill(colors < 0, 0.0)
     return Layers(alphas * light[:-1], light[-1], colors, points[:, 2], order, responses)
@@ -130,8 +132,8 @@ def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> T
     """Derivative of the pixel, with x/z and y/z limited to 15 % of the image size beyond its borders."""
     size = torch.tensor([width, height]).to(points)
     focal, centre = intrinsics.detach().diagonal()[:2], intrinsics.detach()[:2, 2]
-    low, high = (-0.5 - centre - 0.15 * size) / focal, (size - 0.5 - centre + 0.15 * size) / focal
-    tangents = torch.clamp(points[:, :2] / points[:, 2:], low, high)
+    ends = torch.stack([(-0.5 - centre - 0.15 * size) / focal, (size - 0.5 - centre + 0.15 * size) / focal])
+    tangents = torch.clamp(points[:, :2] / points[:, 2:], ends.amin(0), ends.amax(0))
     plane = torch.cat([torch.eye(2).to(points).expand(len(points), 2, 2), -tangents[:, :, None]], 2)
     return intrinsics[:2, :2] @ plane / points[:, 2, None, None]
 

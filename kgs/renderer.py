@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from .camera import Cameras
 from .projection import project
 from .raster import check_options, composite
-from .types import Cameras, Gaussians, Rendering
+from .types import Gaussians, Rendering
 
 __all__ = ["GaussianRenderer"]
 

@@ -17,11 +17,9 @@ import math
 from dataclasses import dataclass
 
 import torch
-from kornia.geometry.camera import PinholeCamera
-from kornia.sensors.camera import CameraModel
 from torch import Tensor
 
-__all__ = ["Cameras", "Gaussians", "PosedCamera", "ProjectedGaussians", "Rendering", "TileBins"]
+__all__ = ["Gaussians", "ProjectedGaussians", "Rendering", "TileBins"]
 
 SH_SIZES = (1, 4, 9, 16)
 
@@ -77,45 +75,6 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
-
-
-@dataclass(frozen=True)
-class PosedCamera:
-    """One of Kornia's camera models together with its poses: for lenses that `PinholeCamera` cannot describe.
-
-    Convention:
-        - `model` projects points of the camera frame (x right, y down, z forward) to pixels with integer centres;
-          its `params` are `(P,)`, shared by all poses, or `(C, P)`, one row a pose.
-        - `extrinsics` are world-to-camera, `(C, 4, 4)`.
-
-    Args:
-        model: a `kornia.sensors.camera.CameraModel` of any of its four types.
-        extrinsics: shape `(C, 4, 4)`.
-
-    Raises:
-        TypeError: `model` is no Kornia camera model or `extrinsics` no tensor.
-        ValueError: shapes do not fit.
-    """
-
-    model: CameraModel
-    extrinsics: Tensor
-
-    def __post_init__(self) -> None:
-        if not hasattr(self.model, "project") or not hasattr(self.model, "params"):
-            raise TypeError(f"model: expected a kornia.sensors.camera.CameraModel, got {type(self.model).__name__}")
-        if not isinstance(self.extrinsics, Tensor):
-            raise TypeError(f"extrinsics: expected a torch.Tensor, got {type(self.extrinsics).__name__}")
-        if self.extrinsics.ndim != 3 or self.extrinsics.shape[-2:] != (4, 4):
-            raise ValueError(f"extrinsics: expected shape (C, 4, 4), got {tuple(self.extrinsics.shape)}")
-        params = self.model.params
-        if params.ndim == 2 and params.shape[0] not in (1, self.extrinsics.shape[0]):
-            raise ValueError(
-                f"model: expected params of 1 or {self.extrinsics.shape[0]} cameras as extrinsics, "
-                f"got {params.shape[0]}"
-            )
-
-
-Cameras = PinholeCamera | PosedCamera
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,277 @@
+"""Cameras from matrices, poses of any kind, and gradients of poses and lenses, also where nothing is in view."""
+
+import math
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia.geometry.vector import Vector3
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
+from oracles import pinhole, random_camera, random_gaussians
+
+import kgs
+import kgs.reference
+from kgs import GaussianRenderer, Gaussians, PosedCamera
+
+SIZE = (24, 32)
+FIELDS = ("means", "quats", "scales", "opacities", "colors")
+K = [[30.0, 0.0, 16.0], [0.0, 28.0, 12.0], [0.0, 0.0, 1.0]]
+
+
+def dot(points, dtype=torch.float64):
+    """Small white Gaussians at points of the camera frame."""
+    n = len(points)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4)
+    scales = 0.02 * torch.as_tensor(points).norm(dim=1, keepdim=True).expand(n, 3)
+    values = (torch.as_tensor(points), quats, scales, torch.full((n,), 0.9), torch.ones(n, 3))
+    return Gaussians(*(value.to(dtype) for value in values))
+
+
+# --- kgs.cameras ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [3, 4])
+@pytest.mark.parametrize("count", [None, 1, 3])
+def test_matrices_become_kornias_cameras(side, count):
+    k = torch.eye(side)
+    k[:3, :3] = torch.tensor(K)
+    poses = torch.eye(4) if count is None else torch.eye(4).repeat(count, 1, 1)
+    if count is not None:
+        poses[:, 2, 3] = torch.arange(count)
+    for ks in (k, k[None], k.repeat(count or 1, 1, 1)):
+        made = kgs.cameras(poses, ks, 32, 24)
+        assert made.batch_size == (count or 1)
+        assert torch.equal(made.camera_matrix, torch.tensor(K).expand(count or 1, 3, 3))
+        assert torch.equal(made.intrinsics[:, 3], torch.tensor([[0.0, 0, 0, 1]]).expand(count or 1, 4))
+        assert torch.equal(made.extrinsics, poses.reshape(-1, 4, 4))
+        assert (made.height.tolist(), made.width.tolist()) == ([24] * (count or 1), [32] * (count or 1))
+    half = kgs.cameras(poses, k, 32, 24, pixel_centers="half")
+    assert (half.cx[0], half.cy[0], half.fx[0]) == (15.5, 11.5, 30.0)
+
+
+def test_cameras_are_differentiable():
+    pose, k = torch.eye(4, requires_grad=True), torch.tensor(K, requires_grad=True)
+    made = kgs.cameras(pose, k, 32, 24, pixel_centers="half")
+    (made.extrinsics.sum() + made.intrinsics[:, :3, :3].square().sum()).backward()
+    assert torch.equal(pose.grad, torch.ones(4, 4))
+    expected = torch.tensor(K)
+    expected[:2, 2] -= 0.5
+    assert torch.equal(k.grad, 2 * expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "change"),
+    [
+        ("viewmats", TypeError, {"viewmats": [1]}),
+        ("Ks", TypeError, {"Ks": torch.eye(3).double()}),
+        ("viewmats", ValueError, {"viewmats": torch.eye(3)}),
+        ("Ks", ValueError, {"Ks": torch.eye(2)}),
+        ("Ks", ValueError, {"Ks": torch.eye(3).repeat(2, 1, 1)}),
+        ("width", ValueError, {"width": 0}),
+        ("height", ValueError, {"height": 2.5}),
+        ("pixel_centers", ValueError, {"pixel_centers": "centre"}),
+    ],
+)
+def test_wrong_matrices_and_sizes_are_named(name, error, change):
+    arguments = {"viewmats": torch.eye(4), "Ks": torch.eye(3), "width": 32, "height": 24} | change
+    with pytest.raises(error, match=rf"^{name}: expected"):
+        kgs.cameras(**arguments)
+
+
+# --- nothing in view --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [0, 5])
+@pytest.mark.parametrize("cameras_too", [False, True])
+@pytest.mark.parametrize("leaf", ["extrinsics", "intrinsics", "both"])
+def test_a_camera_that_sees_nothing_has_gradient_zero(n, cameras_too, leaf):
+    """Alone and in a batch whose other camera sees everything; all inputs or the camera's alone are leaves."""
+    gaussians = random_gaussians(n, 0, sh_degree=1)
+    ahead = random_camera(*SIZE, 0)
+    behind = ahead.extrinsics.clone()
+    behind[:, 2, 3] -= 100
+    poses = torch.cat([behind, ahead.extrinsics]) if cameras_too else behind
+    k = ahead.intrinsics.repeat(len(poses), 1, 1)
+    poses.requires_grad_(leaf != "intrinsics")
+    k.requires_grad_(leaf != "extrinsics")
+    sizes = (torch.full((len(poses),), value) for value in SIZE)
+    out = GaussianRenderer()(gaussians, PinholeCamera(k, poses, *sizes), outputs=("image", "alpha", "depth"))
+    (out.image.square().sum() + out.alpha.sum() + out.depth.sum()).backward()
+    for value in (poses, k):
+        if value.requires_grad:
+            assert not value.grad[0].any()
+            assert not cameras_too or n == 0 or value.grad[1].any()
+
+
+# --- poses and lenses as parameters -----------------------------------------------------------------------------
+
+
+def recover(render, parameters, target, steps=50):
+    optimizer = torch.optim.Adam(parameters, lr=0.006)
+    losses = []
+    for _ in range(steps):
+        optimizer.zero_grad()
+        loss = (render() - target).square().mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_pose_and_focal_length_are_optimised_with_cameras_made_in_the_loop():
+    gaussians, renderer = random_gaussians(30, 0, torch.float32, None), GaussianRenderer()
+    k, truth = torch.tensor(K), torch.eye(4)
+    target = renderer(gaussians, kgs.cameras(truth, k, 32, 24)).image
+    twist = torch.tensor([0.02, -0.03, 0.01], requires_grad=True)  # a rotation vector
+    shift = torch.tensor([0.05, 0.0, -0.04], requires_grad=True)
+    focal = torch.tensor([31.0, 27.5], requires_grad=True)
+
+    def render():
+        top = torch.cat([axis_angle_to_rotation_matrix(twist[None])[0], shift[:, None]], 1)
+        pose = torch.cat([top, torch.tensor([[0.0, 0, 0, 1]])])
+        lens = k - torch.diag(k.diagonal()) + torch.diag(torch.cat([focal, torch.ones(1)]))
+        return renderer(gaussians, kgs.cameras(pose, lens, 32, 24)).image
+
+    recover(render, [twist, shift, focal], target)
+
+
+def test_pose_and_lens_that_are_parameters_are_optimised_with_one_camera_object():
+    """Also where the sixteen numbers of the pose are free, and so no rotation any more."""
+    gaussians, renderer = random_gaussians(30, 0, torch.float32, 1), GaussianRenderer()
+    params, pose = torch.tensor([30.0, 28.0, 15.5, 11.5]), torch.eye(4)[None]
+
+    def camera(params, pose):
+        return PosedCamera(CameraModel(ImageSize(*SIZE), CameraModelType.PINHOLE, params), pose)
+
+    target = renderer(gaussians, camera(params, pose)).image
+    params, pose = torch.nn.Parameter(params + 0.3), torch.nn.Parameter(pose.clone())
+    pose.data[0, :3] += 0.02 * torch.randn(3, 4)
+    one = camera(params, pose)
+    recover(lambda: renderer(gaussians, one).image, [params, pose], target)
+
+
+# --- unusual matrices -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", ["scaled", "mirrored", "sheared"])
+def test_a_pose_that_is_no_rotation_is_drawn_from_where_its_rays_meet(change):
+    """x' = B (R x + t) with the lens K B^-1 shows what x' = R x + t shows with K, colours by direction included."""
+    gaussians, camera = random_gaussians(80, 0, sh_degree=3), random_camera(*SIZE, 0)
+    matrix = {"scaled": [1.7, 1.7, 1.7], "mirrored": [-1.0, 1.0, 1.0], "sheared": [1.0, 1.0, 1.0]}[change]
+    matrix = torch.diag(torch.tensor(matrix, dtype=torch.float64))
+    matrix[0, 1] = 0.3 if change == "sheared" else 0.0
+    pose, k = camera.extrinsics.clone(), camera.intrinsics.clone()
+    pose[0, :3] = matrix @ pose[0, :3]
+    k[0, :3, :3] = k[0, :3, :3] @ torch.linalg.inv(matrix / matrix[2, 2])
+    other = PinholeCamera(k, pose, camera.height, camera.width)
+    seen = GaussianRenderer()(gaussians, camera).projected  # the tangent limits of the two sit elsewhere
+    ids = ((seen.means2d - torch.tensor([15.5, 11.5])).abs() < torch.tensor([9.0, 7.0])).all(1).nonzero()[:, 0]
+    ids = seen.gaussian_ids[ids]
+    gaussians = Gaussians(*(getattr(gaussians, name)[ids] for name in FIELDS))
+    expected = GaussianRenderer()(gaussians, camera).image
+    assert expected.std() > 0.03
+    assert (GaussianRenderer()(gaussians, other).image - expected).abs().max() < 1e-10
+    assert (kgs.reference.render(gaussians, other) - expected).abs().max() < 1e-10
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("kind", ["pinhole", "model"])
+def test_a_negative_focal_length_mirrors_the_image(axis, kind):
+    gaussians = random_gaussians(80, 0, sh_degree=None)
+    gaussians = Gaussians(gaussians.means * torch.tensor([2.0, 2.0, 1.0]), *(getattr(gaussians, f) for f in FIELDS[1:]))
+    focal = [30.0, 28.0]
+
+    def render(fx, fy):
+        if kind == "pinhole":
+            return GaussianRenderer()(gaussians, pinhole(*SIZE, (fx, fy))).image
+        params = torch.tensor([fx, fy, 15.5, 11.5], dtype=torch.float64)
+        model = CameraModel(ImageSize(*SIZE), CameraModelType.PINHOLE, params)
+        return GaussianRenderer()(gaussians, PosedCamera(model, torch.eye(4, dtype=torch.float64)[None])).image
+
+    expected = render(*focal).flip(3 - axis)
+    focal[axis] *= -1
+    assert (render(*focal) - expected).abs().max() < 1e-12
+
+
+# --- the fold of a distorted lens -------------------------------------------------------------------------------
+
+FOLDING = [
+    (CameraModelType.BROWN_CONRADY, [-0.1, 0, 0, 0, 0, 0, 0, 0]),
+    (CameraModelType.BROWN_CONRADY, [-0.05, 0, 0.001, -0.001, 0, 0, 0, 0]),
+    (CameraModelType.BROWN_CONRADY, [-0.3, 0.1, 0, 0, -0.02, 0, 0, 0]),
+    (CameraModelType.BROWN_CONRADY, [0.2, -0.1, 0, 0, 0.01, 0.3, 0, 0]),
+    (CameraModelType.BROWN_CONRADY, [0.1, 0, 0, 0, 0, -0.2, 0, 0]),  # a pole
+    (CameraModelType.KANNALA_BRANDT_K3, [-0.2, 0, 0, 0]),
+    (CameraModelType.KANNALA_BRANDT_K3, [0.1, -0.15, 0, 0]),
+    (CameraModelType.KANNALA_BRANDT_K3, [-0.6, 0.0, 0.1, 0.0]),  # grows again behind the fold
+]
+STEADY = [
+    (CameraModelType.BROWN_CONRADY, [0.1, 0.05, 0.001, 0.002, 0.01, 0.02, 0.03, 0.0]),
+    (CameraModelType.KANNALA_BRANDT_K3, [0.05, 0.02, 0.0, 0.0]),
+]
+
+
+def distorted(kind, coefficients, focal=8.0, dtype=torch.float64):
+    params = torch.tensor([focal, focal, 16.0, 12.0, *coefficients], dtype=dtype)
+    return PosedCamera(CameraModel(ImageSize(25, 33), kind, params), torch.eye(4, dtype=dtype)[None])
+
+
+def fold_angle(kind, coefficients):
+    """The first angle where the radius that Kornia projects to stops growing, by looking at many."""
+    radial = list(coefficients)
+    if kind is CameraModelType.BROWN_CONRADY:
+        radial[2:4] = [0, 0]
+    angles = torch.linspace(0, math.radians(89.9), 20000, dtype=torch.float64)
+    points = torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], 1)
+    radii = distorted(kind, radial).model.project(Vector3(points)).data[:, 0] - 16.0
+    falling = (radii.diff() <= 0).nonzero()
+    return float(angles[falling[0, 0]]) if len(falling) else math.pi / 2
+
+
+@pytest.mark.parametrize(("kind", "coefficients"), FOLDING + STEADY)
+def test_what_lies_behind_the_fold_is_not_drawn(kind, coefficients):
+    camera, fold = distorted(kind, coefficients), fold_angle(kind, coefficients)
+    assert (fold < math.radians(85)) == ((kind, coefficients) in FOLDING)
+    angles = torch.cat([torch.linspace(0.02, 1.53, 60), torch.tensor([fold - 0.01, min(fold + 0.01, 1.55)])])
+    for turn in (0.0, 2.1, 4.0):
+        x, y = angles.sin() * math.cos(turn), angles.sin() * math.sin(turn)
+        gaussians = dot(torch.stack([x, y, angles.cos()], 1) * 3.0)
+        leaves = [getattr(gaussians, name).requires_grad_() for name in FIELDS]
+        out = GaussianRenderer(alpha_threshold=0)(gaussians, camera, outputs=("image",))
+        expected = (angles < fold).nonzero()[:, 0]
+        assert torch.equal(out.projected.gaussian_ids, expected)
+        out.image.square().sum().backward()
+        assert all(x.grad.isfinite().all() for x in leaves)
+        assert not leaves[0].grad[angles >= fold].any()
+        assert leaves[0].grad[:10].any()
+
+
+def test_the_gradient_of_a_folding_lens_is_that_of_what_it_sees():
+    kind, coefficients = FOLDING[0]
+    angles = torch.linspace(0.05, 1.4, 12)
+    gaussians = dot(torch.stack([0.8 * angles.sin(), 0.6 * angles.sin(), angles.cos()], 1) * 2.0)
+    params = distorted(kind, coefficients).model.params.clone().requires_grad_()
+    renderer = GaussianRenderer(alpha_threshold=0, transmittance_stop=0)
+
+    def image(params):
+        camera = PosedCamera(CameraModel(ImageSize(25, 33), kind, params), torch.eye(4).double()[None])
+        return renderer(gaussians, camera).image.sum((0, 1))
+
+    assert torch.autograd.gradcheck(image, params, eps=1e-6, atol=1e-6, fast_mode=True)
+
+
+@pytest.mark.parametrize(("kind", "coefficients"), STEADY)
+def test_a_model_made_in_inference_mode_renders_there_and_outside(kind, coefficients):
+    gaussians = random_gaussians(40, 0, torch.float32, 1)
+    expected = GaussianRenderer()(gaussians, distorted(kind, coefficients, dtype=torch.float32)).image
+    with torch.inference_mode():
+        camera = distorted(kind, coefficients, dtype=torch.float32)
+        assert torch.equal(GaussianRenderer()(gaussians, camera).image, expected)
+    leaf = gaussians.means.clone().requires_grad_()
+    moved = Gaussians(leaf, *(getattr(gaussians, name) for name in FIELDS[1:]))
+    image = GaussianRenderer()(moved, camera).image
+    assert torch.equal(image, expected)
+    image.square().sum().backward()
+    assert leaf.grad.any()
