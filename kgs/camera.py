@@ -212,7 +212,8 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
     height, width = int(model.height), int(model.width)
     one = CameraModelBase(model.distortion, model.projection, ImageSize(height, width), params)
     k = torch.diag(params[:2])
-    limits = _tangent_limits(*params[:4].unbind(), height, width)
+    fx, fy, cx, cy = params[:4].unbind()
+    limits = _tangent_limits(fx, fy, cx, cy, height, width)
     parallel = isinstance(model.projection, OrthographicProjection)
     plain = parallel or isinstance(model.distortion, AffineTransform)
 

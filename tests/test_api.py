@@ -32,6 +32,7 @@ INVENTORY = {
         "TrainingDiverged",
         "bin_to_tiles",
         "camera_extent",
+        "cameras",
         "composite",
         "drop_gaussian",
         "load_ply",

@@ -11,7 +11,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.fit.trainer import move_camera
+from kgs.camera import move_camera
 from kgs.losses import photometric_loss, target_moments
 from kgs.model import GaussianModel
 from kgs.projection import project

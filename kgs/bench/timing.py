@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 
 import kgs.reference
-from kgs.fit.trainer import move_camera
+from kgs.camera import move_camera
 
 from .scenes import layered_scene
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from kgs.camera import move_camera
 from kgs.datasets.scene import Scene
 from kgs.ply import load_ply
 from kgs.renderer import GaussianRenderer
@@ -13,7 +14,6 @@ from kgs.renderer import GaussianRenderer
 from .config import Recipe
 from .outputs import check_folder, png_names, write_png
 from .starts import typical_depths
-from .trainer import move_camera
 
 __all__ = ["render_views"]
 

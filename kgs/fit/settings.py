@@ -10,6 +10,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.camera import move_camera
 from kgs.errors import DataError
 from kgs.json_files import read_json
 from kgs.model import GaussianModel
@@ -17,7 +18,6 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import newest_checkpoint
 from .config import FitConfig
-from .trainer import move_camera
 
 __all__ = ["CHECKPOINT", "SavedFit", "load_fit", "read_settings"]
 

@@ -17,6 +17,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.metrics import psnr
 from torch import Tensor
 
+from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
 from kgs.errors import DataError, TrainingDiverged
@@ -31,7 +32,7 @@ from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
 from .state import check_state, restore, trainer_state
 
-__all__ = ["Trainer", "move_camera"]
+__all__ = ["Trainer"]
 
 _GROUPS = {
     "means": "lr_means",
@@ -294,8 +295,3 @@ class Trainer:
 
 def _seed(config: FitConfig, stream: int) -> int:
     return config.seed * 10 + stream
-
-
-def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
-    """The same camera on another device."""
-    return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
