@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import os
 import re
+import uuid
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -27,7 +29,6 @@ __all__ = ["load_ply", "save_ply"]
 
 MAX_HEADER = 1 << 16
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_SPACE, _PART = re.compile(rb"\s"), 1 << 16
 SCALARS = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
@@ -38,66 +39,74 @@ SCALARS = {
 def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None) -> None:
     """Write a model as a 3DGS PLY file, all harmonics included; the file appears whole or not at all.
 
-    The layout knows float32 only: a float32 model without offset comes back from :func:`load_ply` bit for bit, float64
-    values are rounded to the nearest float32. The active degree goes into a comment.
+    Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit,
+    float64 values are rounded. Where float32 would move more than a tenth of the Gaussians by more than a thousandth of
+    their largest axis (a scene in map coordinates, millions of metres from its origin) x, y and z are doubles. A viewer
+    that reads floats alone cannot show such a scene: write it without the offset. The active degree is a comment.
 
     Args:
-        path: the file to write; its folder exists.
+        path: the file to write; its folder exists. Where it is a symbolic link, the file it leads to is written.
         model: the Gaussians.
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
 
     Raises:
         ValueError: `offset` has another shape, or a value is not finite in float32.
     """
-    means = model.means.detach().cpu()
-    if offset is not None:
-        if tuple(offset.shape) != (3,):
-            raise ValueError(f"offset: expected shape (3,), got {tuple(offset.shape)}")
-        means = means.double() + offset.detach().cpu().double()
-    n = len(model)
-    columns = torch.cat(
-        [
-            means.float(),
-            torch.zeros(n, 3),
-            model.sh_dc.detach().cpu().float().reshape(n, 3),
-            model.sh_rest.detach().cpu().float().mT.flatten(1),
-            model.opacity_logits.detach().cpu().float()[:, None],
-            model.log_scales.detach().cpu().float(),
-            model.quats.detach().cpu().float(),
-        ],
-        dim=1,
-    )
+    values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
+    n, means = len(model), values["means"].astype(np.float64)
+    if offset is not None:  # not + 0: that would lose the sign of zero
+        means += _vector("offset", offset)
+    with np.errstate(over="ignore"):
+        columns = np.concatenate(
+            [
+                means,
+                np.zeros((n, 3)),
+                values["sh_dc"][:, 0],
+                values["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * model.sh_rest.shape[1]),
+                values["opacity_logits"][:, None],
+                values["log_scales"],
+                values["quats"],
+            ],
+            axis=1,
+            dtype="<f4",
+            casting="unsafe",
+        )
     names = [*"xyz", "nx", "ny", "nz", *_splat_names(model.sh_rest.shape[1])]
-    bad = (~torch.isfinite(columns)).any(dim=0).nonzero().flatten().tolist()
-    if bad:
+    bad = np.flatnonzero(~np.isfinite(columns).all(axis=0))
+    if len(bad):
         raise ValueError(f"model: expected values that are finite in float32, got others in {names[bad[0]]}")
+    double = _float32_moves(means, values["log_scales"])
+    if double:
+        columns = np.concatenate([means.astype("<f8").view("<f4"), columns[:, 3:]], axis=1)
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment kgs sh_degree {model.sh_degree}",
         f"element vertex {n}",
-        *(f"property float {name}" for name in names),
+        *(f"property {'double' if double and name in 'xyz' else 'float'} {name}" for name in names),
         "end_header\n",
     ]
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    target = Path(os.path.realpath(path))
+    unfinished = target.with_name(f".kgs-{uuid.uuid4().hex}.tmp")
     try:
         with open(unfinished, "wb") as file:
             file.write("\n".join(header).encode("ascii"))
-            file.write(columns.numpy().astype("<f4").tobytes())
-        os.replace(unfinished, path)
+            file.write(columns.tobytes())
+        os.replace(unfinished, target)
     finally:
         unfinished.unlink(missing_ok=True)
 
 
-def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
+def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> GaussianModel:
     """Read a 3DGS PLY file: ascii or binary, properties in any order and of any scalar type, harmonics of degree 0-3.
 
     Properties and elements that are not those of a splat are skipped. The active degree is the one that kgs wrote
-    down, else that of the harmonics in the file.
+    down, else that of the harmonics in the file. Warns where float32 cannot hold the positions and `origin` would help.
 
     Args:
         path: the file to read.
+        origin: subtracted in float64 from the positions before they are rounded, `(3,)`: the `offset` that
+            :func:`save_ply` added. None: nothing.
 
     Returns:
         A float32 model on the CPU.
@@ -105,39 +114,35 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     Raises:
         DataError: the file cannot be read or is no 3DGS PLY: wrong header, a property missing, fewer or more bytes
             than the header says, or a value that is not finite.
+        ValueError: `origin` has another shape or is not finite.
     """
-    path = Path(path)
+    path, start = Path(path), np.zeros(3) if origin is None else _vector("origin", origin)
     try:
         with open(path, "rb") as file:
             header = _read_header(path, file)
-            body = file.read()
+            vertex, names = _splat_element(path, header)
+            columns = _read_columns(path, header, vertex, file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
+    except MemoryError as error:
+        raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
 
-    vertices = [element for element in header.elements if element.name == "vertex"]
-    if len(vertices) != 1:
-        raise DataError(path, "vertex", f"expected one element of that name, got {len(vertices)}")
-    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices[0].properties)
-    sizes = [3 * (k - 1) for k in SH_SIZES]
-    if rest not in sizes:
-        raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
-    names = [*"xyz", *_splat_names(rest // 3)]
-    for name in names:
-        if name not in vertices[0].properties:
-            raise DataError(path, name, "expected this property of a splat, got none")
-
-    columns = _read_columns(path, header, vertices[0], body)
+    means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - start
     with np.errstate(over="ignore"):
-        table = np.stack([columns[name].astype(np.float32) for name in names], axis=1)
+        table = np.stack([*means.astype(np.float32).T, *(columns[name].astype(np.float32) for name in names[3:])], 1)
     bad = np.argwhere(~np.isfinite(table))
     if len(bad):
         row, column = bad[0]
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
 
-    n, degree = len(table), sizes.index(rest)
-    means, dc, sh_rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
+    n, rest = len(table), len(names) - 14
+    means32, dc, sh_rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
+    if _float32_moves(means, scales.numpy()):
+        centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
+        warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
+    degree = SH_SIZES.index(rest // 3 + 1)
     return GaussianModel(
-        means=means,
+        means=means32,
         quats=quats,
         log_scales=scales,
         opacity_logits=opacity[:, 0],
@@ -145,6 +150,22 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
         sh_rest=sh_rest.reshape(n, 3, rest // 3).mT,
         sh_degree=degree if header.sh_degree is None else min(header.sh_degree, degree),
     )
+
+
+def _vector(name: str, value: Tensor) -> NDArray[np.float64]:
+    vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
+    if vector.shape != (3,):
+        raise ValueError(f"{name}: expected shape (3,), got {vector.shape}")
+    if not np.isfinite(vector).all():
+        raise ValueError(f"{name}: expected finite numbers, got {vector.tolist()}")
+    return vector
+
+
+def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[Any]]) -> bool:
+    """Whether float32 would move more than a tenth of the Gaussians by over a thousandth of their largest axis."""
+    with np.errstate(over="ignore"):
+        moved = np.abs(means.astype(np.float32) - means).max(axis=1)
+        return bool((moved > 1e-3 * np.exp(log_scales.max(axis=1))).sum() > 0.1 * len(means))
 
 
 @dataclass
@@ -211,46 +232,72 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
     return _Header(order, elements, degree)
 
 
-def _read_columns(path: Path, header: _Header, vertex: _Element, body: bytes) -> dict[str, NDArray[np.generic]]:
-    """The vertices' properties, after a check that the body is as long as the header says."""
+def _splat_element(path: Path, header: _Header) -> tuple[_Element, list[str]]:
+    """The element of the Gaussians, and the names of the properties of theirs that are read."""
+    vertices = [element for element in header.elements if element.name == "vertex"]
+    if len(vertices) != 1:
+        raise DataError(path, "vertex", f"expected one element of that name, got {len(vertices)}")
+    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices[0].properties)
+    sizes = [3 * (k - 1) for k in SH_SIZES]
+    if rest not in sizes:
+        raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
+    names = [*"xyz", *_splat_names(rest // 3)]
+    for name in names:
+        if name not in vertices[0].properties:
+            raise DataError(path, name, "expected this property of a splat, got none")
+    return vertices[0], names
+
+
+def _read_columns(path: Path, header: _Header, vertex: _Element, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
+    """The vertices' properties; nothing is read before the file is known to be long enough."""
     before = header.elements[: header.elements.index(vertex)]
     if vertex.has_list or any(element.has_list for element in before):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
-    available = len(body) if header.order != "ascii" else sum(map(len, _words(body)))
+    ascii_words = header.order == "ascii"
     start = sum(element.count * element.width(header.order) for element in before)
     end = start + vertex.count * vertex.width(header.order)
     rest = header.elements[len(before) + 1 :]
     total = end + sum(element.count * element.width(header.order) for element in rest)
+    begin, size = file.tell(), os.fstat(file.fileno()).st_size
+    available, most = size - begin, ""
+    if ascii_words and available < 2 * end - 1:
+        most = "at most "
+        available = (available + 1) // 2  # a sign and a space each
+    elif ascii_words:
+        numbers, available = _numbers(path, file, start, end)
     if available < end or (available != total and not any(element.has_list for element in rest)):
-        unit = "numbers" if header.order == "ascii" else "bytes"
-        raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
-    if header.order == "ascii":
-        table = _numbers(path, body, start, end).reshape(vertex.count, len(vertex.properties))
-        return dict(zip(vertex.properties, table.T, strict=True))
-    rows = np.ndarray(vertex.count, vertex.dtype(header.order), buffer=body, offset=start)
+        unit = "numbers" if ascii_words else "bytes"
+        raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {most}{available}")
+    if ascii_words:
+        return dict(zip(vertex.properties, numbers.reshape(vertex.count, len(vertex.properties)).T, strict=True))
+    file.seek(begin + start)
+    rows = np.fromfile(file, vertex.dtype(header.order), vertex.count)
     return {name: rows[name] for name in vertex.properties}
 
 
-def _words(body: bytes) -> Iterator[list[bytes]]:
+def _words(file: BinaryIO) -> Iterator[list[bytes]]:
     """The words of a text, a part at a time: a list of all would take many times the memory of the text."""
-    begin = 0
-    while begin < len(body):
-        match = _SPACE.search(body, begin + _PART)
-        end = match.start() if match else len(body)
-        yield body[begin:end].split()
-        begin = end
+    rest = b""
+    while part := file.read(1 << 16):
+        words = (rest + part).split()
+        # the last word may go on in the next part, but no number is that long
+        rest = b"" if part[-1:].isspace() or len(words[-1]) > 1024 else words.pop()
+        yield words
+    yield rest.split()
 
 
-def _numbers(path: Path, body: bytes, start: int, end: int) -> NDArray[np.float32]:
-    """The words from `start` to `end` as numbers."""
-    numbers, at = np.empty(end - start, np.float32), 0
-    for words in _words(body):
+def _numbers(path: Path, file: BinaryIO, start: int, end: int) -> tuple[NDArray[np.float64], int]:
+    """The words from `start` to `end` as numbers, and how many words there are."""
+    numbers, at = np.empty(end - start), 0
+    for words in _words(file):
         first, last = max(start, at), min(end, at + len(words))
-        try:
-            with np.errstate(over="ignore"):
-                if first < last:
-                    numbers[first - start : last - start] = [float(word) for word in words[first - at : last - at]]
-        except ValueError as error:
-            raise DataError(path, "vertex", str(error)[:200]) from error
+        if first < last:
+            chosen = words[first - at : last - at]
+            try:
+                if b"_" in b"".join(chosen):  # Python alone reads 1_0 as 10
+                    raise ValueError("expected numbers, got a word with an underscore")
+                numbers[first - start : last - start] = [float(word) for word in chosen]
+            except ValueError as error:
+                raise DataError(path, "vertex", str(error)[:200]) from error
         at += len(words)
-    return numbers
+    return numbers, at

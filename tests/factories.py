@@ -17,7 +17,7 @@ from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "footprints", "join", "leaves", "one_gaussian", "pinhole"]
 __all__ += ["posed", "random_camera", "random_gaussians", "random_model", "random_scene", "random_views", "replace"]
-__all__ += ["drop_layer", "random_opacities", "select", "with_camera", "wide_footprints"]
+__all__ += ["drop_layer", "random_opacities", "splat_columns", "select", "with_camera", "wide_footprints"]
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -268,3 +268,10 @@ def random_views(count: int = 2, height: int = 18, width: int = 23, seed: int = 
     extrinsics = cameras.extrinsics.clone()
     extrinsics[:, 0, 3] = torch.arange(count)
     return Views(with_camera(cameras, extrinsics), images, tuple(f"{i}.png" for i in range(count)))
+
+
+def splat_columns(degree: int = 0) -> list[str]:
+    """The properties of a vertex as the files of 3D Gaussian Splatting name and order them."""
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest]
+    return [*names, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]

@@ -1,58 +1,20 @@
+"""Splats that are written: read back bit for bit, by others, at map coordinates, and never half."""
+
 import math
 import os
-import random
-import struct
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from factories import pinhole, random_model, splat_columns
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from kgs.errors import DataError
+from kgs import GaussianRenderer
 from kgs.model import GaussianModel
 from kgs.ply import load_ply, save_ply
-
-SIZES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
-ALIASES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
-FORMATS = SIZES | ALIASES | {"float32": "f", "float64": "d"}
-
-
-def make(n=5, degree=3, dtype=torch.float32, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh_dc": (n, 1, 3)}
-    shapes["sh_rest"] = (n, (degree + 1) ** 2 - 1, 3)
-    return GaussianModel(**{k: torch.randn(v, generator=generator, dtype=dtype) for k, v in shapes.items()})
-
-
-BEFORE_REST = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-AFTER_REST = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-
-
-def splat_columns(degree=0):
-    """Names as the files of 3D Gaussian Splatting have them."""
-    rest = {0: 0, 1: 9, 2: 24, 3: 45}[degree]
-    return [*BEFORE_REST, *(f"f_rest_{i}" for i in range(rest)), *AFTER_REST]
-
-
-def handmade(columns, rows, order="binary_little_endian", newline="\n", before=(), after=(), count=None):
-    """Bytes of a PLY: columns are (name, type), rows lists of numbers; before and after are (header lines, bytes)."""
-    lines = ["ply", f"format {order} 1.0", "comment made by hand"]
-    for header, _ in before:
-        lines += header
-    lines += [f"element vertex {len(rows) if count is None else count}"]
-    lines += [f"property {kind} {name}" for name, kind in columns]
-    for header, _ in after:
-        lines += header
-    head = (newline.join([*lines, "end_header"]) + newline).encode()
-    if order == "ascii":
-        body = "\n".join(" ".join(repr(value) for value in row) for row in rows).encode() + b"\n"
-    else:
-        code = ("<" if order == "binary_little_endian" else ">") + "".join(FORMATS[kind] for _, kind in columns)
-        body = b"".join(struct.pack(code, *row) for row in rows)
-    return head + b"".join(data for _, data in before) + body + b"".join(data for _, data in after)
 
 
 def same(one, two):
@@ -66,7 +28,7 @@ def pairs(one, two):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 6])
 def test_what_is_written_comes_back_bit_for_bit(tmp_path, degree, n):
-    model = make(n, degree)
+    model = random_model(n, degree)
     model.sh_degree = degree // 2
     save_ply(tmp_path / "a.ply", model)
     again = load_ply(tmp_path / "a.ply")
@@ -98,7 +60,7 @@ def test_any_finite_float32_comes_back_bit_for_bit(tmp_path_factory, values):
 
 
 def test_trimesh_reads_all_columns(tmp_path):
-    model = make()
+    model = random_model(5)
     save_ply(tmp_path / "a.ply", model)
     raw = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
     read = {name: np.asarray(raw[name]).reshape(-1) for name in splat_columns(3)}
@@ -116,7 +78,7 @@ def test_trimesh_reads_all_columns(tmp_path):
 
 
 def test_header_is_that_of_3d_gaussian_splatting(tmp_path):
-    save_ply(tmp_path / "a.ply", make(n=4, degree=1))
+    save_ply(tmp_path / "a.ply", random_model(n=4, sh_degree=1))
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -127,164 +89,97 @@ def test_header_is_that_of_3d_gaussian_splatting(tmp_path):
     assert len(body) == 4 * 26 * 4
 
 
-def test_offset_is_added_in_double_precision(tmp_path):
-    model = make()
-    offset = torch.tensor([1e6 + 1 / 3, -3.0, 0.1], dtype=torch.float64)
+UTM = torch.tensor([448262.127, 5411932.678, 118.5], dtype=torch.float64)  # metres, in zone 31
+
+
+def small_model(n=40, dtype=torch.float32):
+    """A splat before a camera at the origin, with Gaussians of some centimetres."""
+    model = random_model(n, dtype=dtype)
+    with torch.no_grad():
+        model.means.mul_(0.3).add_(torch.tensor([0.0, 0.0, 3.0]))
+        model.log_scales.mul_(0.3).sub_(3.0)
+    return model
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_scene_at_map_coordinates_comes_back_where_it_was(tmp_path, dtype):
+    model = small_model(dtype=dtype)
+    save_ply(tmp_path / "a.ply", model, UTM)
+    again = load_ply(tmp_path / "a.ply", origin=UTM)
+    # 1e-9 is what float64 leaves of a metre at 5e6 metres
+    torch.testing.assert_close(again.means.double(), model.means.double(), rtol=1e-7, atol=2e-9)
+    render, camera = GaussianRenderer(), pinhole(40, 48, 50.0, dtype=torch.float32)
+    with torch.no_grad():
+        before, after = (render(m.float()(), camera).image for m in (model, again))
+    assert before.amax() > 0.5
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
+
+
+def test_others_read_the_doubles(tmp_path):
+    model = small_model()
+    save_ply(tmp_path / "a.ply", model, UTM)
+    expected = model.means.detach().double() + UTM
+    raw = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+    for i, name in enumerate("xyz"):
+        assert raw[name].dtype == np.float64
+        assert np.array_equal(np.asarray(raw[name]).reshape(-1), expected[:, i].numpy())
+    assert np.array_equal(np.asarray(raw["rot_3"]).reshape(-1), model.quats[:, 3].detach().numpy())
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    assert [line for line in head.decode().splitlines() if line.startswith("property double")] == [
+        f"property double {name}" for name in "xyz"
+    ]
+    rows = np.frombuffer(body, [(name, "<f8" if name in "xyz" else "<f4") for name in splat_columns(3)])
+    assert np.array_equal(rows["y"], expected[:, 1].numpy())
+
+
+def test_a_float64_model_that_is_at_map_coordinates_itself_keeps_them(tmp_path):
+    model = small_model(dtype=torch.float64)
+    with torch.no_grad():
+        model.means.add_(UTM)
+    save_ply(tmp_path / "a.ply", model)
+    near = load_ply(tmp_path / "a.ply", origin=UTM).means.double() + UTM
+    torch.testing.assert_close(near, model.means.detach(), rtol=0, atol=1e-6)
+
+
+def test_reading_without_an_origin_warns_where_float32_is_too_coarse(tmp_path, recwarn):
+    save_ply(tmp_path / "a.ply", small_model(), UTM)
+    load_ply(tmp_path / "a.ply", origin=UTM)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"pass an origin= near them, \(448262, 5411933, 12[12]\)"):
+        load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("offset", [[1.5, -3.0, 0.1], [0.0, 0.0, 0.0]])
+def test_a_usual_offset_keeps_the_layout_that_viewers_expect(tmp_path, offset):
+    model, offset = small_model(), torch.tensor(offset, dtype=torch.float64)
     save_ply(tmp_path / "a.ply", model, offset)
+    assert b"property float x\n" in (tmp_path / "a.ply").read_bytes()
     again = load_ply(tmp_path / "a.ply")
     assert torch.equal(again.means, (model.means.detach().double() + offset).float())
     assert torch.equal(again.quats, model.quats)
-    with pytest.raises(ValueError, match=r"offset: expected shape \(3,\), got \(1, 3\)"):
-        save_ply(tmp_path / "a.ply", model, offset[None])
+
+
+def test_other_than_three_finite_numbers_are_no_offset_and_no_origin(tmp_path):
+    save_ply(tmp_path / "a.ply", random_model())
+    for call, name in (
+        (lambda x: save_ply(tmp_path / "a.ply", random_model(), x), "offset"),
+        (lambda x: load_ply(tmp_path / "a.ply", x), "origin"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name}: expected shape \(3,\), got \(1, 3\)"):
+            call(torch.zeros(1, 3))
+        with pytest.raises(ValueError, match=f"{name}: expected finite numbers"):
+            call(torch.tensor([0.0, math.nan, 0.0]))
 
 
 def test_a_float64_model_is_rounded_once(tmp_path):
-    model = make(dtype=torch.float64)
+    model = random_model(dtype=torch.float64)
     save_ply(tmp_path / "a.ply", model)
     assert same(load_ply(tmp_path / "a.ply"), model.float())
 
 
-@pytest.mark.parametrize("order", ["binary_little_endian", "binary_big_endian", "ascii"])
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-def test_shuffled_properties_of_any_type_are_found_by_name(tmp_path, order, newline):
-    shuffler = random.Random(3)
-    names = [*splat_columns(1), "red", "confidence"]
-    shuffler.shuffle(names)
-    kinds = shuffler.sample(sorted(FORMATS), len(FORMATS))
-    columns = [(name, kinds[i % len(kinds)]) for i, name in enumerate(names)]
-    whole = {name: FORMATS[kind] not in "fd" for name, kind in columns}
-    # integers where the type wants them, else eighths, which float32 holds exactly
-    rows = [[shuffler.randrange(100) / (1 if whole[name] else 8) for name in names] for _ in range(4)]
-    rows = [[int(v) if whole[name] else v for name, v in zip(names, row, strict=True)] for row in rows]
-    path = tmp_path / "a.ply"
-    path.write_bytes(handmade(columns, rows, order, newline))
-    model = load_ply(path)
-    read = {name: torch.tensor([float(row[i]) for row in rows]) for i, name in enumerate(names)}
-    assert torch.equal(model.means, torch.stack([read[name] for name in "xyz"], 1))
-    assert torch.equal(model.opacity_logits, read["opacity"])
-    assert torch.equal(model.log_scales, torch.stack([read[f"scale_{i}"] for i in range(3)], 1))
-    assert torch.equal(model.quats, torch.stack([read[f"rot_{i}"] for i in range(4)], 1))
-    assert torch.equal(model.sh_dc[:, 0], torch.stack([read[f"f_dc_{i}"] for i in range(3)], 1))
-    for band in range(3):
-        for channel in range(3):
-            assert torch.equal(model.sh_rest[:, band, channel], read[f"f_rest_{3 * channel + band}"])
-    assert model.sh_degree == 1
-
-
-ROW = [float(i) for i in range(17)]
-FLOATS = [(name, "float") for name in splat_columns()]
-
-
-@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
-def test_other_elements_are_skipped(tmp_path, order):
-    packed = order != "ascii"
-    chunk = (["element chunk 2", "property double low", "property uchar flag"], struct.pack("<dBdB", 1, 2, 3, 4))
-    face = (["element face 1", "property list uchar int vertex_indices"], struct.pack("<B3i", 3, 0, 1, 2))
-    data = handmade(
-        FLOATS,
-        [ROW, ROW],
-        order,
-        before=[(chunk[0], chunk[1] if packed else b"1.0 2 3.0 4\n")],
-        after=[(face[0], face[1] if packed else b"3 0 1 2\n")],
-    )
-    (tmp_path / "a.ply").write_bytes(data)
-    assert load_ply(tmp_path / "a.ply").means.tolist() == [[0, 1, 2], [0, 1, 2]]
-
-
-def test_a_comment_cannot_raise_the_degree(tmp_path):
-    save_ply(tmp_path / "a.ply", make(degree=1))
-    data = (tmp_path / "a.ply").read_bytes()
-    (tmp_path / "b.ply").write_bytes(data.replace(b"sh_degree 1", b"sh_degree 3"))
-    assert load_ply(tmp_path / "b.ply").sh_degree == 1
-
-
-def without(name):
-    return [(n, k) for n, k in FLOATS if n != name]
-
-
-GOOD = handmade(FLOATS, [ROW])
-
-
-@pytest.mark.parametrize(
-    ("data", "field", "reason"),
-    [
-        (b"", "", "not a PLY file"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(50), "", "not a PLY file"),
-        (b"ply\n", "header", "end_header"),
-        (b"ply\n" + b"x" * 200_000, "header", "within 65536 bytes"),
-        (b"ply\n" + b"comment long\n" * 10_000, "header", "within 65536 bytes"),
-        (GOOD.replace(b"format binary_little_endian 1.0\n", b""), "format", "got none"),
-        (GOOD.replace(b"little_endian 1.0", b"middle_endian 1.0"), "header", "binary_middle_endian"),
-        (GOOD.replace(b"float opacity", b"half opacity"), "header", "property half opacity"),
-        (GOOD.replace(b"float opacity", b"float x"), "header", "property float x"),
-        (GOOD.replace(b"element vertex 1", b"element vertex -1"), "header", "element vertex -1"),
-        (GOOD.replace(b"element vertex 1", b"element vertex " + b"9" * 40), "header", "999"),
-        (GOOD.replace(b"element vertex 1", b"element vertex 99999999999999999"), "vertex", "bytes after the header"),
-        (GOOD.replace(b"element vertex 1", b"element point 1"), "vertex", "got 0"),
-        (GOOD.replace(b"float nx", b"list uchar float nx"), "vertex", "no list property"),
-        (handmade(FLOATS, [ROW], before=[(["element f 1", "property list uchar int i"], b"\0")]), "vertex", "list"),
-        (handmade(without("opacity"), [ROW[1:]]), "opacity", "got none"),
-        (handmade(without("rot_3"), [ROW[1:]]), "rot_3", "got none"),
-        (handmade([("x", "float"), ("y", "float"), ("z", "float")], [[0, 1, 2]]), "f_dc_0", "got none"),
-        (handmade([*FLOATS, ("f_rest_0", "float")], [[*ROW, 1.0]]), "f_rest", "got 1"),
-        (
-            handmade([*FLOATS, *((f"f_rest_{i + 1}", "uchar") for i in range(9))], [[*ROW, *range(9)]]),
-            "f_rest_0",
-            "got",
-        ),
-        (handmade([], [], count=10**17), "x", "got none"),
-        (handmade(FLOATS, [ROW])[:-1], "vertex", "expected 68 bytes after the header, got 67"),
-        (handmade(FLOATS, [ROW]) + b"\0", "vertex", "expected 68 bytes after the header, got 69"),
-        (handmade(FLOATS, [ROW], after=[(["element e 1", "property int i"], b"\0")]), "vertex", "expected 72 bytes"),
-        (handmade(FLOATS, [ROW, ROW], "ascii")[:-5], "vertex", "expected 34 numbers after the header, got 33"),
-        (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "two"),
-        (handmade(FLOATS, [[*ROW[:9], math.inf, *ROW[10:]]]), "opacity", "got inf in row 0"),
-        (handmade(FLOATS, [ROW, [*ROW[:16], math.nan]]), "rot_3", "got nan in row 1"),
-        (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
-        (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
-    ],
-)
-def test_bad_files_are_described(tmp_path, data, field, reason):
-    path = tmp_path / "bad.ply"
-    path.write_bytes(data)
-    with pytest.raises(DataError) as caught:
-        load_ply(path)
-    assert (caught.value.path, caught.value.field) == (path, field)
-    assert reason in caught.value.reason
-
-
-def test_a_file_that_cannot_be_opened_is_a_data_error(tmp_path):
-    for path in (tmp_path / "missing.ply", tmp_path):
-        with pytest.raises(DataError, match="cannot be read"):
-            load_ply(path)
-
-
-@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
-def test_mutated_and_truncated_files_load_or_raise_data_errors(tmp_path, order):
-    path = tmp_path / "a.ply"
-    data = handmade([(name, "float") for name in splat_columns(1)], [[0.5 * i for i in range(26)]] * 3, order)
-    mutator = random.Random(1)
-    refused = 0
-    for trial in range(400):
-        damaged = bytearray(data)
-        if trial % 2:
-            del damaged[mutator.randrange(len(data)) :]
-        else:
-            for _ in range(mutator.randint(1, 4)):
-                damaged[mutator.randrange(len(data))] = mutator.randrange(256)
-        path.write_bytes(damaged)
-        try:
-            model = load_ply(path)
-        except DataError:
-            refused += 1
-        else:
-            assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
-    assert refused > 200
-
-
 def test_values_that_float32_cannot_hold_are_not_written(tmp_path):
     for value in (math.nan, math.inf, 1e300):
-        model = make(dtype=torch.float64)
+        model = random_model(dtype=torch.float64)
         with torch.no_grad():
             model.sh_rest[1, 2, 0] = value
         with pytest.raises(ValueError, match="finite in float32, got others in f_rest_2"):
@@ -294,7 +189,7 @@ def test_values_that_float32_cannot_hold_are_not_written(tmp_path):
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
-    save_ply(path, make(seed=1))
+    save_ply(path, random_model(seed=1))
     before = path.read_bytes()
 
     def fail(*_):
@@ -302,6 +197,38 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        save_ply(path, make(seed=2))
+        save_ply(path, random_model(seed=2))
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_the_file_behind_a_link_is_written_and_the_link_stays(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "link.ply").symlink_to(tmp_path / "far" / "a.ply")
+    for seed in (1, 2):
+        save_ply(tmp_path / "link.ply", random_model(seed=seed))
+        assert (tmp_path / "link.ply").is_symlink()
+        assert same(load_ply(tmp_path / "far" / "a.ply"), random_model(seed=seed))
+    assert [entry.name for entry in (tmp_path / "far").iterdir()] == ["a.ply"]
+
+
+def test_a_name_as_long_as_the_file_system_allows(tmp_path):
+    path = tmp_path / ("n" * 251 + ".ply")
+    save_ply(path, random_model())
+    assert same(load_ply(path), random_model())
+
+
+def test_default_device_and_default_dtype_do_not_reach_the_file(tmp_path):
+    model = random_model()
+    save_ply(tmp_path / "a.ply", model, torch.ones(3))
+    try:
+        torch.set_default_device("meta")  # stands for an accelerator
+        torch.set_default_dtype(torch.float64)
+        save_ply(tmp_path / "b.ply", model, torch.ones(3, device="cpu"))
+        again = load_ply(tmp_path / "b.ply", origin=torch.ones(3, device="cpu"))
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert again.means.device.type == "cpu"
+    assert again.means.dtype == torch.float32

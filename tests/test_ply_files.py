@@ -1,0 +1,216 @@
+"""Splats that others wrote, or damaged."""
+
+import math
+import random
+import struct
+import tracemalloc
+
+import pytest
+import torch
+from factories import random_model, splat_columns
+
+from kgs.errors import DataError
+from kgs.ply import load_ply, save_ply
+
+SIZES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
+ALIASES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
+FORMATS = SIZES | ALIASES | {"float32": "f", "float64": "d"}
+
+
+def handmade(columns, rows, order="binary_little_endian", newline="\n", before=(), after=(), count=None):
+    """Bytes of a PLY: columns are (name, type), rows lists of numbers; before and after are (header lines, bytes)."""
+    lines = ["ply", f"format {order} 1.0", "comment made by hand"]
+    for header, _ in before:
+        lines += header
+    lines += [f"element vertex {len(rows) if count is None else count}"]
+    lines += [f"property {kind} {name}" for name, kind in columns]
+    for header, _ in after:
+        lines += header
+    head = (newline.join([*lines, "end_header"]) + newline).encode()
+    if order == "ascii":
+        body = "\n".join(" ".join(repr(value) for value in row) for row in rows).encode() + b"\n"
+    else:
+        code = ("<" if order == "binary_little_endian" else ">") + "".join(FORMATS[kind] for _, kind in columns)
+        body = b"".join(struct.pack(code, *row) for row in rows)
+    return head + b"".join(data for _, data in before) + body + b"".join(data for _, data in after)
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_shuffled_properties_of_any_type_are_found_by_name(tmp_path, order, newline):
+    shuffler = random.Random(3)
+    names = [*splat_columns(1), "red", "confidence"]
+    shuffler.shuffle(names)
+    kinds = shuffler.sample(sorted(FORMATS), len(FORMATS))
+    columns = [(name, kinds[i % len(kinds)]) for i, name in enumerate(names)]
+    whole = {name: FORMATS[kind] not in "fd" for name, kind in columns}
+    # integers where the type wants them, else eighths, which float32 holds exactly
+    rows = [[shuffler.randrange(100) / (1 if whole[name] else 8) for name in names] for _ in range(4)]
+    rows = [[int(v) if whole[name] else v for name, v in zip(names, row, strict=True)] for row in rows]
+    path = tmp_path / "a.ply"
+    path.write_bytes(handmade(columns, rows, order, newline))
+    model = load_ply(path)
+    read = {name: torch.tensor([float(row[i]) for row in rows]) for i, name in enumerate(names)}
+    assert torch.equal(model.means, torch.stack([read[name] for name in "xyz"], 1))
+    assert torch.equal(model.opacity_logits, read["opacity"])
+    assert torch.equal(model.log_scales, torch.stack([read[f"scale_{i}"] for i in range(3)], 1))
+    assert torch.equal(model.quats, torch.stack([read[f"rot_{i}"] for i in range(4)], 1))
+    assert torch.equal(model.sh_dc[:, 0], torch.stack([read[f"f_dc_{i}"] for i in range(3)], 1))
+    for band in range(3):
+        for channel in range(3):
+            assert torch.equal(model.sh_rest[:, band, channel], read[f"f_rest_{3 * channel + band}"])
+    assert model.sh_degree == 1
+
+
+ROW = [float(i) for i in range(17)]
+FLOATS = [(name, "float") for name in splat_columns()]
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_other_elements_are_skipped(tmp_path, order):
+    packed = order != "ascii"
+    chunk = (["element chunk 2", "property double low", "property uchar flag"], struct.pack("<dBdB", 1, 2, 3, 4))
+    face = (["element face 1", "property list uchar int vertex_indices"], struct.pack("<B3i", 3, 0, 1, 2))
+    data = handmade(
+        FLOATS,
+        [ROW, ROW],
+        order,
+        before=[(chunk[0], chunk[1] if packed else b"1.0 2 3.0 4\n")],
+        after=[(face[0], face[1] if packed else b"3 0 1 2\n")],
+    )
+    (tmp_path / "a.ply").write_bytes(data)
+    assert load_ply(tmp_path / "a.ply").means.tolist() == [[0, 1, 2], [0, 1, 2]]
+
+
+def test_a_comment_cannot_raise_the_degree(tmp_path):
+    save_ply(tmp_path / "a.ply", random_model(sh_degree=1))
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "b.ply").write_bytes(data.replace(b"sh_degree 1", b"sh_degree 3"))
+    assert load_ply(tmp_path / "b.ply").sh_degree == 1
+
+
+def without(name):
+    return [(n, k) for n, k in FLOATS if n != name]
+
+
+GOOD = handmade(FLOATS, [ROW])
+
+
+@pytest.mark.parametrize(
+    ("data", "field", "reason"),
+    [
+        (b"", "", "not a PLY file"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), "", "not a PLY file"),
+        (b"ply\n", "header", "end_header"),
+        (b"ply\n" + b"x" * 200_000, "header", "within 65536 bytes"),
+        (b"ply\n" + b"comment long\n" * 10_000, "header", "within 65536 bytes"),
+        (GOOD.replace(b"format binary_little_endian 1.0\n", b""), "format", "got none"),
+        (GOOD.replace(b"little_endian 1.0", b"middle_endian 1.0"), "header", "binary_middle_endian"),
+        (GOOD.replace(b"float opacity", b"half opacity"), "header", "property half opacity"),
+        (GOOD.replace(b"float opacity", b"float x"), "header", "property float x"),
+        (GOOD.replace(b"element vertex 1", b"element vertex -1"), "header", "element vertex -1"),
+        (GOOD.replace(b"element vertex 1", b"element vertex " + b"9" * 40), "header", "999"),
+        (GOOD.replace(b"element vertex 1", b"element vertex 99999999999999999"), "vertex", "bytes after the header"),
+        (GOOD.replace(b"element vertex 1", b"element point 1"), "vertex", "got 0"),
+        (GOOD.replace(b"float nx", b"list uchar float nx"), "vertex", "no list property"),
+        (handmade(FLOATS, [ROW], before=[(["element f 1", "property list uchar int i"], b"\0")]), "vertex", "list"),
+        (handmade(without("opacity"), [ROW[1:]]), "opacity", "got none"),
+        (handmade(without("rot_3"), [ROW[1:]]), "rot_3", "got none"),
+        (handmade([("x", "float"), ("y", "float"), ("z", "float")], [[0, 1, 2]]), "f_dc_0", "got none"),
+        (handmade([*FLOATS, ("f_rest_0", "float")], [[*ROW, 1.0]]), "f_rest", "got 1"),
+        (
+            handmade([*FLOATS, *((f"f_rest_{i + 1}", "uchar") for i in range(9))], [[*ROW, *range(9)]]),
+            "f_rest_0",
+            "got",
+        ),
+        (handmade([], [], count=10**17), "x", "got none"),
+        (handmade(FLOATS, [ROW])[:-1], "vertex", "expected 68 bytes after the header, got 67"),
+        (handmade(FLOATS, [ROW]) + b"\0", "vertex", "expected 68 bytes after the header, got 69"),
+        (handmade(FLOATS, [ROW], after=[(["element e 1", "property int i"], b"\0")]), "vertex", "expected 72 bytes"),
+        (handmade(FLOATS, [ROW, ROW], "ascii")[:-5], "vertex", "expected 34 numbers after the header, got 33"),
+        (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "two"),
+        (handmade(FLOATS, [[*ROW[:9], math.inf, *ROW[10:]]]), "opacity", "got inf in row 0"),
+        (handmade(FLOATS, [ROW, [*ROW[:16], math.nan]]), "rot_3", "got nan in row 1"),
+        (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
+        (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
+        (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "underscore"),
+        (handmade(FLOATS, [ROW], "ascii", count=10**17), "vertex", "numbers after the header, got at most 38"),
+    ],
+)
+def test_bad_files_are_described(tmp_path, data, field, reason):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(data)
+    with pytest.raises(DataError) as caught:
+        load_ply(path)
+    assert (caught.value.path, caught.value.field) == (path, field)
+    assert reason in caught.value.reason
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_memory_is_bounded_by_what_the_header_promises(tmp_path, order):
+    path = tmp_path / "a.ply"
+    path.write_bytes(handmade(FLOATS, [ROW], order))
+    with open(path, "r+b") as file:
+        file.truncate(2**32)  # takes no room on the disk
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match="vertex"):
+            load_ply(path) if order != "ascii" else load_ply(_with_vertices(path, 20))
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+    finally:
+        tracemalloc.stop()
+
+
+def _with_vertices(path, count):
+    """As many as are promised, and zero bytes where the numbers should be."""
+    with open(path, "r+b") as file:
+        data = file.read(1 << 16)
+        file.seek(0)
+        file.write(data.replace(b"element vertex 1\n", f"element vertex {count}\n".encode()))
+    return path
+
+
+def test_long_ascii_files_are_read_in_parts_that_cut_no_word(tmp_path):
+    rows = [[(31 * i + j) / 7 for j in range(17)] for i in range(2000)]  # about 600 kB
+    for newline in ("\n", " "):
+        data = handmade(FLOATS, rows, "ascii")
+        head, body = data.split(b"end_header\n")
+        (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.replace(b"\n", newline.encode()))
+        means = load_ply(tmp_path / "a.ply").means
+        assert torch.equal(means, torch.tensor(rows, dtype=torch.float64)[:, :3].float())
+
+
+def test_ascii_positions_are_read_in_double_precision(tmp_path):
+    rows = [[5411932.678 + i / 1000, *ROW[1:]] for i in range(9)]
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, rows, "ascii"))
+    x = load_ply(tmp_path / "a.ply", origin=torch.tensor([5411932.678, 0, 0], dtype=torch.float64)).means[:, 0]
+    torch.testing.assert_close(x, torch.arange(9.0) / 1000, rtol=0, atol=2e-9)
+
+
+def test_a_file_that_cannot_be_opened_is_a_data_error(tmp_path):
+    for path in (tmp_path / "missing.ply", tmp_path):
+        with pytest.raises(DataError, match="cannot be read"):
+            load_ply(path)
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_mutated_and_truncated_files_load_or_raise_data_errors(tmp_path, order):
+    path = tmp_path / "a.ply"
+    data = handmade([(name, "float") for name in splat_columns(1)], [[0.5 * i for i in range(26)]] * 3, order)
+    mutator = random.Random(1)
+    refused = 0
+    for trial in range(400):
+        damaged = bytearray(data)
+        if trial % 2:
+            del damaged[mutator.randrange(len(data)) :]
+        else:
+            for _ in range(mutator.randint(1, 4)):
+                damaged[mutator.randrange(len(data))] = mutator.randrange(256)
+        path.write_bytes(damaged)
+        try:
+            model = load_ply(path)
+        except DataError:
+            refused += 1
+        else:
+            assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
+    assert refused > 200
