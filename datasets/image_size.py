@@ -1,24 +1,30 @@
-"""The size that an image's header claims, read without decoding it: the defence against decompression bombs.
+"""What an image's bytes say before they are decoded: its size, whether it is whole, how its pixels are stored.
+
+Decoding needs up to 24 bytes a pixel (16 bit RGBA as it is stored and as float32). That is foretold here from the
+header, and refused where it is out of all proportion to the file: see `_most_pixels`.
 
 Sources: PNG (ISO 15948, 11.2.1), JPEG (ITU T.81, B.2), WebP (RFC 9649), BMP (Windows' BITMAPCOREHEADER and
-BITMAPINFOHEADER), TIFF 6.0 (section 2).
+BITMAPINFOHEADER), TIFF 6.0 (sections 2, 8 and 18).
 """
 
 from __future__ import annotations
 
+import mmap
+import re
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 from kgs.errors import DataError
 
-__all__ = ["image_size"]
+__all__ = ["image_size", "plain_jpeg", "plain_tiff"]
 
-_MOST_PIXELS = 2**28
-# A plain grey PNG has 1032 pixels a byte, a photo fewer than 100; small images may be as plain as they like.
-_MOST_PIXELS_PER_BYTE, _ALWAYS_ALLOWED = 2048, 2**20
+Buffer = bytes | mmap.mmap
+
+_WIDTH, _HEIGHT, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPLES = 256, 257, 274, 277, 322, 323, 338
 
 
-def image_size(path: Path, data: bytes) -> tuple[int, int]:
+def image_size(path: Path, data: Buffer) -> tuple[int, int]:
     """Width and height as the header of a PNG, JPEG, WebP, BMP or TIFF image says.
 
     Args:
@@ -27,9 +33,9 @@ def image_size(path: Path, data: bytes) -> tuple[int, int]:
 
     Raises:
         DataError: it is none of these formats, its header is cut short, or decoding would take memory out of all
-            proportion to the file: over 2^28 pixels, or over 2048 pixels a byte where there are more than 2^20.
+            proportion to the file.
     """
-    read = next((read for signature, read in _READERS if data.startswith(signature)), None)
+    read = next((read for signature, read in _READERS if data[: len(signature)] == signature), None)
     if read is None:
         raise DataError(path, "", "cannot be decoded: expected a PNG, JPEG, WebP, BMP or TIFF image")
     try:
@@ -38,16 +44,68 @@ def image_size(path: Path, data: bytes) -> tuple[int, int]:
         raise DataError(path, "header", "cannot be decoded: the image's header is damaged or cut short") from error
     if width < 1 or height < 1:
         raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
-    most = min(_MOST_PIXELS, max(_ALWAYS_ALLOWED, _MOST_PIXELS_PER_BYTE * len(data)))
     for wide, high in ((width, height), tile or (1, 1)):
-        if wide * high > most:
+        if wide * high > _most_pixels(len(data)):
             raise DataError(
                 path, "header", f"claims {wide}x{high} pixels in {len(data)} bytes: a decompression bomb, not decoded"
             )
     return width, height
 
 
-def _png(data: bytes) -> tuple[int, ...]:
+def _most_pixels(size: int) -> int:
+    """The most pixels that a file of so many bytes may have.
+
+    Any file may have 2^21 (2 Mpx, 48 MiB while they are decoded). Up to 2^24 (16 Mpx, 384 MiB) a PNG of one colour
+    (1032 pixels a byte) is read; larger images, up to 2^28 pixels, need a byte for every 32 of them. Photos have
+    fewer than 20 a byte.
+    """
+    return min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
+
+
+def plain_jpeg(data: bytes) -> bytes:
+    """A JPEG up to the end of its first image: some phones put a video or a second picture behind it.
+
+    The parameters of a scan that only progressive images have are set to what they have to be in others: some phones
+    leave them 0, which decoders ignore but warn of.
+
+    Raises:
+        ValueError: the file ends before its image does.
+    """
+    parts, sequential = bytearray(data), False
+    for marker, at in _markers(data):
+        if marker in (0xC0, 0xC1):
+            sequential = True
+        elif marker == 0xDA and sequential:
+            end = at + struct.unpack_from(">H", data, at)[0]
+            parts[end - 3 : end] = b"\0\x3f\0"
+        elif marker == 0xD9:
+            return bytes(parts[:at])
+    raise ValueError
+
+
+def plain_tiff(data: bytes) -> tuple[bytes, bool]:
+    """A TIFF whose pixels decoders give as they are stored, and whether these are multiplied by their alpha.
+
+    Decoders turn and mirror an image as its orientation tag says, and multiply 8 bit colours by an alpha that says
+    it is independent of them. Both tags are overwritten.
+
+    Raises:
+        ValueError: it is grey with an alpha channel, which decoders leave out.
+    """
+    tags, order = _tags(data), "<" if data[:1] == b"I" else ">"
+    parts = bytearray(data)
+    if _ORIENTATION in tags:
+        struct.pack_into(order + "H", parts, tags[_ORIENTATION][1], 1)
+    if _EXTRA_SAMPLES not in tags:
+        return bytes(parts), False
+    if tags.get(_SAMPLES, (1, 0))[0] == 2:
+        raise ValueError("is a grey TIFF with an alpha channel, which cannot be read: store it as RGBA or as PNG")
+    kind, at = tags[_EXTRA_SAMPLES]
+    struct.pack_into(order + "H", parts, at, min(kind, 1))
+    return bytes(parts), kind == 1
+
+
+def _png(data: Buffer) -> tuple[int, ...]:
     """Every chunk has to be in the file: decoders take memory for what its length says."""
     if data[12:16] != b"IHDR":
         raise ValueError
@@ -57,24 +115,31 @@ def _png(data: bytes) -> tuple[int, ...]:
     return struct.unpack_from(">II", data, 16)
 
 
-def _jpeg(data: bytes) -> tuple[int, ...]:
-    """Walk from marker to marker, as a decoder does, to the start of the frame."""
-    at = 2
-    while True:
-        at = data.index(b"\xff", at)
-        while data[at] == 0xFF:
-            at += 1
-        marker, at = data[at], at + 1
+def _jpeg(data: Buffer) -> tuple[int, ...]:
+    for marker, at in _markers(data):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack_from(">HH", data, at + 3)
             return width, height
         if marker in (0xD9, 0xDA):
-            raise ValueError
-        if marker not in (0x00, 0x01, *range(0xD0, 0xD9)):  # those have no length behind them
+            break
+    raise ValueError
+
+
+_MARKER = re.compile(rb"\xff+([^\x00\xff])", re.DOTALL)
+
+
+def _markers(data: Buffer) -> Iterator[tuple[int, int]]:
+    """A JPEG's markers and where what follows each begins; the coded data behind a scan's header are passed over."""
+    at = 2
+    while found := _MARKER.search(data, at):
+        marker, at = found[1][0], found.end()
+        del found  # it would keep a mapped file open
+        yield marker, at
+        if marker != 0x01 and not 0xD0 <= marker <= 0xD9:  # those have no length behind them
             at += struct.unpack_from(">H", data, at)[0]
 
 
-def _webp(data: bytes) -> tuple[int, ...]:
+def _webp(data: Buffer) -> tuple[int, ...]:
     kind = data[8:16]
     if kind == b"WEBPVP8X":
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
@@ -87,24 +152,36 @@ def _webp(data: bytes) -> tuple[int, ...]:
     raise ValueError
 
 
-def _bmp(data: bytes) -> tuple[int, ...]:
+def _bmp(data: Buffer) -> tuple[int, ...]:
     if struct.unpack_from("<I", data, 14)[0] == 12:
         return struct.unpack_from("<HH", data, 18)
     width, height = struct.unpack_from("<ii", data, 18)
     return width, abs(height)  # below 0: rows from top to bottom
 
 
-def _tiff(data: bytes) -> tuple[int, ...]:
+def _tiff(data: Buffer) -> tuple[int, ...]:
     """The size of the first image, and that of its tiles, which are decoded whole."""
+    tags = _tags(data)
+    return tuple(tags.get(tag, (0, 0))[0] for tag in (_WIDTH, _HEIGHT, _TILE_WIDTH, _TILE_HEIGHT))
+
+
+def _tags(data: Buffer) -> dict[int, tuple[int, int]]:
+    """The first image's tags that are whole numbers: the first value of each, and where it stands in the file.
+
+    Where a tag is there twice the larger value counts, so that no size is larger than it seems.
+    """
     order = "<" if data[:1] == b"I" else ">"
     start = struct.unpack_from(f"{order}I", data, 4)[0]
-    sizes = dict.fromkeys((256, 257, 322, 323), 0)
-    for i in range(struct.unpack_from(f"{order}H", data, start)[0]):
-        tag, kind = struct.unpack_from(f"{order}HH", data, start + 2 + 12 * i)
-        if tag in sizes and kind in (3, 4):
-            form = "H" if kind == 3 else "I"
-            sizes[tag] = max(sizes[tag], struct.unpack_from(order + form, data, start + 10 + 12 * i)[0])
-    return tuple(sizes.values())
+    tags: dict[int, tuple[int, int]] = {}
+    for at in range(start + 2, start + 2 + 12 * struct.unpack_from(f"{order}H", data, start)[0], 12):
+        tag, kind, count = struct.unpack_from(f"{order}HHI", data, at)
+        if kind in (3, 4):
+            form, size = ("H", 2) if kind == 3 else ("I", 4)
+            at += 8
+            if count * size > 4:
+                at = struct.unpack_from(f"{order}I", data, at)[0]
+            tags[tag] = max(tags.get(tag, (0, 0)), (struct.unpack_from(order + form, data, at)[0], at))
+    return tags
 
 
 _READERS = (

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
+import mmap
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from kornia_rs import io as kornia_io
 from numpy.typing import NDArray
 
 from kgs.errors import DataError
 
-from .image_size import image_size
+from .image_size import image_size, plain_jpeg, plain_tiff
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "Image",
     "Intrinsics",
     "image_folder",
     "list_images",
     "read_image",
     "read_size",
+    "rectification",
+    "remap",
     "resize",
-    "undistort",
 ]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 Image = NDArray[np.float32]
+Maps = tuple[Image, Image]
 
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
 _LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
@@ -97,7 +102,13 @@ def read_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: as in :func:`image_size`, or the file cannot be read.
     """
-    return image_size(path, _read_bytes(path))
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return image_size(path, data)
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+    except ValueError:  # an empty file cannot be mapped
+        return image_size(path, b"")
 
 
 def read_image(path: Path) -> Image:
@@ -110,14 +121,15 @@ def read_image(path: Path) -> Image:
         RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
 
     Raises:
-        DataError: the file cannot be read, is of another format, truncated or a decompression bomb, or holds other
-            numbers than 8 or 16 bit integers.
+        DataError: the file cannot be read, is of another format, truncated or a decompression bomb, is a JPEG that
+            libjpeg finds damage in, or holds other numbers than 8 or 16 bit integers.
     """
-    data = _read_bytes(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
     size = image_size(path, data)
-    # A JPEG cut short decodes, with its rest in grey: its last scan then has no end marker behind it.
-    if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-        raise DataError(path, "", "the JPEG ends before its image does (a truncated file?)")
+    data, premultiplied = _plain(path, data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -132,7 +144,29 @@ def read_image(path: Path) -> Image:
             path, "", f"expected {size} pixels of 1, 3 or 4 channels, got {image.shape[1::-1]} of {channels}"
         )
     image = cv2.cvtColor(image, _TO_RGB[channels])
-    return np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
+    result = np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
+    if premultiplied and channels == 4:
+        result[..., :3] = np.minimum(result[..., :3] / np.maximum(result[..., 3:], 1 / 65535), 1)
+    return result
+
+
+def _plain(path: Path, data: bytes) -> tuple[bytes, bool]:
+    """The image's bytes for OpenCV, checked, and whether it stores colours that are multiplied by their alpha."""
+    if data.startswith((b"II", b"MM")):
+        try:
+            return plain_tiff(data)
+        except ValueError as error:
+            raise DataError(path, "", str(error)) from error
+    if data.startswith(b"\xff\xd8"):
+        try:
+            data = plain_jpeg(data)
+        except ValueError as error:
+            raise DataError(path, "", "the JPEG ends before its image does (a truncated file?)") from error
+        try:  # OpenCV only prints the decoder's warnings, and a damaged image comes in wrong colours
+            kornia_io.decode_image_jpegturbo(data, "mono")
+        except Exception as error:  # its base class is no other
+            raise DataError(path, "", "the JPEG is damaged, or has other colours than grey or RGB") from error
+    return data, False
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:
@@ -153,24 +187,27 @@ def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tup
     return np.clip(reduced, 0.0, 1.0).astype(np.float32), intrinsics.scaled(width, height)
 
 
-def undistort(image: Image, intrinsics: Intrinsics) -> tuple[Image, Intrinsics]:
-    """Resample an image as a pinhole with the same principal point would have seen it.
+def remap(image: Image, maps: Maps | None) -> Image:
+    """Take each pixel from where the maps say; the image itself where there are none."""
+    if maps is None:
+        return image
+    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
+
+
+def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
+    """The pinhole with the principal point of a lens, and where its pixels lie in the lens's image.
 
     The focal length stays too, unless that would leave pixels blank (pincushion distortion): then it grows, the same
     on both axes, until every pixel is covered by the image.
 
-    Args:
-        image: `(H, W)` or `(H, W, K)`.
-        intrinsics: of `image`.
-
     Returns:
-        The pinhole's image and intrinsics; the arguments themselves where there is no distortion.
+        The pinhole and the x and y of its pixels, `(H, W)` each, None where there is no distortion.
 
     Raises:
         ValueError: the coefficients fold the image or map it outside itself, or the image is too long for OpenCV.
     """
     if not intrinsics.fisheye and not any(intrinsics.distortion):
-        return image, replace(intrinsics, distortion=())
+        return replace(intrinsics, distortion=()), None
     if max(intrinsics.width, intrinsics.height) > _LONGEST_REMAPPED:
         raise ValueError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels a side, the image has more")
     zoom = _covering_zoom(intrinsics)
@@ -182,8 +219,7 @@ def undistort(image: Image, intrinsics: Intrinsics) -> tuple[Image, Intrinsics]:
     inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
     if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
         raise ValueError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")
-    resampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(resampled, dtype=np.float32), pinhole
+    return pinhole, (np.asarray(x, np.float32), np.asarray(y, np.float32))
 
 
 def _covering_zoom(intrinsics: Intrinsics) -> float:
@@ -209,10 +245,3 @@ def _covering_zoom(intrinsics: Intrinsics) -> float:
         middle = (low + high) / 2
         low, high = (low, middle) if covered(middle) else (middle, high)
     return high
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error

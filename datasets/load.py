@@ -1,26 +1,32 @@
-"""`load_scene`: one function for all layouts."""
+"""`load_scene`: one function for all layouts, and the one place where a scene is built."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Sequence
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 
+import kornia.geometry as kg
+import torch
+from torch import Tensor
+
 from kgs.errors import DataError
 
-from .frames import BACKGROUNDS
-from .images import image_folder, list_images
-from .layouts.blender import load_blender
-from .layouts.colmap import load_colmap
-from .layouts.colmap_model import find_model
-from .layouts.llff import load_llff
-from .layouts.nerfstudio import load_nerfstudio
-from .scene import Scene
+from .frames import LARGEST, Frame, FrameSet
+from .images import Image, read_image, read_size, rectification, remap, resize
+from .layouts import find_layout
+from .scene import Scene, Views, pinholes
+from .splits import select_evenly, split_by_name
 
 __all__ = ["load_scene"]
 
+_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _POINTS = ("none", "model-points")
+_LISTED = 20
+_FINE_PIXELS = 1_000_000  # of the images for the first points: twice the pixels a side halves the error of the depths
 
 
 def load_scene(
@@ -30,24 +36,30 @@ def load_scene(
     *,
     background: str = "black",
     points: str = "none",
+    photos: bool = True,
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
     The layout is told by what the folder holds, in this order: `poses_bounds.npy` (LLFF), `sparse/0` or `sparse`
-    (COLMAP), `transforms_train.json` (Blender), `transforms.json` (nerfstudio).
+    (COLMAP), `transforms_train.json` (Blender), `transforms.json` (nerfstudio, instant-ngp). What the files say is
+    used, refused, or, where it cannot change a picture, named in `Scene.notes`.
 
     Convention:
         Kornia's in the result, see `Views`: world-to-camera extrinsics with OpenCV axes, integer pixel centres. The
-        world is the files', moved by `Scene.offset`, never scaled or turned.
+        world is the files', moved by `Scene.offset` (the mean of the training cameras' centres), never scaled or
+        turned.
 
     Args:
         path: the scene's folder.
         train_views: how many views to train on, spread evenly over those that are not held out; None takes all.
+            Every eighth photo by name is held out, unless the files themselves name the test views.
         downscale: how many times smaller the images shall be than those that are read (`images/`, else the largest
             `images_k/`), >= 1; None leaves them as they are.
         background: "black" or "white", put behind images with an alpha channel.
         points: "none", or "model-points" for the points of a COLMAP model that at least two training views observe.
             Their positions were refined with the test views too.
+        photos: False reads the photos' sizes only: cameras, names and sizes are the same, `images` have no pixels
+            (they are on torch's "meta" device), `masks` and `finer` are None.
 
     Raises:
         DataError: the folder is no scene, or its files are missing, damaged or contradict each other.
@@ -57,39 +69,140 @@ def load_scene(
         >>> scene = load_scene("fern", train_views=3, downscale=2)  # doctest: +SKIP
         >>> scene.train.images.shape  # doctest: +SKIP
         torch.Size([3, 3, 189, 252])
+        >>> for view in scene.train:  # doctest: +SKIP
+        ...     print(view["name"], view["image"].shape, view["extrinsics"].shape)
+        >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
-    if background not in BACKGROUNDS:
-        raise ValueError(f"background: expected one of {sorted(BACKGROUNDS)}, got {background!r}")
+    if background not in _BACKGROUNDS:
+        raise ValueError(f"background: expected one of {sorted(_BACKGROUNDS)}, got {background!r}")
     if points not in _POINTS:
         raise ValueError(f"points: expected one of {list(_POINTS)}, got {points!r}")
     if downscale is not None and not (isinstance(downscale, (int, float)) and 1 <= downscale < math.inf):
-        raise ValueError(f"downscale: expected None or a number of at least 1, got {downscale!r}")
+        raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
     root = Path(path)
-    if not root.is_dir():
-        raise DataError(root, "", "expected a folder" + (", got a file" if root.exists() else ", there is none"))
-    return _loader(root)(root, train_views, downscale, background, points)
-
-
-def _loader(root: Path) -> Callable[[Path, int | None, float | None, str, str], Scene]:
-    if (root / "poses_bounds.npy").is_file():
-        return load_llff
-    if find_model(root) is not None:
-        return load_colmap
-    if (root / "transforms_train.json").is_file():
-        return load_blender
-    if (root / "transforms.json").is_file():
-        return load_nerfstudio
-    photos = len(list_images(image_folder(root) or root))
-    if photos:
-        raise DataError(
-            root,
-            "",
-            f"has {photos} photos but no camera poses: run COLMAP (its model goes to sparse/0) or nerfstudio's "
-            "ns-process-data (transforms.json) on them first",
-        )
-    raise DataError(
-        root,
-        "",
-        "is no scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
-        "transforms.json (nerfstudio)",
+    found = find_layout(root)
+    if points == "model-points" and found.model_points is None:
+        raise DataError(root, "points", "model-points are not available: there is no COLMAP model in sparse/0")
+    train, test = _split(root, found, train_views)
+    cloud = found.points
+    if points == "model-points" and found.model_points is not None:
+        cloud = found.model_points(train)
+    if not bool((cloud.points.abs() <= LARGEST).all()):
+        raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
+    _check_present(root, [frame.path for frame in (*train, *test)])
+    color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
+    offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; no test view enters it
+    height, width = size = _common_size([*train, *test], downscale)
+    fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
+    is_finer = photos and downscale is not None and fine_downscale < downscale
+    return Scene(
+        train=_views(train, size, offset, color, photos),
+        test=_views(test, size, offset, color, photos),
+        points=(cloud.points - offset).float(),
+        point_colors=cloud.colors.float(),
+        init_kind=cloud.kind,
+        offset=offset,
+        background=color,
+        root=root,
+        finer=_views(train, _common_size(train, fine_downscale), offset, color, photos) if is_finer else None,
+        notes=found.notes,
     )
+
+
+def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:
+    """The frames to train on and those to test on, no photo in both."""
+    every = [*found.frames, *(found.test or ())]
+    path, times = Counter(frame.path for frame in every).most_common(1)[0] if every else (root, 0)
+    if times > 1:
+        twice = next(frame for frame in every if frame.path == path)
+        held_out = " (in the training and in the test views)" if twice in (found.test or ()) else ""
+        raise DataError(twice.source, twice.name, f"expected each image once, got it {times} times{held_out}")
+    frames = found.frames
+    if found.test is None:
+        if len(frames) < 2:
+            raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
+        train, test = split_by_name([frame.name for frame in frames], train_views)
+        return [frames[i] for i in train], [frames[i] for i in test]
+    chosen: Sequence[int] = select_evenly(len(frames), train_views)
+    if train_views == len(found.published) and len(frames) > max(found.published):
+        chosen = found.published
+    return [frames[i] for i in chosen], list(found.test)
+
+
+def _check_present(root: Path, paths: Sequence[Path]) -> None:
+    """Raise one DataError that names every photo that is not there."""
+    missing = [str(path.relative_to(root)) for path in paths if not path.is_file()]
+    if missing:
+        listed = ", ".join(missing[:_LISTED]) + (f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else "")
+        raise DataError(root, "", f"{len(missing)} of {len(paths)} images are missing: {listed}")
+
+
+def _common_size(frames: Sequence[Frame], downscale: float | None) -> tuple[int, int]:
+    """(height, width) of all images after downscaling, from the headers of the photos."""
+    first = None
+    for frame in frames:
+        width, height = read_size(frame.path)
+        lens = frame.intrinsics
+        if not lens.same_aspect(width, height):
+            raise DataError(
+                frame.path,
+                "",
+                f"has {width}x{height} pixels, which is no scaled version of the {lens.width}x{lens.height} that "
+                f"{frame.source.name} describes",
+            )
+        by = downscale or 1
+        size = max(1, round(height / by)), max(1, round(width / by))
+        first = first or (size, f"{width}x{height}")
+        if size != first[0]:
+            raise DataError(frame.path, "", f"expected {first[1]} pixels as the other images, got {width}x{height}")
+    if first is None:
+        raise ValueError("frames: expected one or more, got none")
+    return first[0]
+
+
+def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, background: Tensor, photos: bool) -> Views:
+    """The frames as views of the given (height, width), their photos decoded or not."""
+    count = len(frames)
+    rectify = lru_cache(maxsize=1)(rectification)  # photos of one lens share it
+    images = torch.empty(count, 3, *size, dtype=torch.float32, device="cpu" if photos else "meta")
+    intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
+    alphas: dict[int, Tensor] = {}
+    for i, frame in enumerate(frames):
+        width, height = read_size(frame.path)
+        try:
+            lens, maps = rectify(frame.intrinsics.scaled(width, height))
+        except ValueError as error:
+            raise DataError(frame.source, frame.name, str(error)) from error
+        if photos:
+            image, lens = resize(remap(_composited(frame.path, background), maps), lens, size[1], size[0])
+            pixels = torch.from_numpy(image).permute(2, 0, 1)
+            images[i] = pixels[:3]
+            if len(pixels) == 4:
+                alphas[i] = pixels[3:]
+        else:
+            lens = lens.scaled(size[1], size[0])
+        intrinsics[i, :3, :3] = torch.from_numpy(lens.matrix())
+    opaque = torch.ones(1, *size, dtype=torch.float32)
+    return Views(
+        cameras=pinholes(intrinsics, _extrinsics(frames, offset), size),
+        images=images,
+        names=tuple(frame.name for frame in frames),
+        masks=torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None,
+    )
+
+
+def _composited(path: Path, background: Tensor) -> Image:
+    """A photo's RGB on the background, with its alpha behind if it has one."""
+    image = read_image(path)
+    if image.shape[2] == 4:
+        alpha = image[..., 3:]
+        image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
+    return image
+
+
+def _extrinsics(frames: Sequence[Frame], offset: Tensor) -> Tensor:
+    """World-to-camera `(V, 4, 4)` float32 in the recentred world, the rotations made exactly orthogonal."""
+    poses = torch.stack([frame.pose for frame in frames])
+    u, _, vh = torch.linalg.svd(poses[:, :3, :3])
+    rotation, translation = kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])
+    return kg.Rt_to_matrix4x4(rotation, translation).float()

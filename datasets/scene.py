@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import SupportsIndex
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -12,25 +15,38 @@ from torch.nn.functional import avg_pool2d
 
 from kgs.errors import DataError
 
-__all__ = ["Scene", "Views"]
+__all__ = ["Scene", "Views", "pinholes"]
+
+
+def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
+    """Cameras from `(V, 4, 4)` matrices and one (height, width) for all of them."""
+    return PinholeCamera(intrinsics, extrinsics, *(intrinsics.new_full((len(intrinsics),), float(s)) for s in size))
 
 
 @dataclass(frozen=True)
 class Views:
-    """V posed images of one size.
+    """V posed images of one size: a data set of dicts, `views[0]["image"]`.
 
     Convention:
         Kornia's: world-to-camera extrinsics `(V, 4, 4)` with OpenCV axes (x right, y down, z forward), integer pixel
-        centres (a centred image has cx = (W - 1) / 2). Float32.
+        centres (a centred image has cx = (W - 1) / 2). Float32, whatever torch's default dtype is.
 
     Args:
         cameras: the V cameras; height and width of each equal the images'.
-        images: RGB in [0, 1], `(V, 3, H, W)`.
+        images: RGB in [0, 1], `(V, 3, H, W)`; on the "meta" device (a shape without pixels) in a scene that was
+            loaded with `photos=False`.
         names: file names, unique, in the order of the images.
-        masks: `(V, 1, H, W)` in [0, 1], or None.
+        masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
 
     Raises:
         ValueError: counts, shapes or sizes do not fit.
+
+    Example:
+        >>> from torch.utils.data import DataLoader
+        >>> from kgs.datasets import synthetic_scene
+        >>> batch = next(iter(DataLoader(synthetic_scene().train, batch_size=2)))
+        >>> batch["image"].shape, batch["extrinsics"].shape, batch["intrinsics"].shape
+        (torch.Size([2, 3, 126, 168]), torch.Size([2, 4, 4]), torch.Size([2, 3, 3]))
     """
 
     cameras: PinholeCamera
@@ -53,21 +69,52 @@ class Views:
     def __len__(self) -> int:
         return len(self.names)
 
-    def camera(self, index: int | list[int]) -> PinholeCamera:
-        """The cameras at the given positions (Kornia's class cannot be indexed)."""
-        rows = torch.tensor([index] if isinstance(index, int) else index, dtype=torch.int64)
+    def __getitem__(self, index: SupportsIndex) -> dict[str, Tensor | int | str]:
+        """One view; `torch.utils.data.DataLoader` makes batches of these with its default collate function.
+
+        Returns:
+            image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.cameras` and `kgs.rasterization`
+            take them with `pixel_centers="integer"`, index, name, and mask `(1, H, W)` where there are masks.
+
+        Raises:
+            IndexError: there is no such view.
+        """
+        given = operator.index(index)
+        if not -len(self) <= given < len(self):
+            raise IndexError(f"index: expected a whole number below {len(self)}, the number of views, got {given}")
+        i = given % len(self)
+        view: dict[str, Tensor | int | str] = {
+            "image": self.images[i],
+            "extrinsics": self.cameras.extrinsics[i],
+            "intrinsics": self.cameras.intrinsics[i, :3, :3],
+            "index": i,
+            "name": self.names[i],
+        }
+        return view if self.masks is None else view | {"mask": self.masks[i]}
+
+    def __iter__(self) -> Iterator[dict[str, Tensor | int | str]]:
+        return (self[i] for i in range(len(self)))
+
+    def camera(self, index: SupportsIndex | Sequence[SupportsIndex] | Tensor) -> PinholeCamera:
+        """The cameras at the given positions, one or several (Kornia's class cannot be indexed).
+
+        Raises:
+            TypeError: the positions are no integers.
+            IndexError: there is no such view.
+        """
+        rows = torch.as_tensor(index)
+        if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
+            raise TypeError(f"index: expected integers, got {rows.dtype}")
+        cameras, rows = self.cameras, rows.reshape(-1).long()
         return PinholeCamera(
-            self.cameras.intrinsics[rows],
-            self.cameras.extrinsics[rows],
-            self.cameras.height[rows],
-            self.cameras.width[rows],
+            *(x[rows] for x in (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width))
         )
 
-    def select(self, indices: list[int]) -> Views:
+    def select(self, indices: Sequence[int]) -> Views:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64)
         return Views(
-            cameras=self.camera(list(indices)),
+            cameras=self.camera(rows),
             images=self.images[rows],
             names=tuple(self.names[i] for i in indices),
             masks=None if self.masks is None else self.masks[rows],
@@ -85,9 +132,8 @@ class Views:
         intrinsics = self.cameras.intrinsics.clone()
         intrinsics[:, :2, :3] *= 0.5
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
-        sizes = (torch.full((len(self),), float(size)) for size in (height, width))
         return Views(
-            cameras=PinholeCamera(intrinsics, self.cameras.extrinsics, *sizes),
+            cameras=pinholes(intrinsics, self.cameras.extrinsics, (height, width)),
             images=avg_pool2d(self.images, 2),
             names=self.names,
             masks=None if self.masks is None else avg_pool2d(self.masks, 2),
@@ -109,6 +155,7 @@ class Scene:
         root: the folder the scene was read from.
         finer: the training views in more pixels than `train` has, where the files have more; first points are found
             in these. None where `train` is as fine as that.
+        notes: what the files say that is not used, one sentence each, to be shown to the user.
     """
 
     train: Views
@@ -120,6 +167,7 @@ class Scene:
     background: Tensor
     root: Path
     finer: Views | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.train) == 0:

@@ -51,5 +51,7 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
     if train_views is None:
         return list(range(count))
     if isinstance(train_views, bool) or not isinstance(train_views, int) or not 1 <= train_views <= count:
-        raise ValueError(f"train_views: expected None or a whole number from 1 to {count}, got {train_views!r}")
+        raise ValueError(
+            f"train_views (--views): expected None or a whole number from 1 to {count}, got {train_views!r}"
+        )
     return [int(i) for i in np.round(np.linspace(0, count - 1, train_views))]

@@ -43,7 +43,7 @@ def parse_json(text: bytes) -> Any:
         ValueError: it is no JSON (NaN and Infinity are none), nested too deep, or holds a number beyond float64.
     """
     try:
-        return json.loads(text.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
+        return json.loads(text.decode("utf-8-sig"), parse_constant=_finite, parse_float=_finite)
     except RecursionError as error:
         raise ValueError("nested too deep") from error
 

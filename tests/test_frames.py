@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kgs.datasets.frames import Frame, check_unique, path_inside
+from kgs.datasets.frames import Frame, path_inside
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
@@ -62,10 +62,3 @@ def test_poses_that_no_camera_has(row: int, column: int, value: float) -> None:
     pose[row, column] = value
     with pytest.raises(DataError, match=r"photo\.png"):
         Frame(SOURCE, "photo.png", SOURCE, LENS, pose)
-
-
-def test_one_photo_under_two_names_is_refused(tmp_path: Path) -> None:
-    pose = torch.eye(4, dtype=torch.float64)
-    frames = [Frame(SOURCE, name, tmp_path / "a.png", LENS, pose) for name in ("a.png", "./a.png")]
-    with pytest.raises(DataError, match="2 times"):
-        check_unique(frames)

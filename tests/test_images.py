@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kgs.datasets.images import Intrinsics, image_folder, list_images, read_image, resize, undistort
+from kgs.datasets.images import Intrinsics, image_folder, list_images, read_image, rectification, remap, resize
 from kgs.errors import DataError
 
 WIDTH, HEIGHT = 120, 90
@@ -27,6 +27,11 @@ def centroid(image: np.ndarray) -> np.ndarray:
 
 def lens(*distortion: float, fisheye: bool = False) -> Intrinsics:
     return Intrinsics(WIDTH, HEIGHT, 100.0, 98.0, 58.0, 47.0, distortion, fisheye)
+
+
+def undistort(image: np.ndarray, given: Intrinsics) -> tuple[np.ndarray, Intrinsics]:
+    pinhole, maps = rectification(given)
+    return remap(image, maps), pinhole
 
 
 def test_colours_come_as_rgb(tmp_path: Path) -> None:

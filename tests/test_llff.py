@@ -130,7 +130,6 @@ def with_value(row: int, column: int, value: float) -> np.ndarray:
         (rows()[0], r"\(17,\)"),
         (rows().astype(np.int64), "int64"),
         (with_value(3, 2, np.nan), "row 3.*finite"),
-        (with_value(3, 15, 9.5), "row 3.*near"),
         (with_value(3, 4, 32.5), "row 3.*whole pixels"),
         (with_value(3, 4, 0), "row 3.*whole pixels"),
         (with_value(3, 14, -80), r"image003\.png.*focal length"),

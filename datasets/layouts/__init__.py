@@ -1,1 +1,78 @@
-"""The file layouts that `load_scene` reads, one file each."""
+"""The file layouts that `load_scene` reads, one file each: from a folder to a `FrameSet`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kgs.datasets.frames import FrameSet
+from kgs.datasets.images import image_folder, list_images
+from kgs.errors import DataError
+
+from .blender import load_blender
+from .colmap import load_colmap
+from .colmap_model import find_model
+from .llff import load_llff
+from .nerfstudio import load_nerfstudio
+
+__all__ = ["find_layout"]
+
+_LAYOUTS = (
+    (lambda root: (root / "poses_bounds.npy").is_file(), load_llff),
+    (lambda root: find_model(root) is not None, load_colmap),
+    (lambda root: (root / "transforms_train.json").is_file(), load_blender),
+    (lambda root: (root / "transforms.json").is_file(), load_nerfstudio),
+)
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+_UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif", ".jxl", ".exr")
+_ON_PHOTOS = "run COLMAP (its model goes to sparse/0) or nerfstudio's ns-process-data (transforms.json) on them first"
+
+
+def find_layout(root: Path) -> FrameSet:
+    """What the files of a scene's folder say, whatever layout it has.
+
+    Raises:
+        DataError: the folder is no scene (the message says what it is and what to do), or its files are damaged.
+    """
+    if not root.is_dir():
+        raise DataError(root, "", _about_file(root))
+    for is_there, load in _LAYOUTS:
+        if is_there(root):
+            return load(root)
+    raise DataError(root, "", _about_folder(root))
+
+
+def _is_scene(folder: Path) -> bool:
+    return any(is_there(folder) for is_there, _ in _LAYOUTS)
+
+
+def _about_file(path: Path) -> str:
+    if not path.exists():
+        return "expected a folder, there is none"
+    if path.suffix.lower() in _VIDEOS:
+        return "expected a folder, got a video: take photos out of it (ns-process-data video does that and finds poses)"
+    inside = f": the scene is the folder that it lies in, {path.parent}" if _is_scene(path.parent) else ""
+    return f"expected a folder, got a file{inside}"
+
+
+def _about_folder(root: Path) -> str:
+    """Why a folder is no scene: what it holds instead, and what to do."""
+    for folder in (*sorted(p for p in root.iterdir() if p.is_dir()), *list(root.resolve().parents)[:2]):
+        if _is_scene(folder):
+            return f"is no scene, but {folder} is one: give that folder"
+    photo_folder = image_folder(root) or root
+    photos = len(list_images(photo_folder))
+    if photos:
+        return f"has {photos} photos but no camera poses: {_ON_PHOTOS}"
+    files = [p for folder in {root, photo_folder} for p in folder.iterdir() if not p.name.startswith(".")]
+    for suffixes, advice in (
+        (_UNREADABLE, "photos that cannot be read: convert them to JPEG or PNG"),
+        (_VIDEOS, "videos: take photos out of them (ns-process-data video does that and finds poses)"),
+    ):
+        kinds = sorted({p.suffix[1:].upper() for p in files if p.suffix.lower() in suffixes})
+        if kinds:
+            count = sum(p.suffix.lower() in suffixes for p in files)
+            return f"is no scene: it holds {count} {' and '.join(kinds)} {advice}"
+    return (
+        "is no scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
+        f"transforms.json (nerfstudio), found {'other files' if files else 'an empty folder'}"
+    )

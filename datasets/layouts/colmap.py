@@ -11,9 +11,8 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
-from kgs.datasets.frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
+from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
 from kgs.datasets.images import Intrinsics, image_folder
-from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 
 from .colmap_model import ColmapCamera, ColmapImage, find_model, model_file, read_cameras, read_images, read_points
@@ -21,36 +20,22 @@ from .colmap_model import ColmapCamera, ColmapImage, find_model, model_file, rea
 __all__ = ["camera_to_world", "load_colmap", "track_points"]
 
 
-def load_colmap(
-    root: Path,
-    train_views: int | None = None,
-    downscale: float | None = None,
-    background: str = "black",
-    points: str = "none",
-) -> Scene:
-    """Load a scene whose lenses and poses come from a COLMAP model; distorted lenses are undone.
+def load_colmap(root: Path) -> FrameSet:
+    """Read a COLMAP model in `sparse/0` or `sparse`; distorted lenses are undone when photos are read.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes already; its first pixel's centre is at (0.5, 0.5).
 
-    Args:
-        root: the folder with `sparse/0` or `sparse`, and the photos.
-        train_views: how many views to train on (see `split_by_name`).
-        downscale: how many times smaller the images shall be.
-        background: "black" or "white", behind transparent images.
-        points: "none", or "model-points" for those of the model's points that two training views observe.
-
     Raises:
-        DataError: the model or a photo is missing, damaged, or they do not fit.
-        ValueError: train_views is out of range.
+        DataError: the model is missing or damaged.
     """
     folder = find_model(root)
     if folder is None:
         raise DataError(root, "", "expected a COLMAP model in sparse/0 or sparse, found none")
     cameras_file, images_file = model_file(folder, "cameras"), model_file(folder, "images")
     cameras, images = read_cameras(cameras_file), read_images(images_file)
-    photos, frames = image_folder(root), []
-    for image in images.values():
+    photos, frames, ids = image_folder(root), [], {}
+    for image_id, image in images.items():
         if image.camera_id not in cameras:
             raise DataError(images_file, image.name, f"has camera {image.camera_id}, which {cameras_file.name} lacks")
         path = path_inside(images_file, root, image.name, photos)
@@ -58,12 +43,12 @@ def load_colmap(
             path = path_inside(images_file, root, image.name)
         lens = _intrinsics(cameras[image.camera_id])
         frames.append(Frame(images_file, image.name, path, lens, camera_to_world(image)))
-    train, test = split_frames(root, frames, train_views)
-    cloud = NO_POINTS
-    if points == "model-points":
-        ids = list(images)
-        cloud = track_points(folder, {ids[i] for i in train})
-    return build_scene(root, [frames[i] for i in train], [frames[i] for i in test], downscale, background, cloud)
+        ids[path] = image_id
+    others = [p.name for p in sorted(folder.parent.iterdir()) if p.name.isdecimal() and p != folder and p.is_dir()]
+    notes = (f"sparse/: only model 0 is read, not {', '.join(others[:20])}",) if folder.name == "0" and others else ()
+    return FrameSet(
+        frames, model_points=lambda train: track_points(folder, {ids[frame.path] for frame in train}), notes=notes
+    )
 
 
 def camera_to_world(image: ColmapImage) -> Tensor:
@@ -84,12 +69,11 @@ def track_points(folder: Path, image_ids: set[int]) -> PointCloud:
 
 
 def _intrinsics(camera: ColmapCamera) -> Intrinsics:
-    numbers = camera.params
-    if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+    numbers, model = camera.params, camera.model
+    if model.startswith("SIMPLE_") or model.startswith("RADIAL"):
         numbers = (numbers[0], *numbers)
     fx, fy, cx, cy, *distortion = numbers
-    # Radial models end with k1 or k1, k2; OpenCV's order has p1, p2 next, which are 0 then.
-    if camera.model in ("SIMPLE_RADIAL", "RADIAL"):
+    # Radial models end with k1 or k1, k2; what OpenCV's order has next (p1, p2; k3, k4 of a fisheye) is 0 then.
+    if "RADIAL" in model:
         distortion = [*distortion, 0.0, 0.0, 0.0][:4]
-    fisheye = camera.model == "OPENCV_FISHEYE"
-    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion), fisheye)
+    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion), model.endswith("FISHEYE"))

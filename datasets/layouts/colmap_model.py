@@ -45,6 +45,8 @@ _PARAMETERS = {
     "OPENCV": 8,
     "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
 }
 
 
@@ -129,11 +131,14 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
             _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
         data.finish()
     else:
-        lines = _lines(path)
-        for line in filter(None, lines):
+        may_be_observations = False
+        for line in _lines(path):
+            if not line or (may_be_observations and _is_observations(line)):
+                may_be_observations = False  # an image's second line may be empty, or left out
+                continue
             image_id, *pose, camera_id, name = _fields(path, line, (int, *[float] * 7, int, str))
             _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
-            next(lines, None)  # the observations, a line that may be empty
+            may_be_observations = True
     return images
 
 
@@ -224,7 +229,7 @@ def _read_bytes(path: Path) -> bytes:
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text model without its comments, stripped; empty ones included."""
     try:
-        text = _read_bytes(path).decode("utf-8")
+        text = _read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(path, "", "expected text in UTF-8") from error
     return (line.strip() for line in text.split("\n") if not line.startswith("#"))
@@ -245,6 +250,15 @@ def _floats(text: str) -> tuple[float, ...]:
 
 def _integers(text: str) -> tuple[int, ...]:
     return tuple(map(int, text.split()))
+
+
+def _is_observations(line: str) -> bool:
+    """Whether a line can be an image's observations: x, y and a point's id, again and again."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and len(_floats(" ".join(words[:12]))) > 0
+    except ValueError:
+        return False
 
 
 def _parameter_count(path: Path, camera_id: int, model: str) -> int:

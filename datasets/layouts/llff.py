@@ -5,15 +5,15 @@ Source: https://github.com/Fyusion/LLFF, "Using your own poses without running C
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kgs.datasets.frames import NO_POINTS, Frame, PointCloud, build_scene, path_inside, split_frames
+from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
 from kgs.datasets.images import Intrinsics, image_folder, list_images
-from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 
 from .colmap import camera_to_world, track_points
@@ -22,32 +22,16 @@ from .colmap_model import find_model, model_file, read_images
 __all__ = ["load_llff"]
 
 
-def load_llff(
-    root: Path,
-    train_views: int | None = None,
-    downscale: float | None = None,
-    background: str = "black",
-    points: str = "none",
-) -> Scene:
-    """Load a scene whose poses stand in `poses_bounds.npy`, one row an image in the order of the names.
+def load_llff(root: Path) -> FrameSet:
+    """Read `poses_bounds.npy`, one row an image in the order of the names in `images/` or else `images_k/`.
 
     Convention:
-        A row is a 3x5 matrix and two depths. Its columns are the camera's down, right and backward axes and its
-        centre in the world, then height, width and focal length in pixels; the principal point is the image's
-        centre. The focal length is scaled to the images that are read.
-
-    Args:
-        root: the folder with `poses_bounds.npy` and `images/`, or else `images_k/` (the smallest k is taken).
-        train_views: how many views to train on (see `split_by_name`).
-        downscale: how many times smaller the images shall be.
-        background: "black" or "white", behind transparent images.
-        points: "none", or "model-points" for those points of the COLMAP model beside it that two training views
-            observe; its poses must be those of the file.
+        A row is a 3x5 matrix and two depths, which are not used. Its columns are the camera's down, right and
+        backward axes and its centre in the world, then height, width and focal length in pixels; the principal point
+        is the image's centre. The focal length is scaled to the images that are read.
 
     Raises:
-        DataError: the file is damaged, its rows are not as many as the images, or points are asked for and there is
-            no model that agrees.
-        ValueError: train_views is out of range.
+        DataError: the file is damaged, or its rows are not as many as the images.
     """
     source, folder = root / "poses_bounds.npy", image_folder(root)
     rows = _read_rows(source)
@@ -57,9 +41,7 @@ def load_llff(
     if len(paths) != len(rows):
         raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")
     frames = [_frame(source, path, row) for path, row in zip(paths, rows, strict=True)]
-    train, test = split_frames(root, frames, train_views)
-    cloud = _model_points(root, frames, train) if points == "model-points" else NO_POINTS
-    return build_scene(root, [frames[i] for i in train], [frames[i] for i in test], downscale, background, cloud)
+    return FrameSet(frames, model_points=lambda train: _model_points(root, frames, train))
 
 
 def _read_rows(path: Path) -> NDArray[np.float64]:
@@ -73,8 +55,7 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
         raise DataError(path, "", f"expected floating point numbers of shape (N, 17), got {got}")
     rows = np.array(rows, dtype=np.float64)
     for name, wrong in (
-        ("finite numbers", ~np.isfinite(rows).all(axis=1)),
-        ("a near depth below the far depth", ~(rows[:, 15] < rows[:, 16])),
+        ("finite numbers", ~np.isfinite(rows[:, :15]).all(axis=1)),
         ("a height and width of whole pixels", (rows[:, [4, 9]] < 1).any(axis=1) | (rows[:, [4, 9]] % 1).any(axis=1)),
     ):
         if wrong.any():
@@ -92,7 +73,7 @@ def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
     return Frame(source, path.name, path, lens, torch.from_numpy(pose))
 
 
-def _model_points(root: Path, frames: list[Frame], train: list[int]) -> PointCloud:
+def _model_points(root: Path, frames: Sequence[Frame], train: Sequence[Frame]) -> PointCloud:
     """The points of the COLMAP model that the poses were made from; its images pair with ours in order of name."""
     folder = find_model(root)
     if folder is None:
@@ -104,5 +85,8 @@ def _model_points(root: Path, frames: list[Frame], train: list[int]) -> PointClo
         span = (given[:, :3, 3] - given[:, :3, 3].mean(dim=0)).abs().max()
         difference = (given - model).abs().amax(dim=0)
         if bool((difference[:, :3] < 1e-3).all()) and bool((difference[:, 3] <= 1e-3 * span).all()):
-            return track_points(folder, {images[i][0] for i in train})
+            chosen = {frame.name for frame in train}
+            return track_points(
+                folder, {image[0] for image, frame in zip(images, frames, strict=True) if frame.name in chosen}
+            )
     raise DataError(folder, "points", "model-points are not available: the model's poses are not those of the scene")

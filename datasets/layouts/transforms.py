@@ -1,81 +1,187 @@
-"""The `transforms.json` files of NeRF's Blender scenes, instant-ngp and nerfstudio: strict reading, field by field."""
+"""The `transforms.json` files of NeRF's Blender scenes, instant-ngp and nerfstudio: strict reading, field by field.
+
+What a file says of a lens or a pose is used or refused; other keys that are not known are named in a note.
+
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
+"""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
+import re
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeGuard
 
 import kornia.geometry as kg
 import torch
 from torch import Tensor
 
+from kgs.datasets.frames import Frame, path_inside
+from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics, read_size
 from kgs.errors import DataError
 from kgs.json_files import read_json
 
-__all__ = ["opencv_pose", "read_focal", "read_frames", "read_number", "read_text"]
+__all__ = ["find_photo", "read_transforms"]
+
+Object = dict[str, Any]
+
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
+_BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")  # in OpenCV's order
+_COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
+_KNOWN = """
+    frames file_path transform_matrix train_filenames val_filenames test_filenames
+    camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
+"""
+# How a tool sorts, frames or normalises a scene, and what it did to the world, which stays the file's.
+_HARMLESS = """
+    aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
+    applied_transform applied_scale orientation_override auto_scale_poses_override
+"""
+_GEOMETRY = re.compile(
+    r"angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
+    r"camera|fisheye|ftheta|latlong|equirect|panoram|spheric|ortho|omni|projection|skew|shear|aspect|rolling|shutter|"
+    r"mask|crop|width|height|resolution|pose|matrix|extrins|intrins|transl|rotat|quat|orient|flip|from_na|axis|axes|"
+    r"handed|convention|c2w|w2c",
+    re.IGNORECASE,
+)
 
 
-def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[str, ...]]:
     """Read such a file.
 
+    Convention:
+        `transform_matrix` is camera-to-world with OpenGL axes (x right, y up, z backward). A lens's numbers stand in
+        the frame or, for all frames, at the top; `camera_angle_x` and `_y` are fields of view, used where there is no
+        `fl_x` or `fl_y`. Without them pixels are square, the lens is centred and has the first photo's size.
+
     Returns:
-        The whole object, and its list of frames, not empty.
+        The frames, at least one; the whole object; notes about what is not used.
 
     Raises:
-        DataError: the file cannot be read, see :func:`kgs.json_files.read_json`, or has no list of frames.
+        DataError: the file cannot be read, see :func:`kgs.json_files.read_json`, lacks a field, or says something
+            of lenses or poses that cannot be used.
     """
-    data = read_json(path)
-    frames = data.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise DataError(path, "frames", "expected a list of objects, not empty")
-    return data, frames
+    source = root / name
+    data = read_json(source)
+    entries = data.get("frames")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise DataError(source, "frames", "expected a list of objects, not empty")
+    notes = _check_keys(source, [data, *entries])
+    names = [find_photo(source, root, _text(source, "file_path", entry)) for entry in entries]
+    paths = [path_inside(source, root, name) for name in names]
+    size = next((read_size(path) for path in paths if path.is_file()), (1, 1))
+    frames = [
+        Frame(source, name, path, _lens(source, entry, data, size), _opencv_pose(source, entry))
+        for name, path, entry in zip(names, paths, entries, strict=True)
+    ]
+    return frames, data, notes
 
 
-def read_number(path: Path, key: str, *objects: dict[str, Any], default: float | None = None) -> float:
-    """The number under a key in the first of the objects that has it.
+def find_photo(source: Path, root: Path, name: str) -> str:
+    """The name of a photo within the scene's folder: as given, or with the ending that the file has."""
+    name = str(PurePosixPath(name.replace("\\", "/")))
+    endings = [ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper())]
+    candidates = (name, *(name + ending for ending in endings))
+    otherwise = name if PurePosixPath(name).suffix else f"{name}.png"
+    return next((candidate for candidate in candidates if path_inside(source, root, candidate).is_file()), otherwise)
 
-    Raises:
-        DataError: it is no finite number, or is nowhere and has no default.
-    """
+
+def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
+    """Refuse what bears on lenses and poses and is not known; a note on other things that are not known."""
+    known, unused = {*_KNOWN.split(), *_HARMLESS.split()}, set()
+    for item in objects:
+        for key in item.keys() - known:
+            if not _says_nothing(item[key]):
+                if _GEOMETRY.search(key):
+                    raise DataError(
+                        source, key[:60], f"is not supported: expected none, 0 or false, got {str(item[key])[:60]}"
+                    )
+                unused.add(key[:60])
+    return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
+
+
+def _says_nothing(value: Any) -> bool:
+    return all(map(_says_nothing, value)) if isinstance(value, list) else not value
+
+
+def _lens(source: Path, frame: Object, data: Object, size: tuple[int, ...]) -> Intrinsics:
+    """A frame's lens; where the file does not tell the image size, it is that of the first photo."""
+
+    def number(key: str, default: float | None = None) -> float:
+        return _number(source, key, frame, data, default=default)
+
+    fisheye = _is_fisheye(source, frame, data)
+    width, height = number("w", size[0]), number("h", size[1])
+    if not (width.is_integer() and height.is_integer()):
+        raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
+    fx, fy = (_focal(source, axis, length, frame, data) for axis, length in (("x", width), ("y", height)))
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
+    used = _KANNALA if fisheye else _BROWN
+    of_this_lens = (frame,) if {"camera_model", "is_fisheye"} & frame.keys() else (frame, data)
+    for key in _COEFFICIENTS:
+        if key not in used and (value := _number(source, key, *of_this_lens, default=0.0)) != 0:
+            kind = "a fisheye lens" if fisheye else "a lens that is no fisheye, where tools disagree on its meaning"
+            raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
+    distortion = tuple(number(key, 0.0) for key in used)
+    cx, cy = number("cx", width / 2), number("cy", height / 2)
+    return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
+
+
+def _is_fisheye(source: Path, frame: Object, data: Object) -> bool:
+    """Whether it is one: nerfstudio names the model; instant-ngp says `is_fisheye`."""
+    model = _text(source, "camera_model", frame, data, default="")
+    flag = next((item["is_fisheye"] for item in (frame, data) if "is_fisheye" in item), None)
+    if model not in ("", *_PERSPECTIVE, _FISHEYE):
+        known = ", ".join((*_PERSPECTIVE, _FISHEYE))
+        raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {known}")
+    if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
+        raise DataError(source, "is_fisheye", f"expected true or false, got {str(flag)[:60]!r}")
+    if flag is not None and model and bool(flag) != (model == _FISHEYE):
+        raise DataError(source, "is_fisheye", f"is {str(bool(flag)).lower()}, but camera_model is {model}")
+    return bool(flag) or model == _FISHEYE
+
+
+def _focal(source: Path, axis: str, length: float, *objects: Object) -> float | None:
+    """The focal length in pixels along an axis, from `fl_` or else the field of view over a length; None without."""
+    for item in objects:
+        if f"fl_{axis}" in item:
+            return _number(source, f"fl_{axis}", item)
+        if (key := f"camera_angle_{axis}") in item:
+            angle = _number(source, key, item)
+            if not 0 < angle / 2 < math.pi / 2:
+                raise DataError(source, key, f"expected an angle between 0 and pi, got {angle:g}")
+            return length / (2 * math.tan(angle / 2))
+    return None
+
+
+def _number(path: Path, key: str, *objects: Object, default: float | None = None) -> float:
+    """The finite number under a key in the first of the objects that has it."""
     value = next((item[key] for item in objects if key in item), default)
     if not _is_finite(value):
         raise DataError(path, key, "expected a finite number, got " + ("none" if value is None else repr(value)[:60]))
     return float(value)
 
 
-def read_text(path: Path, key: str, *objects: dict[str, Any], default: str | None = None) -> str:
-    """The text under a key in the first of the objects that has it.
-
-    Raises:
-        DataError: it is no text, or is nowhere and has no default.
-    """
+def _text(path: Path, key: str, *objects: Object, default: str | None = None) -> str:
+    """The text under a key in the first of the objects that has it."""
     value = next((item[key] for item in objects if key in item), default)
     if not isinstance(value, str):
         raise DataError(path, key, "expected a text, got " + ("none" if value is None else repr(value)[:60]))
     return value
 
 
-def read_focal(path: Path, width: float, *objects: dict[str, Any]) -> float:
-    """The focal length in pixels that `camera_angle_x`, the horizontal field of view, gives images of a width.
+def _opencv_pose(path: Path, frame: Object) -> Tensor:
+    """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64.
 
-    Raises:
-        DataError: there is no angle between 0 and pi.
-    """
-    angle = read_number(path, "camera_angle_x", *objects)
-    if not 0 < angle / 2 < math.pi / 2:
-        raise DataError(path, "camera_angle_x", f"expected an angle between 0 and pi, got {angle:g}")
-    return width / (2 * math.tan(angle / 2))
-
-
-def opencv_pose(path: Path, frame: dict[str, Any]) -> Tensor:
-    """A frame's `transform_matrix`, given with OpenGL axes, as camera-to-world with OpenCV axes, `(4, 4)` float64.
-
-    Raises:
-        DataError: it is no 4x4 matrix of finite numbers with the last row 0, 0, 0, 1, up to 1e-6 as an inverse has it.
+    The last row may be off 0, 0, 0, 1 by 1e-6, as an inverse has it.
     """
     rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
+    rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
     if len(rows) != 4 or not all(_is_finite(x) for row in rows for x in row):
         raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
     matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]

@@ -18,7 +18,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs.datasets.scene import Scene, Views
+from kgs.datasets.scene import Scene, Views, pinholes
 
 from .raycast import Array, raycast
 from .world import CENTER, World, make_world, shade
@@ -71,11 +71,11 @@ def synthetic_scene(
     return Scene(
         train=_views(world, train_eyes, size, "train"),
         test=_views(world, test_eyes, size, "test"),
-        points=torch.zeros(0, 3),
-        point_colors=torch.zeros(0, 3),
+        points=torch.zeros(0, 3, dtype=torch.float32),
+        point_colors=torch.zeros(0, 3, dtype=torch.float32),
         init_kind="none",
         offset=torch.zeros(3, dtype=torch.float64),
-        background=torch.zeros(3),
+        background=torch.zeros(3, dtype=torch.float32),
         root=Path("synthetic"),
     )
 
@@ -110,19 +110,17 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 
 def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> Views:
     height, width = size
     count = len(eyes)
-    intrinsics = torch.eye(4).repeat(count, 1, 1)
+    intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
     intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = FOCAL * max(size)
     intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
-    extrinsics = torch.zeros(count, 4, 4)
+    extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
     images = np.zeros((count, 3, height, width), dtype=np.float32)
     for i, eye in enumerate(eyes):
         # rounded to float32 first and then drawn: the images show exactly what the cameras say
         extrinsics[i] = torch.from_numpy(_look_at(eye, CENTER))
         images[i] = _render(world, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
     return Views(
-        cameras=PinholeCamera(
-            intrinsics, extrinsics, torch.full((count,), float(height)), torch.full((count,), float(width))
-        ),
+        cameras=pinholes(intrinsics, extrinsics, size),
         images=torch.from_numpy(images),
         names=tuple(f"{split}_{i:02d}" for i in range(count)),
     )
