@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, TextIO
 
-__all__ = ["progress", "say"]
+__all__ = ["Stage", "progress", "say", "silent"]
+
+Stage = Callable[[int, str, int, str], AbstractContextManager[Callable[..., None]]]  # what `progress` and `silent` are
 
 _LINES = 10  # per stage, where there is no terminal
 
@@ -59,6 +61,12 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
         if bar is not None:
             with suppress(OSError, ValueError):
                 bar.close()
+
+
+@contextmanager
+def silent(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
+    """Like :func:`progress`, and shows nothing."""
+    yield lambda note="": None
 
 
 def _bar(total: int, title: str, done: int, unit: str) -> Any:

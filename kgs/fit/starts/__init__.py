@@ -6,19 +6,18 @@ import warnings
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.errors import DataError
+from kgs.fit.progress import Stage, silent
 from kgs.model import log_spacing
 
 from .dense import dense_points
+from .files import read_points
 from .tracks import find_tracks
 from .triangulate import camera_centers, project_all, triangulate_certain, unproject
 
@@ -52,6 +51,8 @@ def first_points(
     seed: int = 0,
     count: int = 10_000,
     file: str | PathLike[str] | None = None,
+    origin: Tensor | None = None,
+    stage: Stage = silent,
 ) -> FirstPoints:
     """Find the points a fit starts from.
 
@@ -66,7 +67,9 @@ def first_points(
             views; grey if it has no colours.
         seed: of what is drawn at random.
         count: how many points "random" gives, and "dense" at most; >= 1.
-        file: the file of the kind "file".
+        file: the file of the kind "file", not compressed; a splat gives the colours of its harmonics of degree 0.
+        origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
+        stage: shows how far the work is: :func:`kgs.fit.progress.progress`, or nothing.
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.
@@ -82,8 +85,8 @@ def first_points(
     if kind == "file":
         if file is None:
             raise ValueError("file: expected a path for the kind 'file', got None")
-        return FirstPoints(*_read_points(Path(file)), kind="file")
-    points, tracks = triangulate_certain(find_tracks(views), views.cameras)
+        return FirstPoints(*read_points(Path(file), origin), kind="file")
+    points, tracks = triangulate_certain(find_tracks(views, stage), views.cameras)
     inside = _within_typical_depths(points, tracks.seen, views.cameras)
     points, pixels, seen = points[inside], tracks.pixels[inside], tracks.seen[inside]
     if len(points) >= FEWEST_POINTS:
@@ -93,7 +96,7 @@ def first_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
-        dense, colors = dense_points(views, near, far, count, generator)
+        dense, colors = dense_points(views, near, far, count, generator, stage)
         if len(dense) >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind="dense")
         warnings.warn(
@@ -226,23 +229,6 @@ def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:
     samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)[..., 0]
     weights = (seen / seen.sum(1, keepdim=True)).T[:, None].to(images.dtype)
     return torch.where(weights > 0, weights * samples, 0.0).sum(0).T.clamp(0.0, 1.0).contiguous()
-
-
-def _read_points(path: Path) -> tuple[Tensor, Tensor]:
-    if not path.is_file():
-        raise DataError(path, "", "expected a point cloud or mesh, found no such file")
-    try:
-        geometry: Any = trimesh.load(path, process=False)
-        geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
-        points = torch.tensor(geometry.vertices, dtype=torch.float32).reshape(-1, 3)
-        values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
-    except Exception as error:  # each of trimesh's readers raises what its parser meets
-        raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
-    if not len(points) or not bool(points.isfinite().all()):
-        raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
-    if len(values) != len(points):
-        return points, torch.full_like(points, 0.5)
-    return points, torch.tensor(values)[:, :3].float() / 255.0
 
 
 def _quantile(values: Tensor, fraction: float) -> float:

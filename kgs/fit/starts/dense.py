@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.fit.progress import Stage, silent
 
 from .plane_sweep import DepthMap, sweep_depths
 from .triangulate import project_all, unproject
@@ -18,7 +19,7 @@ AGREEMENT = 0.01  # relative difference of the depths that two views have of a p
 
 
 def dense_points(
-    views: Views, near: float, far: float, count: int, generator: torch.Generator
+    views: Views, near: float, far: float, count: int, generator: torch.Generator, stage: Stage = silent
 ) -> tuple[Tensor, Tensor]:
     """Points on the surfaces that at least two views agree on, with their colours there.
 
@@ -33,13 +34,14 @@ def dense_points(
         far: of the farthest.
         count: how many to draw from all that were found, at random.
         generator: of the draw.
+        stage: shows how far the work is.
 
     Returns:
         Points `(P, 3)` float32 in the frame of the views, P <= count, and RGB `(P, 3)` in [0, 1].
     """
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
         views = views.halved()
-    maps = sweep_depths(views, near, far)
+    maps = sweep_depths(views, near, far, stage=stage)
     certain = [there.is_inner & (there.scores > SCORE) for there in maps]
     if views.masks is not None:
         certain = [pixels & (mask[0] > 0.5).cpu() for pixels, mask in zip(certain, views.masks, strict=True)]

@@ -17,6 +17,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.fit.progress import Stage, silent
 
 from .triangulate import camera_centers
 
@@ -49,7 +50,7 @@ class DepthMap:
     is_inner: Tensor
 
 
-def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES) -> list[DepthMap]:
+def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES, stage: Stage = silent) -> list[DepthMap]:
     """The depth map of each view.
 
     Args:
@@ -57,6 +58,7 @@ def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES) ->
         near: depth of the nearest plane, > 0.
         far: of the farthest, > near.
         planes: how many, evenly spread over inverse depth; at least 3.
+        stage: shows how far the work is.
 
     Raises:
         ValueError: the range is empty or not in front of the cameras, or there are too few planes.
@@ -69,19 +71,18 @@ def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES) ->
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
     depth = 1 / float(inverse.mean())
     maps = []
-    for view in range(len(views)):
-        others = _neighbours(views, view, depth)
-        if not others:
-            maps.append(_unknown(grey[view, 0], far))
-            continue
-        scores = _combine(_scores(grey, views.cameras, view, other, inverse) for other in others)
-        cost = _semi_global(1.0 - scores, grey[view, 0])
-        maps.append(_refine(cost, scores, inverse))
+    with stage(len(views), "depth maps", 0, "view") as advance:
+        for view, image in enumerate(grey[:, 0]):
+            scores = _combine(
+                _scores(grey, views.cameras, view, other, inverse) for other in _neighbours(views, view, depth)
+            )
+            if scores is None:
+                unknown = torch.full_like(image, -1.0)
+                maps.append(DepthMap(torch.full_like(image, far), unknown, unknown > 0))
+            else:
+                maps.append(_refine(_semi_global(1.0 - scores, image), scores, inverse))
+            advance()
     return maps
-
-
-def _unknown(image: Tensor, far: float) -> DepthMap:
-    return DepthMap(torch.full_like(image, far), torch.full_like(image, -1.0), torch.zeros_like(image).bool())
 
 
 def _neighbours(views: Views, view: int, depth: float) -> list[int]:
@@ -142,15 +143,21 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 
 
-def _combine(scores: Iterator[Tensor]) -> Tensor:
-    """Of the neighbours the best, and the second best with a quarter of the weight: the others may see it hidden."""
-    best = next(scores)
+def _combine(scores: Iterator[Tensor]) -> Tensor | None:
+    """The best score with three quarters of the weight, the second best with one: further views may see it hidden.
+
+    None without any scores.
+    """
+    best: Tensor | None = None
     second: Tensor | None = None
     for score in scores:
+        if best is None:
+            best = score
+            continue
         lower = torch.minimum(best, score)
         best = torch.maximum(best, score)
         second = lower if second is None else torch.maximum(second, lower)
-    return best if second is None else 0.75 * best + 0.25 * second
+    return best if best is None or second is None else 0.75 * best + 0.25 * second
 
 
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.fit.progress import Stage, silent
 
 __all__ = ["Tracks", "find_tracks"]
 
@@ -43,7 +44,7 @@ class Tracks:
     seen: Tensor
 
 
-def find_tracks(views: Views) -> Tracks:
+def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
     """Find points that at least two of the views see.
 
     A pair of keypoints matches if each is the other's nearest in RootSIFT among those near its epipolar line (under
@@ -53,20 +54,28 @@ def find_tracks(views: Views) -> Tracks:
 
     Args:
         views: posed images; where they have masks, keypoints lie where the mask is above 0.5.
+        stage: shows how far the work is.
 
     Returns:
         The tracks, in float64 on the CPU.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
-    features = [_detect(views, v, limit=min(max(48_000 // len(views), 1500), 12_000)) for v in range(len(views))]
+    limit, features = min(max(48_000 // len(views), 1500), 12_000), []
+    with stage(len(views), "keypoints", 0, "view") as advance:
+        for view in range(len(views)):
+            features.append(_detect(views, view, limit))
+            advance()
     cameras = views.cameras
     projections = (cameras.intrinsics.double() @ cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
     links: list[tuple[float, int, int]] = []
-    for i, j in combinations(range(len(views)), 2):
-        distances, pairs = _match(features[i], features[j], projections[i], projections[j])
-        ends = nodes[i][pairs[:, 0]], nodes[j][pairs[:, 1]]
-        links += zip(distances.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
+    pairs = list(combinations(range(len(views)), 2))
+    with stage(len(pairs), "matches", 0, "pair") as advance:
+        for i, j in pairs:
+            distances, found = _match(features[i], features[j], projections[i], projections[j])
+            ends = nodes[i][found[:, 0]], nodes[j][found[:, 1]]
+            links += zip(distances.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
+            advance()
     tracks = _join(links, owners)
     table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
     seen = torch.zeros(len(tracks), len(views), dtype=torch.bool)

@@ -1,0 +1,67 @@
+"""First points from a file: a splat of 3D Gaussian Splatting, or any point cloud or mesh that trimesh reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import trimesh
+from torch import Tensor
+
+from kgs.errors import DataError
+from kgs.harmonics import SH_C0
+from kgs.ply import load_ply
+
+__all__ = ["read_points"]
+
+_MOST_BYTES = 2**30
+_PACKED = {b"PK\3\4": "zip", b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zX": "xz", b"7z\xbc\xaf": "7z"}
+
+
+def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Positions and colours of the points or vertices in a file.
+
+    Args:
+        path: the file. Compressed ones are refused: a small one can hold more than the memory.
+        origin: subtracted in the file's precision, `(3,)`; None for zeros.
+
+    Returns:
+        `(P, 3)` and RGB in [0, 1], `(P, 3)`, float32; a splat has the colours of its harmonics of degree 0, and what
+        has no colours is grey.
+
+    Raises:
+        DataError: the file is missing, broken, compressed, larger than 1 GiB, or has no points or infinite ones.
+    """
+    if not path.is_file():
+        raise DataError(path, "", "expected a point cloud or mesh, found no such file")
+    if path.stat().st_size > _MOST_BYTES:
+        raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
+    with open(path, "rb") as file:
+        head = file.read(2**13)
+    for magic, name in _PACKED.items():
+        if head.startswith(magic):
+            raise DataError(path, "", f"expected a point cloud or mesh, got a {name} archive: unpack it first")
+    points, colors = _splat(path) if head.startswith(b"ply") and b" f_dc_0" in head else _cloud(path)
+    points = (points if origin is None else points - origin).float()
+    if not len(points) or not bool(points.isfinite().all()):
+        raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
+    return points, colors
+
+
+def _splat(path: Path) -> tuple[Tensor, Tensor]:
+    model = load_ply(path)
+    return model.means.detach().double(), (0.5 + SH_C0 * model.sh_dc.detach()[:, 0]).clamp(0.0, 1.0)
+
+
+def _cloud(path: Path) -> tuple[Tensor, Tensor]:
+    try:
+        geometry: Any = trimesh.load(path, process=False, skip_materials=True)
+        geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
+        points = torch.tensor(geometry.vertices, dtype=torch.float64).reshape(-1, 3)
+        values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
+    except Exception as error:  # each of trimesh's readers raises what its parser meets
+        raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
+    if len(values) != len(points):
+        return points, torch.full((len(points), 3), 0.5)
+    return points, torch.tensor(values)[:, :3].float() / 255.0

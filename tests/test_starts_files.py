@@ -1,0 +1,96 @@
+"""First points from files: point clouds, meshes and splats; damaged and packed files are refused."""
+
+from __future__ import annotations
+
+import gzip
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from start_scenes import flat
+
+import kgs
+from kgs.errors import DataError
+from kgs.fit.starts import first_points
+
+
+def test_file_with_colors(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(size=(30, 3)).astype(np.float32), rng.integers(0, 256, (30, 4), dtype=np.uint8)
+    trimesh.PointCloud(points, colors=colors).export(tmp_path / "cloud.ply")
+    result = first_points(flat(), "file", file=tmp_path / "cloud.ply")
+    assert result.kind == "file"
+    assert result.points.dtype == result.colors.dtype == torch.float32
+    np.testing.assert_array_equal(result.points.numpy(), points)
+    np.testing.assert_allclose(result.colors.numpy(), colors[:, :3] / 255, atol=1e-6)
+
+
+def test_file_without_colors_is_grey(tmp_path: Path) -> None:
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
+    for name in ("cloud.ply", "mesh.obj"):
+        result = first_points(flat(), "file", file=tmp_path / name)
+        assert result.points.shape == (3, 3)
+        assert torch.equal(result.colors, torch.full((3, 3), 0.5))
+
+
+@pytest.mark.parametrize("content", [None, b"", b"ply\nformat ascii 1.0\nelement vertex 2\n", b"garbage"])
+def test_broken_file(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "cloud.ply"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=r"cloud\.ply"):
+        first_points(flat(), "file", file=path)
+
+
+def test_file_with_a_point_that_is_not_finite(tmp_path: Path) -> None:
+    trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
+    with pytest.raises(DataError, match="finite"):
+        first_points(flat(), "file", file=tmp_path / "cloud.ply")
+
+
+@pytest.mark.parametrize("ending", [".zip", ".ply.gz", ".gz", ".tar.gz", ".ply"])
+def test_a_packed_file_is_refused_before_it_is_unpacked(tmp_path: Path, ending: str) -> None:
+    """A few hundred kilobytes can hold gigabytes; whatever the file is called, its memory is bounded."""
+    header = "ply\nformat ascii 1.0\nelement vertex 8000000\n" + "".join(f"property float {x}\n" for x in "xyz")
+    cloud = f"{header}end_header\n".encode() + b"0 0 0\n" * 8_000_000
+    path = tmp_path / f"cloud{ending}"
+    if ending == ".zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("cloud.ply", cloud)
+    else:
+        path.write_bytes(gzip.compress(cloud))
+    code = (
+        "import sys, kgs\nfrom kgs.fit.machine import peak_rss_mb\nfrom kgs.fit.starts.files import read_points\n"
+        "from pathlib import Path\nbefore = peak_rss_mb()\n"
+        "try:\n    read_points(Path(sys.argv[1]))\n"
+        "except kgs.DataError as error:\n    print(peak_rss_mb() - before, error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=100)
+    memory, said = done.stdout.split(" ", 1)
+    assert int(memory) < 64
+    assert "unpack it first" in said
+
+
+def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points, colors = torch.randn(40, 3, generator=generator), torch.rand(40, 3, generator=generator)
+    kgs.save_ply(tmp_path / "splat.ply", kgs.GaussianModel.from_points(points, colors, sh_degree=2))
+    found = first_points(flat(), "file", file=tmp_path / "splat.ply")
+    assert torch.equal(found.points, points)
+    assert torch.allclose(found.colors, colors, atol=1e-6)
+
+
+def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
+    """At UTM coordinates a float32 is a quarter of a metre."""
+    local = np.random.default_rng(0).normal(size=(20, 3)).round(3)
+    origin = np.array([432_100.25, 5_400_000.5, 120.0])
+    rows = "\n".join(" ".join(f"{x:.4f}" for x in row) for row in local + origin)
+    (tmp_path / "cloud.xyz").write_text(rows)
+    found = first_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
+    np.testing.assert_allclose(found.points.numpy(), local, atol=1e-5)
