@@ -1,0 +1,124 @@
+"""The house itself: who may import whom, and what every module says."""
+
+import ast
+import functools
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
+FLOORS = ("core", "fit", "bench", "cli")  # each imports from those before it only
+HEAVY = ("cv2", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "viser", "distributed")
+
+
+def module_name(path):
+    folder, *rest = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join([PACKAGES[folder], *rest]).removesuffix(".__init__")
+
+
+SOURCES = {module_name(path): path for folder in PACKAGES for path in sorted((ROOT / folder).rglob("*.py"))}
+
+
+@functools.cache
+def imports(name):
+    """Absolute names of all that a module imports, at any depth of its code, for types only included."""
+    path, found = SOURCES[name], set()
+    package = name.split(".") if path.stem == "__init__" else name.split(".")[:-1]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            found |= {f"{module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def imported_modules(name):
+    """Modules of ours among them: of `from a import b`, a.b where that is a module, else a."""
+    return {known for known in (f if f in SOURCES else f.rpartition(".")[0] for f in imports(name)) if known in SOURCES}
+
+
+def within(name, *modules):
+    return any(name == module or name.startswith(module + ".") for module in modules)
+
+
+def floor(name):
+    if within(name, "kgs.losses", "kgs.datasets"):
+        return name.split(".")[1]
+    above = [floor for floor in FLOORS[1:] if within(name, f"kgs.{floor}")]
+    return above[0] if above else "core"
+
+
+# -- imports -------------------------------------------------------------------------------------------------------
+
+
+def test_imports_go_one_way():
+    allowed = {
+        "core": {"core"},
+        "losses": {"losses"},
+        "datasets": {"datasets"},
+        "fit": {"core", "losses", "datasets", "fit"},
+        "bench": {"core", "losses", "datasets", "fit", "bench"},
+        "cli": {"core", "losses", "datasets", "fit", "bench", "cli"},
+    }
+    small = ("kgs.errors", "kgs.json_files", "kgs.compiled")  # of the core, what losses and datasets may use
+    wrong = [
+        (name, other)
+        for name in SOURCES
+        for other in sorted(imported_modules(name))
+        if floor(other) not in allowed[floor(name)]
+        and not (floor(name) in ("losses", "datasets") and within(other, *small))
+    ]
+    assert not wrong
+
+
+def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
+    assert {name.split(".")[0] for name in imports("kgs.drop")} - set(sys.stdlib_module_names) == {"torch"}
+    assert imported_modules("kgs.reference") <= {"kgs.types"}
+
+
+def test_importing_kgs_is_light():
+    # torch itself imports tqdm where it is installed
+    code = "import sys, torch; before = set(sys.modules); import kgs; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    new = done.stdout.split()
+    above = [f"kgs.{name}" for name in ("losses", "datasets", "fit", "bench", "cli", "reference")]
+    assert "kgs.renderer" in new
+    assert [name for name in new if within(name, *HEAVY, *above)] == []
+
+
+# -- names and docstrings ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_every_module_says_what_it_is_and_exports_what_it_has(name):
+    module = importlib.import_module(name)
+    assert module.__doc__
+    if len(ast.parse(SOURCES[name].read_text(encoding="utf-8")).body) == 1:
+        return  # a folder with nothing of its own
+    assert len(set(module.__all__)) == len(module.__all__)
+    missing = [exported for exported in module.__all__ if not hasattr(module, exported)]
+    assert not missing, "in __all__, but not there"
+
+
+# -- words ---------------------------------------------------------------------------------------------------------
+
+
+def test_no_file_names_a_place_on_a_disk():
+    tracked = [path for folder in (*PACKAGES, "tests", "docs", ".ci") for path in (ROOT / folder).rglob("*")]
+    texts = [path for path in tracked if path.suffix in {".py", ".md", ".json", ".jsonl", ".csv", ".tex", ".html", ""}]
+    texts = [path for path in [*texts, *ROOT.glob("[!.]*.*")] if path.is_file()]
+    place = re.compile(r"(?<![\w.:/<])/(?:home|root|work|tmp|Users)/\w")
+    found = [
+        (path.relative_to(ROOT).as_posix(), number)
+        for path in texts
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
+        if place.search(line)
+    ]
+    assert not found
