@@ -20,7 +20,7 @@ __all__ = ["LARGEST", "NO_POINTS", "Frame", "FrameSet", "PointCloud", "path_insi
 LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares of them are finite in float32
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One photo with its lens and its pose, its pixels not read yet.
 

@@ -111,13 +111,13 @@ def load_scene(
 
 def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:
     """The frames to train on and those to test on, no photo in both."""
-    every = [*found.frames, *(found.test or ())]
-    path, times = Counter(frame.path for frame in every).most_common(1)[0] if every else (root, 0)
-    if times > 1:
-        twice = next(frame for frame in every if frame.path == path)
-        held_out = " (in the training and in the test views)" if twice in (found.test or ()) else ""
-        raise DataError(twice.source, twice.name, f"expected each image once, got it {times} times{held_out}")
-    frames = found.frames
+    frames, every = found.frames, [*found.frames, *(found.test or ())]
+    times = Counter(frame.path for frame in every)
+    for frame in every:
+        if times[frame.path] > 1:
+            both = frame not in frames or frame.path in [other.path for other in found.test or ()]
+            where = "in the training and in the test views" if both else "several times"
+            raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
     if found.test is None:
         if len(frames) < 2:
             raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")

@@ -1,0 +1,260 @@
+"""What transforms*.json files say of lenses, in both layouts that have them: used or refused, never passed over."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from kgs.datasets import load_scene
+from kgs.errors import DataError
+
+WIDTH, HEIGHT, COUNT = 40, 30, 4
+LENS: dict[str, Any] = {"fl_x": 50.0, "fl_y": 52.0, "cx": 21.0, "cy": 14.5, "w": WIDTH, "h": HEIGHT}
+BOTH = pytest.mark.parametrize("layout", ["nerfstudio", "blender"])
+
+
+def write(root: Path, layout: str, top: dict[str, Any], *own: dict[str, Any], suffix: str = ".png") -> Path:
+    """Frame i has what `own[i]` says; returns the file that holds the training views, the second frame first."""
+    (root / "images").mkdir(exist_ok=True)
+    frames = []
+    for i in range(COUNT):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"images/{i}{suffix}", "transform_matrix": pose.tolist()})
+        frames[-1].update(own[i] if i < len(own) else {})
+        cv2.imwrite(str(root / "images" / f"{i}.png"), ramps())
+    if layout == "nerfstudio":
+        path = root / "transforms.json"
+        path.write_text(json.dumps({**top, "frames": frames}))
+        return path
+    (root / "transforms_test.json").write_text(json.dumps({**top, "frames": frames[:1]}))
+    (root / "transforms_train.json").write_text(json.dumps({**top, "frames": frames[1:]}))
+    return root / "transforms_train.json"
+
+
+def ramps() -> np.ndarray:
+    """A picture whose red and green say column and row."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([np.zeros_like(rows), rows * 1000, columns * 1000], axis=2).astype(np.uint16)
+
+
+def check_undistorted(root: Path, coefficients: tuple[float, ...], fisheye: bool, view: int = 0) -> None:
+    """Each pixel of the loaded picture comes from where OpenCV's projection puts its ray."""
+    scene = load_scene(root)
+    matrix = scene.train.cameras.intrinsics[view, :3, :3].double().numpy()
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=2).reshape(-1, 1, 3)
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    given = np.array([[50, 0, 20.5], [0, 52, 14], [0, 0, 1]])
+    rays = pixels @ np.linalg.inv(matrix).T
+    expected = project(rays, np.zeros(3), np.zeros(3), given, np.array(coefficients))[0].reshape(-1, 2)
+    got = scene.train.images[view, :2].permute(1, 2, 0).reshape(-1, 2).numpy() * 65.535
+    np.testing.assert_allclose(got, expected, atol=0.02)
+
+
+@BOTH
+def test_instant_ngps_fisheye(tmp_path: Path, layout: str) -> None:
+    write(tmp_path, layout, {**LENS, "is_fisheye": True, "k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": 0.002, "p1": 0})
+    check_undistorted(tmp_path, (0.05, -0.02, 0.01, 0.002), fisheye=True)
+
+
+@BOTH
+def test_a_frame_of_its_own_model_among_others(tmp_path: Path, layout: str) -> None:
+    fish = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
+    write(tmp_path, layout, {**LENS, "camera_model": "OPENCV", "k1": -0.05, "p1": 0.001, "is_fisheye": None}, {}, fish)
+    check_undistorted(tmp_path, (0.02, -0.01, 0.003, 0.001), fisheye=True)
+    check_undistorted(tmp_path, (-0.05, 0, 0.001, 0), fisheye=False, view=1)
+
+
+@BOTH
+def test_lenses_of_own_data(tmp_path: Path, layout: str) -> None:
+    write(tmp_path, layout, {**LENS, "camera_angle_x": 0.76, "k1": -0.1, "k2": 0.02, "p1": 0.004, "p2": -0.003})
+    check_undistorted(tmp_path, (-0.1, 0.02, 0.004, -0.003), fisheye=False)
+    write(tmp_path, layout, LENS)
+    np.testing.assert_allclose(
+        load_scene(tmp_path).train.cameras.intrinsics[0, :2, :3], [[50, 0, 20.5], [0, 52, 14]], atol=1e-6
+    )
+
+
+def focal(length: float, angle: float) -> float:
+    return length / 2 / math.tan(angle / 2)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("top", "own", "expected"),
+    [
+        ({"camera_angle_x": 0.8}, {}, (focal(WIDTH, 0.8), focal(WIDTH, 0.8))),
+        ({"camera_angle_x": 0.8, "camera_angle_y": 0.5}, {}, (focal(WIDTH, 0.8), focal(HEIGHT, 0.5))),
+        ({"camera_angle_y": 0.5}, {}, (focal(HEIGHT, 0.5), focal(HEIGHT, 0.5))),
+        ({"fl_y": 44.0}, {}, (44.0, 44.0)),
+        ({"fl_x": 55.0, "camera_angle_y": 0.5}, {}, (55.0, focal(HEIGHT, 0.5))),
+        ({"camera_angle_x": 0.8}, {"camera_angle_x": 0.6}, (focal(WIDTH, 0.6), focal(WIDTH, 0.6))),
+        ({"fl_x": 55.0, "fl_y": 56.0}, {"camera_angle_x": 0.6}, (focal(WIDTH, 0.6), 56.0)),
+        ({"camera_angle_x": 0.8, "w": 80, "h": 60}, {}, (focal(WIDTH, 0.8), focal(WIDTH, 0.8))),
+    ],
+)
+def test_focal_lengths_and_fields_of_view(
+    tmp_path: Path, layout: str, top: dict[str, Any], own: dict[str, Any], expected: tuple[float, float]
+) -> None:
+    write(tmp_path, layout, top, {}, own)
+    cameras = load_scene(tmp_path).train.cameras
+    np.testing.assert_allclose([float(cameras.fx[0]), float(cameras.fy[0])], expected, rtol=1e-6)
+
+
+REFUSED: list[tuple[str, Any]] = [
+    ("k4", 0.1),  # nerfstudio: the fourth radial term; OpenCV: a denominator
+    ("k6", -0.1),
+    ("ftheta_p0", 0.3),
+    ("equirectangular", True),
+    ("latlong", True),
+    ("orthographic", 1),
+    ("rolling_shutter", [0, 0, 0.1, 0]),
+    ("distortion_params", [0.1, 0, 0, 0, 0, 0]),
+    ("fisheye_crop_radius", 12.0),
+    ("mask_path", "masks/0.png"),
+    ("x_fov", 40),
+    ("focal_length", 50),
+    ("principal_point_x", 20),
+    ("lens_mode", "ftheta"),
+    ("skew", 0.1),
+    ("from_na", True),
+    ("is_fisheye", "yes"),
+    ("camera_model", "EQUIRECTANGULAR"),
+    ("camera_model", "FISHEYE624"),
+    ("k1", "0.1"),
+    ("fl_x", -50.0),
+    ("fl_y", -50.0),
+]
+
+
+@BOTH
+@pytest.mark.parametrize("where", ["top", "frame"])
+@pytest.mark.parametrize(("key", "value"), REFUSED)
+def test_what_cannot_be_used_is_refused(tmp_path: Path, layout: str, where: str, key: str, value: Any) -> None:
+    said = {key: value}
+    path = write(tmp_path, layout, {**LENS, **(said if where == "top" else {})}, {}, said if where == "frame" else {})
+    with pytest.raises(DataError, match="focal length" if key.startswith("fl_") else key) as error:
+        load_scene(tmp_path)
+    assert Path(error.value.path).parent == path.parent
+
+
+@pytest.mark.parametrize("flag", [True, False])
+def test_a_fisheye_that_is_none_is_refused(tmp_path: Path, flag: bool) -> None:
+    write(tmp_path, "nerfstudio", {**LENS, "is_fisheye": flag, "camera_model": "OPENCV" if flag else "OPENCV_FISHEYE"})
+    with pytest.raises(DataError, match="is_fisheye.*but camera_model is"):
+        load_scene(tmp_path)
+    write(tmp_path, "nerfstudio", {**LENS, "is_fisheye": True, "p1": 0.01})
+    with pytest.raises(DataError, match="p1.*expected 0 for a fisheye"):
+        load_scene(tmp_path)
+
+
+@BOTH
+def test_what_tools_write_beside_lenses_and_poses_is_no_error(tmp_path: Path, layout: str) -> None:
+    top = {
+        **LENS,
+        **{"aabb_scale": 16, "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "applied_scale": 0.5},
+        **{"orientation_override": "none", "scale": 0.3, "offset": [0.5, 0.5, 0.5], "is_fisheye": False, "k3": 0},
+        **{"k4": 0.0, "distortion_params": [0.0, 0, 0], "mask_path": "", "equirectangular": False},
+    }
+    write(tmp_path, layout, top, *[{"sharpness": 30.1, "rotation": 0.01, "colmap_im_id": i} for i in range(COUNT)])
+    assert load_scene(tmp_path).notes == ()
+
+
+@BOTH
+def test_other_things_that_are_not_used_are_noted(tmp_path: Path, layout: str) -> None:
+    path = write(tmp_path, layout, {**LENS, "ply_file_path": "sparse.ply"}, {}, {"depth_file_path": "d/1.png"})
+    (note,) = {note for note in load_scene(tmp_path).notes if path.name in note}
+    assert note == f"{path.name}: not used: depth_file_path, ply_file_path"
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("written", "stored"),
+    [(".png", ".png"), ("", ".png"), ("", ".PNG"), ("", ".jpg"), ("", ".JPEG"), (".jpg", ".jpg"), ("", ".webp")],
+)
+def test_photos_are_found_whatever_their_ending(tmp_path: Path, layout: str, written: str, stored: str) -> None:
+    write(tmp_path, layout, LENS, suffix=written)
+    for path in list((tmp_path / "images").iterdir()):
+        cv2.imwrite(str(path.with_suffix(stored)), np.full((HEIGHT, WIDTH, 3), 80, np.uint8))
+        if stored != ".png":
+            path.unlink()
+    scene = load_scene(tmp_path)
+    assert scene.train.names == tuple(f"images/{i}{stored}" for i in range(1, COUNT))
+    assert float((scene.train.images - 80 / 255).abs().max()) < 0.01
+
+
+@BOTH
+def test_byte_order_marks_backslashes_and_poses_of_three_rows(tmp_path: Path, layout: str) -> None:
+    path = write(tmp_path, layout, LENS)
+    before = load_scene(tmp_path).train
+    text = path.read_text().replace("images/", "images\\\\").replace(", [0.0, 0.0, 0.0, 1.0]]", "]")
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    after = load_scene(tmp_path).train
+    assert after.names == before.names
+    assert after.cameras.extrinsics.equal(before.cameras.extrinsics)
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train": [3, 1], "test": [2]}, (1, 3), (2,)),
+        ({"train": [3, 1], "val": [0], "test": [2]}, (1, 3), (2,)),
+        ({"train": [3, 1], "val": [0, 2]}, (1, 3), (0, 2)),
+        ({"test": [1]}, (0, 2, 3), (1,)),
+        ({"val": [1], "test": [1]}, (0, 2, 3), (1,)),
+        ({"train": [0, 1, 2]}, (0, 1, 2), (3,)),
+    ],
+)
+def test_the_files_own_split(
+    tmp_path: Path, lists: dict[str, list[int]], train: tuple[int, ...], test: tuple[int, ...]
+) -> None:
+    names = {f"{key}_filenames": [f"./images/{i}.png" for i in value] for key, value in lists.items()}
+    write(tmp_path, "nerfstudio", {**LENS, **names})
+    scene = load_scene(tmp_path)
+    assert scene.train.names == tuple(f"images/{i}.png" for i in train)
+    assert scene.test.names == tuple(f"images/{i}.png" for i in test)
+    assert any("neither" in note for note in scene.notes) == (len(train) + len(test) < COUNT)
+    assert load_scene(tmp_path, 2).train.names == (scene.train.names[0], scene.train.names[-1])
+
+
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        ({"train_filenames": ["images/0.png"], "test_filenames": ["images/0.png"]}, "training and in the test"),
+        ({"train_filenames": ["images/9.png"]}, "images/9.png"),
+        ({"test_filenames": "images/0.png"}, "test_filenames.*list"),
+        ({"test_filenames": [3]}, "test_filenames.*list"),
+        ({"train_filenames": [f"images/{i}.png" for i in range(COUNT)]}, "others to test on"),
+        ({"test_filenames": [f"images/{i}.png" for i in range(COUNT)]}, "others to test on"),
+        ({"test_filenames": ["../0.png"]}, "inside the scene"),
+    ],
+)
+def test_wrong_splits_are_refused(tmp_path: Path, lists: dict[str, Any], message: str) -> None:
+    write(tmp_path, "nerfstudio", {**LENS, **lists})
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path)
+
+
+def test_a_photo_that_both_blender_files_name_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, "blender", LENS)
+    (tmp_path / "transforms_test.json").write_bytes((tmp_path / "transforms_train.json").read_bytes())
+    with pytest.raises(DataError, match=r"images/1\.png.*training and in the test"):
+        load_scene(tmp_path)
+
+
+@BOTH
+@pytest.mark.parametrize("factor", [0.99, 1.01, 2.0])
+@pytest.mark.parametrize("rows", [[0, 1, 2], [1]])
+def test_scaled_poses_are_refused(tmp_path: Path, layout: str, factor: float, rows: list[int]) -> None:
+    pose = np.eye(4)
+    pose[rows] *= factor
+    write(tmp_path, layout, LENS, {}, {"transform_matrix": pose.tolist()})
+    with pytest.raises(DataError, match=r"images/1\.png.*rotation"):
+        load_scene(tmp_path)
