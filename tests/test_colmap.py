@@ -22,6 +22,8 @@ DISTORTED = {
     "OPENCV": [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002],
     "FULL_OPENCV": [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002, 0.01, 0.02, 0.01, 0.0],
     "OPENCV_FISHEYE": [40.0, 42.0, 24.3, 15.6, 0.02, -0.01, 0.003, 0.001],
+    "SIMPLE_RADIAL_FISHEYE": [40.0, 24.3, 15.6, 0.02],
+    "RADIAL_FISHEYE": [40.0, 24.3, 15.6, 0.02, -0.01],
 }
 
 
@@ -172,6 +174,18 @@ def test_intrinsics_follow_the_size_of_the_images(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "images" / "img4.png"), np.zeros((WIDTH, HEIGHT, 3), np.uint8))
     with pytest.raises(DataError, match=r"img4\.png.*no scaled version"):
         load_scene(tmp_path)
+
+
+def test_names_with_backslashes_and_further_models(tmp_path: Path) -> None:
+    write_model(tmp_path, text=True, names=[f"cam/img{i}.png" for i in range(COUNT)])
+    before = load_scene(tmp_path)
+    assert before.notes == ()
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace("cam/", "cam\\"))
+    (tmp_path / "sparse" / "1").mkdir()
+    after = load_scene(tmp_path)
+    assert torch.equal(after.train.images, before.train.images)
+    assert after.notes == ("sparse/: only model 0 is read, not 1",)
 
 
 def test_all_missing_images_are_named_at_once_and_extra_ones_do_no_harm(tmp_path: Path) -> None:

@@ -70,6 +70,30 @@ def test_lying_lengths_within(tmp_path: Path) -> None:
         read_images(packed(tmp_path, "images.bin", latin))
 
 
+HEADS = [f"{i} 1 0 0 0 {i}.5 0.25 2 3 {name}" for i, name in enumerate(["a.png", "b c.png", "7", "d e f.png"], 1)]
+
+
+@pytest.mark.parametrize("end", ["\n", ""])
+@pytest.mark.parametrize("between", ["", "\n", "\n\n", "3.5 4.5 7\n", "3.5 4.5 7 1e2 0.5 -1\n", "# a remark\n", "\r\n"])
+def test_texts_with_and_without_second_lines(tmp_path: Path, between: str, end: str) -> None:
+    """COLMAP writes a second line for each photo, which may be empty; other tools leave it out."""
+    text = "# Image list\n" + f"\n{between}".join(HEADS) + end
+    images = read_images(packed(tmp_path, "images.txt", text.encode()))
+    assert [image.name for image in images.values()] == ["a.png", "b c.png", "7", "d e f.png"]
+    assert [image.translation for image in images.values()] == [(i + 0.5, 0.25, 2) for i in range(1, 5)]
+
+
+def test_texts_where_only_some_photos_have_second_lines(tmp_path: Path) -> None:
+    text = f"\ufeff{HEADS[0]}\n1 2 3\n{HEADS[1]}\n{HEADS[2]}\n\n{HEADS[3]}\n4 5 -1 6 7 8\n"
+    assert list(read_images(packed(tmp_path, "images.txt", text.encode()))) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("line", ["1 2", "1 2 x", "1 2 3 4", f"{HEADS[0]} 1 2\n1 2 3\n1 2 3"])
+def test_second_lines_that_are_none_are_refused(tmp_path: Path, line: str) -> None:
+    with pytest.raises(DataError, match=r"images\.txt"):
+        read_images(packed(tmp_path, "images.txt", f"{HEADS[1]}\n{line}\n{HEADS[2]}\n".encode()))
+
+
 @pytest.mark.parametrize(("number", "name"), [(7, "FOV"), (10, "THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "-1")])
 def test_camera_models_that_cannot_be_read_are_named(tmp_path: Path, number: int, name: str) -> None:
     data = struct.pack("<QIiQQ5d", 1, 3, number, 8, 6, 5.0, 4.0, 3.0, 0.1, 0.0)

@@ -143,6 +143,16 @@ def test_wrong_arrays(tmp_path: Path, array: np.ndarray, message: str) -> None:
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("bounds", [(0.0, 0.0), (9.0, 1.0), (np.nan, np.inf)])
+def test_depths_are_not_used_whatever_they_are(tmp_path: Path, bounds: tuple[float, float]) -> None:
+    array = rows()
+    write(tmp_path, array)
+    before = load_scene(tmp_path)
+    array[:, 15:] = bounds
+    np.save(tmp_path / "poses_bounds.npy", array)
+    assert torch.equal(load_scene(tmp_path).train.cameras.extrinsics, before.train.cameras.extrinsics)
+
+
 def test_left_handed_poses_are_refused(tmp_path: Path) -> None:
     array = rows()
     array[3, [1, 6, 11]] *= -1

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tiny_scenes import write_colmap, write_nerfstudio
 
 from kgs.datasets import Views, load_scene
 from kgs.errors import DataError
@@ -26,6 +27,62 @@ def test_bare_photos_are_answered_with_what_is_needed(tmp_path: Path, folder: st
     with pytest.raises(DataError, match=r"3 photos but no camera poses.*COLMAP.*ns-process-data") as error:
         load_scene(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "my scene")
+    for given in (tmp_path, *(tmp_path / "my scene" / part for part in ("images", "sparse", "sparse/0"))):
+        with pytest.raises(DataError, match="my scene is one: give that folder"):
+            load_scene(given)
+    write_nerfstudio(tmp_path / "other")
+    (tmp_path / "other" / "transforms.json").rename(tmp_path / "other" / "a.json")
+    with pytest.raises(DataError, match="got a file$"):
+        load_scene(tmp_path / "other" / "a.json")
+    (tmp_path / "my scene" / "notes.txt").touch()
+    with pytest.raises(DataError, match=r"got a file: the scene is the folder.*my scene"):
+        load_scene(tmp_path / "my scene" / "notes.txt")
+
+
+@pytest.mark.parametrize("folder", [".", "images"])
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["IMG_1.HEIC", "IMG_2.HEIC"], "holds 2 HEIC photos that cannot be read: convert them to JPEG or PNG"),
+        (["a.dng", "b.avif", "c.AVIF"], "holds 3 AVIF and DNG photos that cannot be read"),
+        (["walk.MP4"], "holds 1 MP4 videos: take photos out"),
+        (["notes.txt", "._IMG_1.HEIC"], r"is no scene: looked for poses_bounds\.npy"),
+    ],
+)
+def test_what_is_no_scene_is_named(tmp_path: Path, folder: str, names: list[str], message: str) -> None:
+    (tmp_path / folder).mkdir(exist_ok=True)
+    for name in names:
+        (tmp_path / folder / name).touch()
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path)
+
+
+def test_a_video_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "walk.mov").touch()
+    with pytest.raises(DataError, match="got a video: take photos out of it"):
+        load_scene(tmp_path / "walk.mov")
+
+
+def test_photos_of_several_sizes_are_told_in_their_own_pixels(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    cv2.imwrite(str(tmp_path / "images" / "2.jpg"), np.zeros((8, 12, 3), np.uint8))
+    np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (3, 1)))
+    for downscale in (None, 2):
+        with pytest.raises(DataError, match=r"2\.jpg: expected 6x4 pixels as the other images, got 12x8"):
+            load_scene(tmp_path, downscale=downscale)
+
+
+def test_messages_name_the_flags(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (3, 1)))
+    with pytest.raises(ValueError, match=r"--views.*expected None or a whole number from 1 to 2, got 3"):
+        load_scene(tmp_path, 3)
+    with pytest.raises(ValueError, match=r"--downscale.*at least 1, got 0\.5"):
+        load_scene(tmp_path, downscale=0.5)
 
 
 def test_other_folders_are_answered_with_what_was_looked_for(tmp_path: Path) -> None:

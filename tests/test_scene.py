@@ -1,9 +1,16 @@
-"""Views: halved pictures keep showing the same rays."""
+"""Views: a data set of dicts; halved pictures keep showing the same rays; cameras without photos; float32."""
 
+from collections.abc import Iterator
+
+import numpy as np
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
+from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
+from torch.utils.data import DataLoader
 
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.layouts import blender
 from kgs.datasets.scene import Views
 
 
@@ -36,3 +43,112 @@ def test_a_point_projects_to_the_same_place_of_a_halved_picture(size):
 def test_a_single_row_cannot_be_halved():
     with pytest.raises(ValueError, match="2 x 2"):
         views(1, 8).halved()
+
+
+def test_views_are_a_data_set_of_dicts():
+    given = views(6, 8)
+    assert len(given) == len(list(given)) == 2
+    for i, view in enumerate(given):
+        assert torch.equal(view["image"], given.images[i])
+        assert torch.equal(view["extrinsics"], given.cameras.extrinsics[i])
+        assert torch.equal(view["intrinsics"], given.cameras.intrinsics[i, :3, :3])
+        assert torch.equal(view["mask"], given.masks[i])
+        assert (view["index"], view["name"]) == (i, "ab"[i])
+    assert given[-1]["name"] == given[np.int64(1)]["name"] == "b"
+    for index in (2, -3):
+        with pytest.raises(IndexError, match=f"below 2, the number of views, got {index}"):
+            given[index]
+    with pytest.raises(TypeError):
+        given["a"]
+    assert "mask" not in synthetic_scene(train_views=1, test_views=0, size=(6, 8)).train[0]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_torchs_loader_makes_batches_of_views(workers):
+    given = synthetic_scene(train_views=5, test_views=1, size=(6, 8)).train
+    loader = DataLoader(given, batch_size=2, shuffle=True, num_workers=workers)
+    seen = []
+    for batch in loader:
+        count = len(batch["name"])
+        assert batch["image"].shape == (count, 3, 6, 8)
+        assert batch["extrinsics"].shape == (count, 4, 4)
+        assert batch["intrinsics"].shape == (count, 3, 3)
+        assert torch.equal(batch["image"], given.images[batch["index"]])
+        seen += batch["index"].tolist()
+    assert sorted(seen) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("index", "rows"),
+    [
+        *[(one, [1]) for one in (1, -1, np.int64(1), np.uint8(1), torch.tensor(1), [np.int32(1)], (1,))],
+        *[(several, [1, 0]) for several in ([1, 0], np.array([1, 0]), torch.tensor([1, 0]))],
+    ],
+)
+def test_cameras_by_any_kind_of_integers(index, rows):
+    given = views(6, 8)
+    given.cameras.extrinsics[1, 0, 3] = 7.0
+    chosen = given.camera(index)
+    assert torch.equal(chosen.extrinsics, given.cameras.extrinsics[rows])
+    assert chosen.batch_size == len(rows)
+
+
+@pytest.mark.parametrize("index", [0.0, np.float32(1), [0.5], True, torch.tensor([True, False])])
+def test_cameras_by_other_things(index):
+    with pytest.raises(TypeError, match="index: expected integers"):
+        views(6, 8).camera(index)
+
+
+@pytest.mark.parametrize("index", [2, -3, [0, 5]])
+def test_cameras_that_are_not_there(index):
+    with pytest.raises(IndexError):
+        views(6, 8).camera(index)
+
+
+WRITERS = pytest.mark.parametrize("write", [write_llff, write_colmap, write_blender, write_nerfstudio])
+
+
+@pytest.fixture
+def double() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@WRITERS
+def test_scenes_are_float32_whatever_the_default(tmp_path, double, write):
+    write(tmp_path)
+    check_float32(load_scene(tmp_path, downscale=2))
+
+
+@pytest.mark.usefixtures("double")
+def test_other_tensors_are_float32_whatever_the_default():
+    check_float32(synthetic_scene(train_views=1, test_views=1, size=(6, 8)))
+    assert blender._random_points().colors.dtype == torch.float32
+
+
+def check_float32(scene):
+    for part in (scene.train, scene.test, scene.train.halved(), *([scene.finer] if scene.finer else [])):
+        tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.height, part.cameras.fx]
+        tensors += [part.camera([0]).width] + ([] if part.masks is None else [part.masks])
+        assert {tensor.dtype for tensor in tensors} == {torch.float32}
+    assert {t.dtype for t in (scene.points, scene.point_colors, scene.background)} == {torch.float32}
+    assert scene.offset.dtype == torch.float64
+
+
+@WRITERS
+@pytest.mark.parametrize("downscale", [None, 1.5])
+def test_cameras_without_decoding_photos(tmp_path, monkeypatch, write, downscale):
+    write(tmp_path)
+    whole = load_scene(tmp_path, downscale=downscale)
+    monkeypatch.setattr("cv2.imdecode", None)  # any decoding fails
+    bare = load_scene(tmp_path, downscale=downscale, photos=False)
+    for full, part in ((whole.train, bare.train), (whole.test, bare.test)):
+        assert part.names == full.names
+        for name in ("intrinsics", "extrinsics", "height", "width"):
+            assert torch.equal(getattr(part.cameras, name), getattr(full.cameras, name))
+        assert part.images.shape == full.images.shape
+        assert part.images.is_meta
+        assert part[0]["name"] == full.names[0]
+    assert torch.equal(bare.offset, whole.offset)
+    assert bare.finer is None

@@ -74,5 +74,5 @@ def _about_folder(root: Path) -> str:
             return f"is no scene: it holds {count} {' and '.join(kinds)} {advice}"
     return (
         "is no scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
-        f"transforms.json (nerfstudio), found {'other files' if files else 'an empty folder'}"
+        "transforms.json (nerfstudio)"
     )
