@@ -48,7 +48,7 @@ def drop_gaussian(
         >>> drop_gaussian(torch.full((4,), 0.8), p=0.2)
         tensor([1., 0., 1., 1.])
     """
-    _check_rate("p", p)
+    p = _fraction("p", p)
     if not training or p == 0.0:
         return opacities
     if not isinstance(opacities, Tensor) or not opacities.is_floating_point():
@@ -108,15 +108,13 @@ class DropGaussian(nn.Module):
         self, p: float = 0.2, schedule: str | Callable[[float], float] = "linear", seed: int | None = None
     ) -> None:
         super().__init__()
-        _check_rate("p", p)
         if isinstance(schedule, str) and schedule not in SCHEDULES:
             raise ValueError(f"schedule: expected one of {sorted(SCHEDULES)} or a callable, got {schedule!r}")
         if not isinstance(schedule, str) and not callable(schedule):
             raise ValueError(f"schedule: expected a name or a callable, got {schedule!r}")
-        integer = isinstance(seed, Integral) and not isinstance(seed, bool)
-        if seed is not None and not (integer and -(2**63) <= seed < 2**64):
+        if seed is not None and not _is_seed(seed):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
-        self.p = float(p)
+        self.p = _fraction("p", p)
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
         self.seed = seed
         self._progress: float | None = None
@@ -131,16 +129,12 @@ class DropGaussian(nn.Module):
 
     @progress.setter
     def progress(self, value: float) -> None:
-        if not isinstance(value, Real | Tensor) or not 0.0 <= value <= 1.0:
-            raise ValueError(f"progress: expected a number in [0, 1], got {value!r}")
-        self._progress = float(value)
+        self._progress = _fraction("progress", value, closed=True)
 
     @property
     def rate(self) -> float:
         """The drop rate of the next call in `train()`."""
-        rate = self.p * self.schedule(self.progress)
-        _check_rate("p * schedule(progress)", rate)
-        return rate
+        return _fraction("p * schedule(progress)", self.p * self.schedule(self.progress))
 
     def forward(self, opacities: Tensor) -> Tensor:
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
@@ -204,6 +198,13 @@ class DropGaussian(nn.Module):
         object.__setattr__(self, name, value.detach() if isinstance(value, Tensor) else value)
 
 
-def _check_rate(name: str, rate: float) -> None:
-    if not isinstance(rate, Real | Tensor) or not 0.0 <= rate < 1.0:
-        raise ValueError(f"{name}: expected a rate in [0, 1), got {rate!r}")
+def _is_seed(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, Integral) and -(2**63) <= int(value) < 2**64
+
+
+def _fraction(name: str, value: Any, closed: bool = False) -> float:
+    """A number in [0, 1), or in [0, 1]."""
+    number = float(value) if isinstance(value, (Real, Tensor)) else -1.0
+    if not (0.0 <= number < 1.0 or (closed and number == 1.0)):
+        raise ValueError(f"{name}: expected a number in [0, 1{']' if closed else ')'}, got {value!r}")
+    return number

@@ -8,27 +8,29 @@ distance to the three nearest points.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from .harmonics import SH_C0
+from .neighbours import log_spacing
 from .types import SH_SIZES, Gaussians
 
-__all__ = ["GaussianModel", "log_spacing"]
+__all__ = ["GaussianModel"]
 
 INITIAL_OPACITY = 0.1
-NEIGHBOURS = 3
-MIN_RELATIVE_SPACING = 1e-3
-CHUNK_ELEMENTS = 1 << 24
+PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 
 
 class GaussianModel(nn.Module):
     """N Gaussians as parameters without bounds: log-scales, opacity logits and spherical harmonics.
 
     The harmonics are two parameters because they have two learning rates. `state_dict()` holds the six parameters and
-    nothing else, so `GaussianModel(**state_dict)` rebuilds a model of any size; the active degree is the plain
-    attribute `sh_degree`, to be saved beside it.
+    the active degree: `GaussianModel(**state_dict)` makes the same model again, and `load_state_dict` takes over the
+    number of Gaussians and both degrees too. The parameters stay the same objects, so that an optimiser goes on
+    holding them; its own state has to be loaded after a change of size.
 
     Args:
         means: centres in world units, `(N, 3)`, float32 or float64.
@@ -37,11 +39,20 @@ class GaussianModel(nn.Module):
         opacity_logits: `(N,)`.
         sh_dc: harmonics of degree 0, `(N, 1, 3)`.
         sh_rest: harmonics of degree 1 and above, `(N, K - 1, 3)` with K = 1, 4, 9 or 16.
-        sh_degree: the active degree, 0 to that of `sh_rest`; None takes the latter.
+        sh_degree: the active degree, 0 to that of `sh_rest`; None takes that of `_extra_state`, else that of `sh_rest`.
+        _extra_state: the active degree as `state_dict()` holds it.
 
     Raises:
         TypeError: a tensor is not float32 or float64, or differs in dtype or device from `means`.
         ValueError: a tensor has another shape, or `sh_degree` is out of range.
+
+    Example:
+        >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
+        >>> model.sh_degree = 1
+        >>> other = GaussianModel.from_points(torch.rand(5, 3), torch.rand(5, 3), sh_degree=0)
+        >>> _ = other.load_state_dict(model.state_dict())
+        >>> other
+        GaussianModel(20 Gaussians, sh_degree=1 of 3, torch.float32)
     """
 
     means: nn.Parameter
@@ -60,32 +71,25 @@ class GaussianModel(nn.Module):
         sh_dc: Tensor,
         sh_rest: Tensor,
         sh_degree: int | None = None,
+        _extra_state: Tensor | None = None,
     ) -> None:
         super().__init__()
-        n = len(means)
-        k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
-        if k not in SH_SIZES:
-            raise ValueError(
-                f"sh_rest: expected shape ({n}, K - 1, 3) with K in {SH_SIZES}, got {tuple(sh_rest.shape)}"
-            )
-        for name, value, shape in (
-            ("means", means, (n, 3)),
-            ("quats", quats, (n, 4)),
-            ("log_scales", log_scales, (n, 3)),
-            ("opacity_logits", opacity_logits, (n,)),
-            ("sh_dc", sh_dc, (n, 1, 3)),
-            ("sh_rest", sh_rest, (n, k - 1, 3)),
-        ):
-            if tuple(value.shape) != shape:
-                raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
-            if value.dtype not in (torch.float32, torch.float64):
-                raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
+        values = (means, quats, log_scales, opacity_logits, sh_dc, sh_rest)
+        for name, value in zip(PARAMETERS, values, strict=True):
+            if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
+                raise TypeError(f"{name}: expected float32 or float64, got {getattr(value, 'dtype', type(value))}")
             if value.dtype != means.dtype or value.device != means.device:
                 raise TypeError(
                     f"{name}: expected {means.dtype} on {means.device} as means, got {value.dtype} on {value.device}"
                 )
+        _check_shapes(values)
+        for name, value in zip(PARAMETERS, values, strict=True):
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
-        self.sh_degree = self.max_sh_degree if sh_degree is None else sh_degree
+        self.sh_degree = self.max_sh_degree
+        if sh_degree is not None:
+            self.sh_degree = sh_degree
+        elif _extra_state is not None:
+            self.set_extra_state(_extra_state)
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> GaussianModel:
@@ -112,12 +116,10 @@ class GaussianModel(nn.Module):
             raise ValueError(
                 f"points, colors: expected two of shape (N, 3), got {tuple(points.shape)} and {tuple(colors.shape)}"
             )
-        if len(points) <= NEIGHBOURS:
-            raise ValueError(f"points: expected at least {NEIGHBOURS + 1} to take a spacing from, got {len(points)}")
-        if not bool(torch.isfinite(points).all()):
-            raise ValueError("points: expected finite coordinates, got NaN or infinity")
-        if not isinstance(sh_degree, int) or not 0 <= sh_degree < len(SH_SIZES):
-            raise ValueError(f"sh_degree: expected an integer from 0 to {len(SH_SIZES) - 1}, got {sh_degree!r}")
+        for name, value in (("points", points), ("colors", colors)):
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+        _check_degree(sh_degree, len(SH_SIZES) - 1)
         points = points.detach()
         n = len(points)
         log_scales = log_spacing(points).to(points)
@@ -143,9 +145,7 @@ class GaussianModel(nn.Module):
 
     @sh_degree.setter
     def sh_degree(self, value: int) -> None:
-        if not isinstance(value, int) or not 0 <= value <= self.max_sh_degree:
-            raise ValueError(f"sh_degree: expected an integer from 0 to {self.max_sh_degree}, got {value!r}")
-        self._sh_degree = value
+        self._sh_degree = _check_degree(value, self.max_sh_degree)
 
     def forward(self) -> Gaussians:
         """The Gaussians with activated values and the active bands only."""
@@ -153,10 +153,12 @@ class GaussianModel(nn.Module):
         if self.sh_degree > 0:
             active = self.sh_rest.narrow(1, 0, SH_SIZES[self.sh_degree] - 1)
             colors = torch.cat([self.sh_dc, active], dim=1)
+        # where exp is infinite (that Gaussian is not drawn) its gradient would be 0 times infinity
+        too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         return Gaussians(
             means=self.means,
             quats=self.quats,
-            scales=self.log_scales.exp(),
+            scales=self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf),
             opacities=self.opacity_logits.sigmoid(),
             colors=colors,
         )
@@ -164,49 +166,48 @@ class GaussianModel(nn.Module):
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __bool__(self) -> bool:
+        return True  # also without Gaussians, as every module
+
+    def get_extra_state(self) -> Tensor:
+        """The active degree, for `state_dict()`."""
+        return torch.tensor(self.sh_degree, device="cpu")
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take the active degree over."""
+        self.sh_degree = int(state)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Make room for the values to come, of whatever size they are."""
+        values = [state_dict[prefix + name] for name in PARAMETERS if prefix + name in state_dict]
+        if len(values) == len(PARAMETERS):
+            most = _check_shapes(values)
+            _check_degree(int(state_dict.setdefault(prefix + "_extra_state", torch.tensor(most, device="cpu"))), most)
+            for name, value in zip(PARAMETERS, values, strict=True):
+                parameter = self.get_parameter(name)
+                if parameter.shape != value.shape:
+                    parameter.data, parameter.grad = parameter.new_empty(value.shape), None
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
     def extra_repr(self) -> str:
         """What `print(model)` shows."""
         return f"{len(self)} Gaussians, sh_degree={self.sh_degree} of {self.max_sh_degree}, {self.means.dtype}"
 
 
-def log_spacing(points: Tensor) -> Tensor:
-    """Logarithm of the root mean squared distance to the three nearest points, float64 `(N,)`: the scale of a start.
-
-    Args:
-        points: `(N, 3)`, N >= 4.
-
-    Raises:
-        ValueError: all points are in one place.
-    """
-    points = points.double()
-    centred = points - points.mean(dim=0)
-    size = centred.abs().amax()
-    if not bool(size > 0):
-        raise ValueError("points: expected points in different places, got the same place for all")
-    centred = centred / size  # float32 is then enough to find the neighbours, in whatever unit and place the cloud is
-    neighbours = _nearest_on_cpu(centred) if points.device.type == "cpu" else _nearest(centred)
-    difference = centred[neighbours] - centred[:, None, :]
-    squared = difference.square().sum(dim=-1).mean(dim=-1)
-    typical = squared[squared > 0].median()
-    return 0.5 * squared.clamp(min=MIN_RELATIVE_SPACING**2 * typical).log() + size.log()
+def _check_degree(value: int, most: int) -> int:
+    if not isinstance(value, int) or not 0 <= value <= most:
+        raise ValueError(f"sh_degree: expected an integer from 0 to {most}, got {value!r}")
+    return value
 
 
-def _nearest_on_cpu(points: Tensor) -> Tensor:
-    """Indices of the nearest other points, `(N, 3)`, by OpenCV's exact single k-d tree."""
-    import cv2
-
-    data = points.float().numpy()  # the index refers to this array, it makes no copy
-    index = cv2.flann_Index(data, {"algorithm": 4})  # type: ignore[attr-defined]  # not in the stubs
-    found, _ = index.knnSearch(data, NEIGHBOURS + 1, params={})
-    return torch.from_numpy(found[:, 1:]).long()  # the first is at distance 0: the point itself or its double
-
-
-def _nearest(points: Tensor) -> Tensor:
-    """Indices of the nearest other points, `(N, 3)`, from all distances, a chunk of rows at a time."""
-    data = points.float()
-    rows = max(1, CHUNK_ELEMENTS // len(data))
-    found = [
-        torch.cdist(chunk, data, compute_mode="donot_use_mm_for_euclid_dist").topk(NEIGHBOURS + 1, largest=False)[1]
-        for chunk in data.split(rows)
-    ]
-    return torch.cat(found)[:, 1:]
+def _check_shapes(values: Sequence[Tensor]) -> int:
+    """The degree of the harmonics of values that fit together."""
+    n, sh_rest = values[0].shape[0] if values[0].ndim else 0, values[-1]
+    k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
+    if k not in SH_SIZES:
+        raise ValueError(f"sh_rest: expected shape ({n}, K - 1, 3) with K in {SH_SIZES}, got {tuple(sh_rest.shape)}")
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, k - 1, 3))
+    for name, value, shape in zip(PARAMETERS, values, shapes, strict=True):
+        if tuple(value.shape) != shape:
+            raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
+    return SH_SIZES.index(k)

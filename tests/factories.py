@@ -15,9 +15,9 @@ from torch import Tensor
 from kgs import DropGaussian, GaussianModel, Gaussians, PosedCamera, ProjectedGaussians
 from kgs.datasets import Views
 
-__all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "footprints", "join", "leaves", "one_gaussian", "pinhole"]
-__all__ += ["posed", "random_camera", "random_gaussians", "random_model", "random_scene", "random_views", "replace"]
-__all__ += ["drop_layer", "random_opacities", "splat_columns", "select", "with_camera", "wide_footprints"]
+__all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
+__all__ += ["pinhole", "posed", "random_camera", "random_cloud", "random_gaussians", "random_model", "random_opacities"]
+__all__ += ["random_scene", "random_views", "replace", "select", "splat_columns", "with_camera", "wide_footprints"]
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -251,6 +251,13 @@ def drop_layer(progress: float, **options: Any) -> DropGaussian:
 
 
 # -- models and views ----------------------------------------------------------------------------------------------
+
+
+def random_cloud(n: int = 200, seed: int = 0, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+    """Points and their colours."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, 3, generator=generator, dtype=dtype)
+    return points, torch.rand(n, 3, generator=generator, dtype=dtype)
 
 
 def random_model(n: int = 7, sh_degree: int = 3, dtype: torch.dtype = torch.float32, seed: int = 0) -> GaussianModel:

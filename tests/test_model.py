@@ -1,23 +1,19 @@
+import copy
+import io
 import math
 
-import numpy as np
 import pytest
 import torch
+from factories import pinhole, random_model
+from factories import random_cloud as cloud
+from torch import nn
 
-from kgs.model import GaussianModel, _nearest
-
-
-def cloud(n=200, seed=0, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.randn(n, 3, generator=generator, dtype=dtype)
-    return points, torch.rand(n, 3, generator=generator, dtype=dtype)
+from kgs import GaussianRenderer
+from kgs.model import GaussianModel
 
 
 def model(n=7, degree=3, dtype=torch.float32):
-    made = GaussianModel.from_points(*cloud(n, dtype=dtype), sh_degree=degree)
-    with torch.no_grad():
-        made.sh_rest.normal_(generator=torch.Generator().manual_seed(1))
-    return made
+    return random_model(n, degree, dtype)
 
 
 def test_activations_are_exp_and_sigmoid():
@@ -70,58 +66,6 @@ def test_first_values_follow_the_recipe():
     assert torch.allclose(gaussians.opacities, torch.full((200,), 0.1))
 
 
-def test_scale_is_the_root_of_the_mean_of_squared_distances():
-    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 4.0]])
-    scales = GaussianModel.from_points(points, torch.zeros(4, 3))().scales
-    expected = [math.sqrt((1 + 4 + 16) / 3), math.sqrt((1 + 5 + 17) / 3)]
-    assert torch.allclose(scales[:2], torch.tensor(expected)[:, None], rtol=1e-6)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_scales_agree_with_scipy(dtype):
-    spatial = pytest.importorskip("scipy.spatial", reason="scipy is the oracle for nearest neighbours")
-    points, colors = cloud(3000, dtype=dtype)
-    points = points * torch.tensor([1.0, 10.0, 0.1], dtype=dtype) + 5.0
-    distances, _ = spatial.cKDTree(points.double().numpy()).query(points.double().numpy(), k=4)
-    expected = np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
-    scales = GaussianModel.from_points(points, colors)().scales
-    assert scales.dtype == dtype
-    assert np.allclose(scales.detach().numpy(), expected[:, None], rtol=1e-6)
-
-
-def test_neighbours_from_all_distances_agree_with_scipy(monkeypatch):
-    spatial = pytest.importorskip("scipy.spatial", reason="scipy is the oracle for nearest neighbours")
-    monkeypatch.setattr("kgs.model.CHUNK_ELEMENTS", 10_000)  # several chunks, the last one shorter
-    points, _ = cloud(501)
-    _, expected = spatial.cKDTree(points.numpy()).query(points.numpy(), k=4)
-    assert np.array_equal(_nearest(points).numpy(), expected[:, 1:])
-
-
-@pytest.mark.parametrize("unit", [1e-15, 1e-3, 1e6, 1e15])
-def test_scales_follow_the_unit_of_the_points(unit):
-    points, colors = cloud()
-    points[:10] = points[0]
-    at_one = GaussianModel.from_points(points, colors).log_scales
-    scaled = GaussianModel.from_points(points * unit, colors).log_scales
-    assert torch.allclose(scaled, at_one + math.log(unit), atol=1e-4)
-
-
-def test_scales_do_not_depend_on_the_place_of_the_cloud():
-    points, colors = cloud(dtype=torch.float64)
-    shifted = points + torch.tensor([1e6, -2e6, 3e6], dtype=torch.float64)
-    here, there = (GaussianModel.from_points(x, colors).log_scales for x in (points, shifted))
-    assert torch.allclose(here, there, atol=1e-6)
-
-
-@pytest.mark.parametrize("copies", [4, 100, 190])
-def test_coinciding_points_get_a_small_finite_scale(copies):
-    points, colors = cloud()
-    points[:copies] = points[0]
-    scales = GaussianModel.from_points(points, colors)().scales
-    assert bool(torch.isfinite(scales.log()).all())
-    assert 1e-4 < scales[0, 0] / scales[copies:].median() < 1e-2
-
-
 def test_the_same_points_give_the_same_bits():
     first, second = (GaussianModel.from_points(*cloud()) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
@@ -134,12 +78,113 @@ def test_double_converts_everything():
 
 def test_a_state_dict_rebuilds_a_model_of_any_size():
     made = model(n=9, degree=2)
-    again = GaussianModel(**made.state_dict(), sh_degree=1)
-    assert again.sh_degree == 1
-    assert all(torch.equal(a, b) for a, b in zip(made.parameters(), again.parameters(), strict=True))
+    made.sh_degree = 1
+    for again, degree in (
+        (GaussianModel(**made.state_dict()), 1),
+        (GaussianModel(**made.state_dict(), sh_degree=0), 0),
+    ):
+        assert again.sh_degree == degree
+        assert all(torch.equal(a, b) for a, b in zip(made.parameters(), again.parameters(), strict=True))
+        with torch.no_grad():
+            again.means.zero_()
+        assert bool(made.means.any())
+
+
+@pytest.mark.parametrize("assign", [False, True])
+@pytest.mark.parametrize("n", [0, 5, 9])
+def test_load_state_dict_takes_over_size_and_degrees(n, assign):
+    made, other = model(n=9, degree=3), model(n=5, degree=1)
+    GaussianModel.load_state_dict(other, {**model(max(n, 4), 0).state_dict()})
+    made.sh_degree = 2
+    held = dict(other.named_parameters())
+    buffer = io.BytesIO()
+    torch.save(nn.Sequential(made).state_dict(), buffer)
+    buffer.seek(0)
+    nn.Sequential(other).load_state_dict(torch.load(buffer, weights_only=True), assign=assign)
+    assert (len(other), other.sh_degree, other.max_sh_degree) == (9, 2, 3)
+    for name, parameter in other.named_parameters():
+        assert torch.equal(parameter, made.get_parameter(name))
+        assert assign or parameter is held[name], "an optimiser would hold the old one"
+    other().colors.sum().backward()
+
+
+def test_a_fit_goes_on_in_a_model_of_another_size():
+    def step(made, adam):
+        adam.zero_grad()
+        sum(p.square().sum() for p in made.parameters()).backward()
+        adam.step()
+
+    made, other = model(n=9), model(n=5)
+    adams = [torch.optim.Adam(m.parameters()) for m in (made, other)]
+    step(made, adams[0])
+    step(other, adams[1])
+    other.load_state_dict(made.state_dict())
+    adams[1].load_state_dict(copy.deepcopy(adams[0].state_dict()))
+    for m, adam in zip((made, other), adams, strict=True):
+        step(m, adam)
+    assert all(torch.equal(a, b) for a, b in zip(made.parameters(), other.parameters(), strict=True))
+
+
+def test_the_six_parameters_alone_are_a_state_of_the_full_degree():
+    state = model(n=9, degree=2).state_dict()
+    del state["_extra_state"]
+    other = model(n=5, degree=0)
+    other.load_state_dict(state)
+    assert (len(other), other.sh_degree) == (9, 2)
+
+
+def test_a_state_that_does_not_fit_together_is_refused_and_changes_nothing():
+    made, other = model(n=9), model(n=5)
+    before = {name: value.clone() for name, value in other.state_dict().items()}
+    for change, message in (
+        ({"quats": torch.zeros(8, 4)}, r"quats: expected shape \(9, 4\), got \(8, 4\)"),
+        ({"sh_rest": torch.zeros(9, 5, 3)}, "sh_rest: expected shape"),
+        ({"_extra_state": torch.tensor(4)}, "sh_degree: expected an integer from 0 to 3, got 4"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            other.load_state_dict({**made.state_dict(), **change})
+        assert all(torch.equal(value, before[name]) for name, value in other.state_dict().items())
+    with pytest.raises(RuntimeError, match="Missing key"):
+        other.load_state_dict({"means": other.means})
+
+
+def test_a_model_without_gaussians_is_true():
+    assert model(0)
+    assert len(model(0)) == 0
+
+
+@pytest.mark.parametrize(
+    ("dtype", "large"), [(torch.float32, 100.0), (torch.float64, 800.0), (torch.float32, math.inf)]
+)
+def test_a_scale_beyond_the_dtype_has_gradient_zero_and_the_others_theirs(dtype, large):
+    made = model(3, dtype=dtype)
     with torch.no_grad():
-        again.means.zero_()
-    assert bool(made.means.any())
+        made.log_scales[1, 0] = large
+    scales = made().scales
+    assert torch.equal(scales, made.log_scales.exp())
+    assert scales[1, 0] == math.inf
+    camera = pinhole(20, 24, 20.0, dtype=dtype)
+    for loss in (scales.clamp(max=2.0).sum(), GaussianRenderer()(made(), camera).image.sum()):
+        made.zero_grad()
+        loss.backward()
+        assert all(bool(torch.isfinite(p.grad).all()) for p in made.parameters() if p.grad is not None)
+        assert made.log_scales.grad[1, 0] == 0
+    assert torch.equal(scales[0], made.log_scales[0].exp())
+
+
+def test_default_device_and_default_dtype_do_not_reach_a_model():
+    points, colors = cloud()
+    expected = GaussianModel.from_points(points, colors).state_dict()
+    try:
+        torch.set_default_device("meta")  # stands for an accelerator
+        torch.set_default_dtype(torch.float64)
+        made = GaussianModel.from_points(points, colors)
+        made.load_state_dict(made.state_dict())
+        assert made().colors.dtype == torch.float32
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert all(torch.equal(value, expected[name]) for name, value in made.state_dict().items())
 
 
 def test_repr_says_how_many_and_which_degree():
@@ -165,6 +210,7 @@ def test_a_degree_out_of_range_is_refused(degree):
         (torch.rand(5, 3), torch.rand(4, 3), ValueError, r"\(5, 3\) and \(4, 3\)"),
         (torch.ones(5, 3), torch.rand(5, 3), ValueError, "points: expected points in different places"),
         (torch.full((5, 3), math.nan), torch.rand(5, 3), ValueError, "points: expected finite"),
+        (torch.rand(5, 3), torch.full((5, 3), math.nan), ValueError, "colors: expected finite"),
         (torch.rand(5, 3).half(), torch.rand(5, 3), TypeError, "points: expected float32 or float64"),
         (torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), TypeError, "colors: expected floating point"),
     ],
@@ -184,6 +230,8 @@ def test_bad_points_are_named(points, colors, error, message):
         ("sh_dc", torch.zeros(7, 3), ValueError),
         ("log_scales", torch.zeros(7, 3).double(), TypeError),
         ("means", torch.zeros(7, 3).half(), TypeError),
+        ("means", [[0.0, 0.0, 0.0]], TypeError),
+        ("quats", None, TypeError),
     ],
 )
 def test_bad_tensors_are_named(name, value, error):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
-from kgs.model import log_spacing
+from kgs.neighbours import log_spacing
 
 from .dense import dense_points
 from .files import read_points

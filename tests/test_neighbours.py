@@ -1,0 +1,104 @@
+"""The scales of a start: distances to neighbours against scipy, and clouds whose points coincide."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from factories import random_cloud as cloud
+
+from kgs.model import GaussianModel
+from kgs.neighbours import _nearest, log_spacing
+
+
+def test_scale_is_the_root_of_the_mean_of_squared_distances():
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 4.0]])
+    scales = GaussianModel.from_points(points, torch.zeros(4, 3))().scales
+    expected = [math.sqrt((1 + 4 + 16) / 3), math.sqrt((1 + 5 + 17) / 3)]
+    assert torch.allclose(scales[:2], torch.tensor(expected)[:, None], rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_scales_agree_with_scipy(dtype):
+    spatial = pytest.importorskip("scipy.spatial", reason="scipy is the oracle for nearest neighbours")
+    points, colors = cloud(3000, dtype=dtype)
+    points = points * torch.tensor([1.0, 10.0, 0.1], dtype=dtype) + 5.0
+    distances, _ = spatial.cKDTree(points.double().numpy()).query(points.double().numpy(), k=4)
+    expected = np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
+    scales = GaussianModel.from_points(points, colors)().scales
+    assert scales.dtype == dtype
+    assert np.allclose(scales.detach().numpy(), expected[:, None], rtol=1e-6)
+
+
+def test_neighbours_from_all_distances_agree_with_scipy(monkeypatch):
+    spatial = pytest.importorskip("scipy.spatial", reason="scipy is the oracle for nearest neighbours")
+    monkeypatch.setattr("kgs.neighbours.CHUNK_ELEMENTS", 10_000)  # several chunks, the last one shorter
+    points, _ = cloud(501)
+    _, expected = spatial.cKDTree(points.numpy()).query(points.numpy(), k=4)
+    assert np.array_equal(_nearest(points, 3).numpy(), expected[:, 1:])
+
+
+@pytest.mark.parametrize("unit", [1e-15, 1e-3, 1e6, 1e15])
+def test_scales_follow_the_unit_of_the_points(unit):
+    points, colors = cloud()
+    points[:10] = points[0]
+    at_one = GaussianModel.from_points(points, colors).log_scales
+    scaled = GaussianModel.from_points(points * unit, colors).log_scales
+    assert torch.allclose(scaled, at_one + math.log(unit), atol=1e-4)
+
+
+def test_scales_do_not_depend_on_the_place_of_the_cloud():
+    points, colors = cloud(dtype=torch.float64)
+    shifted = points + torch.tensor([1e6, -2e6, 3e6], dtype=torch.float64)
+    here, there = (GaussianModel.from_points(x, colors).log_scales for x in (points, shifted))
+    assert torch.allclose(here, there, atol=1e-6)
+
+
+@pytest.mark.parametrize("copies", [4, 100, 190])
+def test_coinciding_points_get_a_small_finite_scale(copies):
+    points, colors = cloud()
+    points[:copies] = points[0]
+    scales = GaussianModel.from_points(points, colors)().scales
+    assert bool(torch.isfinite(scales.log()).all())
+    assert 1e-4 < scales[0, 0] / scales[copies:].median() < 1e-2
+
+
+@pytest.mark.parametrize("copies", [4, 5, 9])
+def test_where_every_point_occurs_often_spacing_is_that_of_the_places(copies):
+    points, _ = cloud()
+    torch.testing.assert_close(log_spacing(points.repeat(copies, 1)), log_spacing(points).repeat(copies))
+
+
+@pytest.mark.parametrize("places", [2, 3, 4])
+def test_few_places_with_many_points_each(places):
+    corners = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 9.0]])[:places]
+    distances = torch.cdist(corners, corners).square().sum(1) / min(3, places - 1)
+    expected = 0.5 * distances.double().log()
+    torch.testing.assert_close(log_spacing(corners.repeat(6, 1)), expected.repeat(6))
+
+
+@pytest.mark.parametrize("mesh", [trimesh.creation.box(), trimesh.creation.icosphere(2), trimesh.creation.cone(1, 2)])
+def test_corners_of_the_triangles_of_an_stl_have_sensible_scales(mesh):
+    points = torch.from_numpy(mesh.triangles.reshape(-1, 3).copy()).float()
+    scales = log_spacing(points).exp()
+    edges = torch.from_numpy(mesh.edges_unique_length.copy())
+    assert bool(torch.isfinite(scales).all())
+    assert edges.min() / 2 < scales.min() <= scales.max() < 2 * edges.max()
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-300, 1e-200, 1e-160, 1e-90])
+def test_almost_coinciding_points_have_finite_scales(tiny):
+    points = torch.arange(12, dtype=torch.float64)[:, None].repeat(1, 3) * tiny
+    for far in (1.0, 1e-3, 1e200):
+        points[6:, 0] = far
+        assert bool(torch.isfinite(log_spacing(points)).all())
+
+
+def test_one_place_without_end_and_too_few_points_are_refused():
+    huge = torch.tensor([[1e308, 0.0, 0.0], [-1e308, 0.0, 0.0]], dtype=torch.float64).repeat(4, 1)
+    for points in (torch.ones(5, 3), torch.zeros(5, 3), 10 * huge):
+        with pytest.raises(ValueError, match="points: expected points in different places"):
+            log_spacing(points)
+    with pytest.raises(ValueError, match="points: expected at least 4"):
+        log_spacing(torch.rand(3, 3))
