@@ -8,16 +8,16 @@ from .model import GaussianModel
 from .ply import load_ply, save_ply
 from .projection import project
 from .raster import composite
-from .raster.tiles import bin_to_tiles
+from .rasterization import rasterization
 from .renderer import GaussianRenderer
-from .types import Gaussians, ProjectedGaussians, Rendering, TileBins
+from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering
 
 __all__ = [
     "DropGaussian",
     "drop_gaussian",
     "GaussianRenderer",
+    "rasterization",
     "project",
-    "bin_to_tiles",
     "composite",
     "Gaussians",
     "GaussianModel",
@@ -29,7 +29,7 @@ __all__ = [
     "PosedCamera",
     "cameras",
     "ProjectedGaussians",
-    "TileBins",
+    "RasterOptions",
     "Rendering",
     "DataError",
     "TrainingDiverged",

@@ -76,7 +76,7 @@ class PosedCamera:
 Cameras = PinholeCamera | PosedCamera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lens:
     """One posed camera, reduced to what projection needs.
 

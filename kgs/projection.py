@@ -10,28 +10,30 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .backends import choose, register
 from .camera import Cameras, Lens, image_size, intrinsics, lenses
-from .covariance import footprint_factors, variances
+from .covariance import footprint_factors, rotation_matrices, variances
 from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
-from .types import Gaussians, ProjectedGaussians
+from .types import Gaussians, ProjectedGaussians, RasterOptions
 
-__all__ = ["cut_squared", "project"]
+__all__ = ["cut_squared", "normals", "project"]
 
 
 def project(
     gaussians: Gaussians,
     cameras: Cameras,
     *,
-    near_plane: float = 0.01,
-    eps2d: float = 0.3,
-    alpha_threshold: float = 1 / 255,
+    near_plane: float = RasterOptions.near_plane,
+    eps2d: float = RasterOptions.eps2d,
+    alpha_threshold: float = RasterOptions.alpha_threshold,
     colors: bool = True,
+    backend: str = "auto",
 ) -> ProjectedGaussians:
     """Project Gaussians into every camera of a batch.
 
-    Differentiable with respect to all Gaussian parameters, extrinsics and intrinsics (the harmonics' view direction
-    included).
+    Differentiable once, by `backward`, with respect to all Gaussian parameters, extrinsics and intrinsics (the
+    harmonics' view direction included).
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
@@ -39,41 +41,52 @@ def project(
     Args:
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        near_plane: only centres with z > near_plane in the camera frame are kept; in world units, at least 1e-7 for
-            perspective cameras (Kornia does not divide by less than 1e-8).
-        eps2d: variance in px^2 added to the diagonal of each footprint, >= 0.
-        alpha_threshold: alphas below it are not drawn; with 0 every Gaussian in front of the camera is listed.
+        near_plane: see `kgs.types.RasterOptions`, as for the next two.
+        eps2d: variance in px^2 added to each footprint.
+        alpha_threshold: with 0 every Gaussian in front of the camera is listed.
         colors: whether colours are wanted.
+        backend: "auto", or the name of one, see `kgs.backends`.
 
     Returns:
         The visible pairs (camera, Gaussian): those that would touch the image if their opacity were 2, or the largest
         of all if that is more. (The opacity of each is left aside, so that a dropped Gaussian counts as seen.)
 
     Raises:
-        TypeError: cameras of another kind, dtype or device.
-        ValueError: cameras of different image sizes, or opacities `(C, N)` for another number of cameras.
+        TypeError: no Gaussians, or cameras of another kind, dtype or device.
+        ValueError: an option is out of range, cameras of different image sizes, or opacities `(C, N)` for another
+            number of cameras.
     """
-    size = image_size(cameras)
-    means = gaussians.means
+    options = RasterOptions(near_plane=near_plane, eps2d=eps2d, alpha_threshold=alpha_threshold)
+    if not isinstance(gaussians, Gaussians):
+        raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
+    size, means = image_size(cameras), gaussians.means
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
         if matrix.dtype != means.dtype or matrix.device != means.device:
             raise TypeError(
                 f"cameras: expected {means.dtype} on {means.device} as the Gaussians, "
                 f"got {matrix.dtype} on {matrix.device}"
             )
-    views = lenses(cameras)
-    if gaussians.opacities.ndim == 2 and gaussians.opacities.shape[0] != len(views):
+    rows, count, n = gaussians.opacities.shape[:-1], cameras.extrinsics.shape[0], len(gaussians)
+    if rows not in ((), (count,)):
         raise ValueError(
-            f"opacities: expected shape ({len(gaussians)},) or ({len(views)}, {len(gaussians)}) for {len(views)} "
-            f"cameras, got {tuple(gaussians.opacities.shape)}"
+            f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, "
+            f"got {tuple(gaussians.opacities.shape)}"
         )
+    run = choose("projection", backend, gaussians, cameras, size, options, colors)
+    projected: ProjectedGaussians = run(gaussians, cameras, size, options, colors)
+    return projected
+
+
+def project_torch(
+    gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
+) -> ProjectedGaussians:
+    """`project` in torch, for every camera, device and dtype; trusts its arguments."""
+    means = gaussians.means
+    views = lenses(cameras)
     finite = _finite(gaussians)
-    reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), alpha_threshold)
+    reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
     with full_precision(means.device):
-        parts = [
-            _project_one(gaussians, c, lens, size, finite, near_plane, eps2d, reach, colors)
-            for c, lens in enumerate(views)
-        ]
+        parts = [_project_one(gaussians, c, lens, size, finite, options, reach, colors) for c, lens in enumerate(views)]
     fields = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
     ids, means2d, factors, depths, radii, opacities, rgb = fields
     counts = torch.tensor([part[0].shape[0] for part in parts], device=means.device)
@@ -90,8 +103,28 @@ def project(
         num_cameras=len(parts),
         num_gaussians=len(gaussians),
         num_nonfinite=(~finite).sum(),
-        eps2d=eps2d,
+        eps2d=options.eps2d,
     )
+
+
+register("projection", "torch", project_torch)
+
+
+def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:
+    """The shortest axis of each projected Gaussian, turned towards its camera; unit vectors in world axes, `(M, 3)`.
+
+    Differentiable with respect to the quaternions. At right angles to the view both directions are as good.
+    """
+    ids = projected.gaussian_ids
+    axis = gaussians.scales.detach().index_select(0, ids).argmin(1)
+    turned = rotation_matrices(gaussians.quats.index_select(0, ids))
+    normal = turned.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    with torch.no_grad():
+        means, away = gaussians.means.index_select(0, ids), []
+        for c, lens in enumerate(lenses(cameras)):
+            away.append(_directions(_rows(means, (projected.camera_ids == c).nonzero()[:, 0]), lens))
+        backwards = (normal * torch.cat(away)).sum(1, keepdim=True) > 0
+    return torch.where(backwards, -normal, normal)
 
 
 def cut_squared(opacities: Tensor, alpha_threshold: float) -> Tensor:
@@ -111,14 +144,13 @@ def _project_one(
     lens: Lens,
     size: tuple[int, int],
     finite: Tensor,
-    near_plane: float,
-    eps2d: float,
+    options: RasterOptions,
     reach: Tensor,
     colors: bool,
 ) -> tuple[Tensor, ...]:
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     with torch.no_grad():
-        front = (gaussians.means @ rotation[2] + translation[2] > near_plane) & finite
+        front = (gaussians.means @ rotation[2] + translation[2] > options.near_plane) & finite
         ids = front.nonzero()[:, 0]
         if lens.sees is not None:
             seen = lens.sees(torch.addmm(translation, _rows(gaussians.means, ids), rotation.T))
@@ -133,7 +165,7 @@ def _project_one(
 
     means, points, means2d, factors = footprints(ids)
     with torch.no_grad():
-        seen, radii, overflow = _touches_image(means2d, factors, size, eps2d, reach)
+        seen, radii, overflow = _touches_image(means2d, factors, size, options.eps2d, reach)
         if bool(overflow.any()):  # these must not take part at all: their gradients would not be finite
             ids, seen, radii = (_rows(x, (~overflow).nonzero()[:, 0]) for x in (ids, seen, radii))
     if ids.shape[0] != means.shape[0]:

@@ -3,28 +3,72 @@
     cameras --> project <- Gaussians
                    | ProjectedGaussians
                    v
-              bin_to_tiles --> TileBins
-                   v
                composite --> Rendering
 
-Shapes, dtypes and devices are checked where a value is made by the user (`Gaussians`, `PosedCamera`); values never
-are, because that would wait for the device.
+Shapes, dtypes and devices are checked where a value is made by the user; values never are, because that would wait
+for the device. Two of them are equal where they are the same object.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["Gaussians", "ProjectedGaussians", "Rendering", "TileBins"]
+from .covariance import conics
+
+__all__ = ["Composited", "Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering"]
 
 SH_SIZES = (1, 4, 9, 16)
 
 
 @dataclass(frozen=True)
+class RasterOptions:
+    """How Gaussians become pixels: every option with its default and its range, once.
+
+    Args:
+        tile_size: side of a tile in pixels; the speed depends on it, the image only by rounding (float32: about 1e-6 at
+            16, growing with the square).
+        near_plane: Gaussians with z <= near_plane are left out; in world units, at least 1e-7 for perspective cameras
+            (Kornia does not divide by less than 1e-8).
+        eps2d: variance in px^2 added to the diagonal of each footprint, the low-pass filter of 3D Gaussian splatting.
+        alpha_threshold: alphas below it are skipped, in [0, 1). The knob that trades accuracy for time: 0 is exact;
+            the error is at most the number of layers times it.
+        transmittance_stop: light below it counts as 0, in [0, 1); the error is at most it.
+        max_bytes: bound for the working memory of one call, beside what is kept for each Gaussian and each pixel; an
+            image that needs more is made in row slices, and the backward pass makes each again.
+
+    Raises:
+        ValueError: an option is out of range.
+    """
+
+    tile_size: int = 8
+    near_plane: float = 0.01
+    eps2d: float = 0.3
+    alpha_threshold: float = 1 / 255
+    transmittance_stop: float = 1e-4
+    max_bytes: int = 2**30
+
+    def __post_init__(self) -> None:
+        for name in ("tile_size", "max_bytes"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
+        for name, most in (
+            ("near_plane", math.inf),
+            ("eps2d", math.inf),
+            ("alpha_threshold", 1),
+            ("transmittance_stop", 1),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not 0.0 <= value < most:
+                raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
+
+
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """A set of N Gaussians with activated values: what the renderer draws.
 
@@ -32,8 +76,9 @@ class Gaussians:
         means: centres in world units, shape `(N, 3)`.
         quats: rotations as quaternions in the order w, x, y, z, of any non-zero norm, shape `(N, 4)`.
         scales: standard deviations along the local axes in world units, > 0, shape `(N, 3)`.
-        opacities: shape `(N,)`, or `(C, N)` for one value a camera. In [0, 1], or above 1 after `DropGaussian`.
-        colors: spherical harmonics `(N, K, 3)` with K = 1, 4, 9 or 16 (degree 0 to 3), or RGB `(N, 3)`.
+        opacities: shape `(N,)`, or `(C, N)` for one value per camera. In [0, 1], or above 1 after `DropGaussian`.
+        colors: spherical harmonics `(N, K, 3)` with K = 1, 4, 9 or 16 (degree 0 to 3); or features `(N, D)` that are
+            drawn as they are, RGB for D = 3.
 
     Raises:
         TypeError: a field is no tensor, is not float32 or float64, or differs in dtype or device from `means`.
@@ -65,10 +110,10 @@ class Gaussians:
         if self.opacities.ndim not in (1, 2) or self.opacities.shape[-1] != n:
             raise ValueError(f"opacities: expected shape ({n},) or (C, {n}), got {tuple(self.opacities.shape)}")
         if self.colors.ndim == 2:
-            _check_shape("colors", self.colors, (n, 3))
+            _check_shape("colors", self.colors, (n, self.colors.shape[1]))
         elif self.colors.ndim != 3 or self.colors.shape[1] not in SH_SIZES:
             raise ValueError(
-                f"colors: expected shape ({n}, 3) or ({n}, K, 3) with K in {SH_SIZES}, got {tuple(self.colors.shape)}"
+                f"colors: expected shape ({n}, D) or ({n}, K, 3) with K in {SH_SIZES}, got {tuple(self.colors.shape)}"
             )
         else:
             _check_shape("colors", self.colors, (n, self.colors.shape[1], 3))
@@ -76,8 +121,18 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        """Some of the Gaussians: those of a mask `(N,)`, of indices `(M,)` or of a slice."""
+        opacities = self.opacities[..., index]
+        return Gaussians(self.means[index], self.quats[index], self.scales[index], opacities, self.colors[index])
 
-@dataclass(frozen=True)
+    def to(self, *args: Any, **kwargs: Any) -> Gaussians:
+        """The Gaussians on another device or in another dtype; arguments as of `torch.Tensor.to`."""
+        fields = (self.means, self.quats, self.scales, self.opacities, self.colors)
+        return Gaussians(*(field.to(*args, **kwargs) for field in fields))
+
+
+@dataclass(frozen=True, eq=False)
 class ProjectedGaussians:
     """The M pairs (camera, Gaussian) that a camera can see: in front of the near plane and over the image.
 
@@ -95,7 +150,7 @@ class ProjectedGaussians:
         depths: z in the camera frame, `(M,)`.
         radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.
         opacities: `(M,)`.
-        colors: `(M, 3)`, or `(M, 0)` where no image was asked for.
+        colors: `(M, 3)`, or features `(M, D)`, or `(M, 0)` where no image was asked for.
         image_size: (height, width) in pixels.
         num_cameras: C.
         num_gaussians: N.
@@ -120,67 +175,40 @@ class ProjectedGaussians:
     @property
     def conics(self) -> Tensor:
         """Inverse covariances (a, b, c), meaning a dx^2 + 2 b dx dy + c dy^2, shape `(M, 3)`."""
-        from .covariance import conics
-
         return conics(self.factors, self.eps2d)
 
     def __len__(self) -> int:
         return self.camera_ids.shape[0]
 
 
-@dataclass(frozen=True)
-class TileBins:
-    """For each tile the Gaussians that can reach it, front to back; integers without gradient.
-
-    Tiles are numbered row by row, camera after camera: tile t of the band is tile `first_tile + t` overall.
+@dataclass(frozen=True, eq=False)
+class Composited:
+    """The sums over layers, before background and normalisation.
 
     Args:
-        tile_size: side of a tile in pixels.
-        grid: (rows, columns) of tiles in one image.
-        first_tile: number of the band's first tile among all tiles of all cameras.
-        offsets: `(T + 1,)` int64; the entries of tile t are `offsets[t]:offsets[t + 1]`.
-        entries: `(E,)` int32, position in `ids`, sorted by tile and then from front to back.
-        ids: `(n,)` int64, the rows of `ProjectedGaussians` that may have entries, in depth order.
-        order: `(E,)` int64, which place each entry has if they are sorted by `ids` first and then by tile.
+        features: sum of w times features, `(C, F, H, W)`.
+        transmittance: T behind the last layer, `(C, 1, H, W)`.
+        median_depth: `(C, 1, H, W)` without gradient, or None.
     """
 
-    tile_size: int
-    grid: tuple[int, int]
-    first_tile: int
-    offsets: Tensor
-    entries: Tensor
-    ids: Tensor
-    order: Tensor
-
-    @property
-    def num_tiles(self) -> int:
-        """How many tiles the band has."""
-        return self.offsets.shape[0] - 1
-
-    @property
-    def by_gaussian(self) -> Tensor:
-        """The entries of `ids[0]`, then of `ids[1]`, ..., `(E,)` int64; computed at each call."""
-        entries = torch.arange(self.order.shape[0], device=self.order.device)
-        return torch.empty_like(self.order).scatter_(0, self.order, entries)
-
-    @property
-    def gaussian_offsets(self) -> Tensor:
-        """Where the entries of each of `ids` begin in `by_gaussian`, `(n,)` int64; computed at each call."""
-        counts = torch.bincount(self.entries, minlength=self.ids.shape[0])
-        return torch.cumsum(counts, 0) - counts
+    features: Tensor
+    transmittance: Tensor
+    median_depth: Tensor | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rendering:
     """What a render call returns; a field that was not asked for is None and was not computed.
 
     Args:
-        image: `(C, 3, H, W)`, not clamped.
+        image: `(C, 3, H, W)`, or `(C, D, H, W)` of features, not clamped.
         alpha: `(C, 1, H, W)`, 1 - transmittance.
         depth: `(C, 1, H, W)`, the mean depth weighted by contribution; 0 where alpha < 1e-6.
         median_depth: `(C, 1, H, W)`, depth of the first layer behind which less than half the light remains;
             0 where there is none. No gradient.
         projected: the Gaussians that were seen.
+        normal: `(C, 3, H, W)`, the sum of contribution times normal: the shortest axis of each Gaussian, of length 1,
+            turned towards the camera, in world axes. Not normalised.
     """
 
     image: Tensor | None
@@ -188,6 +216,7 @@ class Rendering:
     depth: Tensor | None
     median_depth: Tensor | None
     projected: ProjectedGaussians
+    normal: Tensor | None = None
 
 
 def sh_degree(colors: Tensor) -> int:

@@ -25,15 +25,15 @@ INVENTORY = {
         "PosedCamera",
         "ProjectedGaussians",
         "Rendering",
-        "TileBins",
+        "RasterOptions",
         "TrainingDiverged",
-        "bin_to_tiles",
         "camera_extent",
         "cameras",
         "composite",
         "drop_gaussian",
         "load_ply",
         "project",
+        "rasterization",
         "save_ply",
     ],
     "kgs.losses": ["TargetMoments", "opacity_l1", "photometric_loss", "target_moments"],
@@ -123,7 +123,7 @@ def test_signatures(name):
 
 
 def test_the_values_that_flow_are_frozen():
-    for name in ("Gaussians", "PosedCamera", "ProjectedGaussians", "TileBins", "Rendering"):
+    for name in ("Gaussians", "PosedCamera", "ProjectedGaussians", "Rendering"):
         made = getattr(kgs, name)
         assert dataclasses.is_dataclass(made)
         assert made.__dataclass_params__.frozen

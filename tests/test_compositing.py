@@ -13,9 +13,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import kgs
 import kgs.reference
 from kgs import GaussianRenderer, ProjectedGaussians, composite, project
-from kgs.raster import bytes_per_entry
-from kgs.raster.tasks import Band
-from kgs.raster.tiles import tile_spans
+from kgs.raster.tasks import Slice
+from kgs.raster.tiles import bin_to_tiles
 
 TH, STOP = 1 / 255, 1e-4
 DTYPES = [torch.float32, torch.float64]
@@ -266,7 +265,7 @@ def dense(means2d, factors, opacities, features, depths, size, eps2d):
 
 
 @pytest.mark.parametrize("chunk_size", [1, 3, None])
-@pytest.mark.parametrize("max_bytes", [2**30, 168 * 2000])
+@pytest.mark.parametrize("max_bytes", [2**30, 2**19])
 def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
     # veils over all, and an opaque curtain for each column of tiles at another depth: tiles end one after the other
     size, columns, veils = (20, 72), 9, 120
@@ -291,38 +290,63 @@ def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
     assert_gradients_close(gradients, torch.autograd.grad((expected * weights).sum(), inputs), 1e-10)
 
 
+def tightest(projected, features, threshold=TH, **options):
+    """The smallest `max_bytes`, up to a tenth, with which one row of tiles fits."""
+    low, high = 1, 2**30
+    while high > 1.1 * low:
+        middle = (low + high) // 2 if high < 4 * low else int((low * high) ** 0.5)
+        try:
+            with torch.no_grad():
+                composite(projected, features, alpha_threshold=threshold, max_bytes=middle, **options)
+            high = middle
+        except ValueError:
+            low = middle
+    return high
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The slices that are made from here on."""
+    found, init = [], Slice.__init__
+
+    def noted(part, *arguments):
+        init(part, *arguments)
+        found.append(part)
+
+    monkeypatch.setattr(Slice, "__init__", noted)
+    return found
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_byte_budget_changes_nothing(dtype):
+def test_byte_budget_changes_nothing(dtype, made):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
-    largest = int(tile_spans(projected, 8, TH).entries_per_row.max())
-    assert len(tile_spans(projected, 8, TH).bands(largest)) >= 4
     free, free_gradients = loss_and_gradients(projected, colors, weights)
-    tight, tight_gradients = loss_and_gradients(
-        projected, colors, weights, max_bytes=bytes_per_entry(3, 8, dtype) * largest
-    )
+    assert len(made) == 1
+    budget = tightest(projected, colors)
+    made.clear()
+    tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
+    assert len(made) >= 2 * 3, "row slices, forward and again backward"
     assert torch.equal(tight, free)
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_alphas_made_again_are_those_that_were_kept(dtype, monkeypatch):
+def test_alphas_made_again_are_those_that_were_kept(dtype, made, monkeypatch):
+    monkeypatch.setattr("kgs.raster.torch_passes.buffer_bytes", lambda *_: 2**20)  # so that groups stay the same
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
-    steps, forward = [], Band.forward
 
-    def noted(band, sums, keep):
-        result = forward(band, sums, keep)
-        steps.extend(step for group in band.groups for step in group.steps)
-        return result
+    def steps():
+        return [step for part in made for group in part.groups for step in group.steps]
 
-    monkeypatch.setattr(Band, "forward", noted)
     kept, kept_gradients = loss_and_gradients(projected, colors, weights)
-    assert all(step.alpha is not None for step in steps)
-    steps.clear()
-    entries = int(tile_spans(projected, 8, TH).entries_per_row.sum())
-    lean, lean_gradients = loss_and_gradients(
-        projected, colors, weights, max_bytes=bytes_per_entry(3, 8, dtype) * entries
-    )
-    assert all(step.alpha is None for step in steps)
+    assert len(steps()) > 0
+    assert all(step.alpha is not None for step in steps())
+    budget = 2**30
+    while any(step.alpha is not None for step in steps()):  # until there is room for the lists alone
+        made.clear()
+        budget = int(0.9 * budget)
+        lean, lean_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
+    assert len(made) == 1
     assert torch.equal(lean, kept)
     assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
 
@@ -330,28 +354,22 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, monkeypatch):
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
 @pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP), (TH, 0.1)])
 @pytest.mark.parametrize("tight", [False, True])
-def test_bands_of_layers_change_nothing(dtype, bound, thresholds, tight, monkeypatch):
+def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, made, monkeypatch):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     opacities = projected.opacities.sqrt()  # some tiles get dark before the last layer
     projected = dataclasses.replace(projected, opacities=opacities)
     image, gradients = loss_and_gradients(projected, colors, weights, **options)
     median = composite(projected, colors, median_depth=True, **options).median_depth
-    if tight:  # and in bands of rows of tiles
-        largest = int(tile_spans(projected, 8, thresholds[0]).entries_per_row.max())
-        options["max_bytes"] = bytes_per_entry(3, 8, dtype) * largest
-    entries, init = [], Band.__init__
-
-    def noted(band, *arguments):
-        init(band, *arguments)
-        entries.append(band.bins.entries.shape[0])
-
-    monkeypatch.setattr(Band, "__init__", noted)
-    monkeypatch.setattr("kgs.raster._LAYERS", 6)
+    if tight:  # and in row slices
+        options["max_bytes"] = tightest(projected, colors, thresholds[0])
+    made.clear()
+    monkeypatch.setattr("kgs.raster.torch_passes._LAYERS", 6)
     layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
+    entries = [len(part.lists.entries) for part in made]
     assert len(entries) > (6 if tight else 3)
     if thresholds[1] == 0.1:  # what lies behind the end of the light is not listed
-        assert sum(entries) < 0.9 * (2 if tight else 1) * len(kgs.bin_to_tiles(projected).entries)
+        assert sum(entries) < 0.9 * (2 if tight else 1) * len(bin_to_tiles(projected).entries)
     assert (layered - image).abs().max() <= bound
     assert_gradients_close(layered_gradients, gradients, bound)
     assert torch.equal(composite(projected, colors, median_depth=True, **options).median_depth, median)
@@ -360,16 +378,16 @@ def test_bands_of_layers_change_nothing(dtype, bound, thresholds, tight, monkeyp
 @pytest.fixture
 def as_on_a_gpu(monkeypatch):
     """Scans and sizes of steps as a GPU gets them."""
-    made = Band.__init__
+    made = Slice.__init__
 
-    def init(band, *arguments):
-        made(band, *arguments)
-        band.by_layer = False
+    def init(part, *arguments):
+        made(part, *arguments)
+        part.by_layer = False
 
-    monkeypatch.setattr(Band, "__init__", init)
+    monkeypatch.setattr(Slice, "__init__", init)
     monkeypatch.setattr("kgs.raster.tasks._STEP_PAIRS", {"cpu": 2**24})
     monkeypatch.setattr("kgs.raster.tasks._PAIRS_TO_SHARE", 2**60)
-    monkeypatch.setattr("kgs.raster.choose_chunk_size", lambda _: 32)
+    monkeypatch.setattr("kgs.raster.torch_passes.choose_chunk_size", lambda _: 32)
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])
@@ -427,7 +445,7 @@ def test_incoming_gradients_are_left_alone(size):
 
 def test_too_small_a_budget_is_an_error_with_the_numbers():
     projected, colors, _ = scene_footprints(50, 1, torch.float32)
-    with pytest.raises(ValueError, match=r"max_bytes.*\d+ entries"):
+    with pytest.raises(ValueError, match=r"max_bytes.*\d+ bytes"):
         composite(projected, colors, max_bytes=160)
 
 
@@ -660,6 +678,9 @@ def test_features_of_any_width(dtype):
     ("option", "value"),
     [
         ("tile_size", 0),
+        ("tile_size", 8.0),
+        ("max_bytes", 0),
+        ("backend", "cuda"),
         ("chunk_size", 0),
         ("alpha_threshold", -0.1),
         ("alpha_threshold", 1.0),

@@ -4,11 +4,10 @@ import functools
 
 import pytest
 import torch
-from oracles import pinhole, random_camera, random_gaussians
+from oracles import random_camera, random_gaussians
 
-import kgs
-from kgs import Gaussians, ProjectedGaussians, bin_to_tiles, project
-from kgs.raster.tiles import tile_spans
+from kgs import Gaussians, ProjectedGaussians, project
+from kgs.raster.tiles import Reach, bin_to_tiles
 
 THRESHOLD = 1 / 255
 INTEGERS = ("offsets", "entries", "ids", "by_gaussian", "gaussian_offsets")
@@ -95,7 +94,7 @@ def listed(projected, bins):
 
 
 def check_structure(projected, bins):
-    """Everything that the docstring of TileBins promises of offsets, order and the inverse permutation."""
+    """Everything that the docstring of TileLists promises of offsets, order and the inverse permutation."""
     entries, n = bins.entries.long(), len(bins.ids)
     assert bins.entries.dtype == torch.int32
     assert all(getattr(bins, name).dtype == torch.int64 for name in INTEGERS if name != "entries")
@@ -315,42 +314,49 @@ def test_a_batch_of_cameras_is_its_cameras_one_by_one():
         assert not table[own][:, torch.arange(cameras) != c].any()
 
 
-# -- bands ---------------------------------------------------------------------------------------------------------
+# -- slices --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("max_spans", [2**40, 100, 1])
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.1, 0.0])
-def test_bands_cover_all_rows_within_the_budget_and_together_are_the_whole(share):
+def test_row_slices_cover_all_rows_within_the_budget_and_together_are_the_whole(share, max_spans):
     projected = scene(0, cameras=3)
-    spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)
-    budget = max(int(share * len(whole.entries)), int(spans.entries_per_row.max()))
-    bands = spans.bands(budget)
-    assert [begin for begin, _ in bands] == [0, *(end for _, end in bands[:-1])]
-    assert bands[-1][1] == 3 * whole.grid[0]
-    assert all(begin < end for begin, end in bands)
-    assert len(bands) == 1 if share == 1 else len(bands) > 1
-    parts = [spans.bin(begin, end) for begin, end in bands]
-    for (begin, end), part in zip(bands, parts, strict=True):
+    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    needs = 5 * reach.spans_per_row + 7 * reach.entries_per_row
+    budget = max(int(share * needs.sum()), int(needs.max()))
+    slices = reach.row_slices(budget, 5, 7)
+    assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
+    assert slices[-1][1] == 3 * whole.grid[0]
+    assert all(begin < end for begin, end in slices)
+    assert len(slices) == 1 if share == 1 else len(slices) > 1
+    parts = []
+    for begin, end in slices:
+        spans = reach.spans(begin, end)
+        part = reach.lists(spans, begin, end)
         check_structure(projected, part)
-        assert len(part.entries) <= budget
+        assert 5 * len(spans.ranks) + 7 * len(part.entries) <= budget
         assert (part.first_tile, part.num_tiles) == (begin * whole.grid[1], (end - begin) * whole.grid[1])
         assert (part.tile_size, part.grid) == (8, whole.grid)
+        parts.append(part)
     entries = torch.cat([part.ids[part.entries.long()] for part in parts])
     assert torch.equal(entries, whole.ids[whole.entries.long()])
     assert torch.equal(torch.cat([part.offsets.diff() for part in parts]), whole.offsets.diff())
 
 
+@pytest.mark.parametrize("max_spans", [2**40, 100])
 @pytest.mark.parametrize("layers", [1, 3, 10, 1000])
-def test_depth_ranges_cover_all_ranks_in_about_equal_parts(layers):
+def test_depth_slices_cover_all_ranks_in_about_equal_parts(layers, max_spans):
     projected = scene(0, cameras=2)
-    spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)
-    ranges = spans.depth_ranges(layers)
-    assert [begin for begin, _ in ranges] == [0, *(end for _, end in ranges[:-1])]
-    assert ranges[-1][1] == len(whole.ids)
-    assert all(begin < end for begin, end in ranges)
-    entries = [len(spans.bin(0, 2 * whole.grid[0], ranks).entries) for ranks in ranges]
+    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    slices, rows = reach.depth_slices(layers), (0, 2 * whole.grid[0])
+    assert slices == Reach(projected, 8, THRESHOLD).depth_slices(layers)
+    assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
+    assert slices[-1][1] == len(whole.ids)
+    assert all(begin < end for begin, end in slices)
+    entries = [len(reach.lists(reach.spans(*rows), *rows, ranks).entries) for ranks in slices]
     assert sum(entries) == len(whole.entries)
-    largest = int(torch.bincount(whole.entries).max())  # a range ends between two Gaussians
-    assert max(entries) <= max(len(whole.entries) / len(ranges), layers * whole.num_tiles) * 1.5 + 2 * largest
+    largest = int(torch.bincount(whole.entries).max())  # a slice ends between two Gaussians
+    assert max(entries) <= max(len(whole.entries) / len(slices), layers * whole.num_tiles) * 1.5 + 2 * largest
 
 
 @pytest.mark.parametrize("rows", [(0, 12), (3, 7)])
@@ -358,10 +364,11 @@ def test_depth_ranges_cover_all_ranks_in_about_equal_parts(layers):
 @pytest.mark.parametrize("share", [None, 0.0, 0.4, 1.0])
 def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, ranks, share):
     projected = scene(0, cameras=2)
-    spans = tile_spans(projected, 8, THRESHOLD)
-    whole, low, high = spans.bin(*rows), *(ranks or (0, len(spans.ids)))
+    reach = Reach(projected, 8, THRESHOLD)
+    spans = reach.spans(*rows)
+    whole, low, high = reach.lists(spans, *rows), *(ranks or (0, len(reach.ids)))
     live = None if share is None else torch.rand(whole.num_tiles) < share
-    part = spans.bin(*rows, ranks, live)
+    part = reach.lists(spans, *rows, ranks, live)
     check_structure(projected, part)
     assert torch.equal(part.ids, whole.ids[low:high])
     for t in range(whole.num_tiles):
@@ -372,17 +379,20 @@ def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, r
         assert torch.equal(part.entries[part.offsets[t] : part.offsets[t + 1]], expected)
 
 
-def test_entries_per_row_are_what_the_rows_hold():
+@pytest.mark.parametrize("max_spans", [2**40, 200, 1])
+def test_spans_and_entries_per_row_are_what_the_rows_hold(max_spans):
     projected = scene(0, cameras=2)
-    spans, whole = tile_spans(projected, 8, THRESHOLD), bin_to_tiles(projected, 8)
-    assert torch.equal(spans.entries_per_row, whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1))
+    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    assert torch.equal(reach.entries_per_row, whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1))
+    assert reach.num_entries == len(whole.entries)
+    assert reach.spans_per_row.tolist() == [len(reach.spans(row, row + 1).ranks) for row in range(12)]
 
 
 def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
-    spans = tile_spans(scene(0), 8, THRESHOLD)
-    most = int(spans.entries_per_row.max())
-    with pytest.raises(ValueError, match=rf"max_bytes: .* needs \d+ entries, the budget allows {most - 1}"):
-        spans.bands(most - 1)
+    reach = Reach(scene(0), 8, THRESHOLD)
+    most = int(reach.entries_per_row.max())
+    with pytest.raises(ValueError, match=rf"max_bytes: one row of tiles needs {most} bytes, .* got {most - 1}"):
+        reach.row_slices(most - 1, 0, 1)
 
 
 # -- nothing to do -------------------------------------------------------------------------------------------------
@@ -393,10 +403,4 @@ def test_nothing_to_draw_gives_empty_lists_for_every_tile(projected):
     bins = bin_to_tiles(projected)
     assert bins.offsets.tolist() == [0] * (6 * 9 + 1)
     assert len(bins.entries) == len(bins.by_gaussian) == 0
-    assert tile_spans(projected, 8, THRESHOLD).bands(1) == [(0, 6)]
-
-
-def test_the_public_names_and_defaults():
-    projected = project(random_gaussians(5, 0), pinhole(16, 16, 16.0))
-    assert kgs.bin_to_tiles is bin_to_tiles
-    assert torch.equal(bin_to_tiles(projected).offsets, bin_to_tiles(projected, 8, 1 / 255).offsets)
+    assert Reach(projected, 8, THRESHOLD).row_slices(1, 1, 1) == [(0, 6)]

@@ -1,13 +1,16 @@
-"""Which Gaussians can reach which tile, front to back.
+"""Which Gaussian reaches which tile, front to back.
 
 A Gaussian reaches a pixel where alpha = o exp(-q/2) is at least the threshold: inside the ellipse q <= 2 ln(o/th).
 For each row of tiles the columns that the ellipse touches are closed form, because an ellipse is convex: its rightmost
-point within a horizontal band lies at its own rightmost point if that is in the band, else on the band's nearer edge.
-Every tile of the span is touched, every other is not; no tile has to be tested.
+point within a horizontal strip lies at its own rightmost point if that is in the strip, else on the strip's nearer
+edge. Every tile of this span is touched, every other is not; no tile has to be tested.
+
+Rows of tiles are numbered through all cameras.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,121 +20,236 @@ from torch import Tensor
 
 from kgs.covariance import variances
 from kgs.projection import cut_squared
-from kgs.types import ProjectedGaussians, TileBins
+from kgs.types import ProjectedGaussians, RasterOptions
 
-__all__ = ["TileSpans", "bin_to_tiles", "tile_spans"]
-
-
-def bin_to_tiles(projected: ProjectedGaussians, tile_size: int = 8, alpha_threshold: float = 1 / 255) -> TileBins:
-    """Depth-sorted lists of Gaussians for all tiles of all cameras.
-
-    Args:
-        projected: what `project` returned.
-        tile_size: side of the square tiles in pixels.
-        alpha_threshold: alphas below it do not count; with 0 every Gaussian is in every tile of its camera.
-
-    Returns:
-        The lists; equal depths keep the order of `projected`. A Gaussian of opacity 0 is in none.
-    """
-    spans = tile_spans(projected, tile_size, alpha_threshold)
-    return spans.bin(0, spans.entries_per_row.shape[0])
+__all__ = ["Reach", "Spans", "TileLists", "bin_to_tiles", "to_images", "to_tiles"]
 
 
 @dataclass(frozen=True)
-class TileSpans:
-    """For each Gaussian and each row of tiles the first tile and how many.
-
-    Rows of tiles are numbered through all cameras; memory is proportional to Gaussians times the rows they touch.
+class TileLists:
+    """For each tile of a row slice its list: the Gaussians that can reach it, front to back. Integers.
 
     Args:
         tile_size: side of a tile in pixels.
-        grid: (rows, columns) of tiles of one image.
-        ids: `(n,)`, rows of the `ProjectedGaussians` that touch a tile, in depth order.
-        ranks: `(S,)` int32, position in `ids`, ascending.
-        rows: `(S,)` int32, row of tiles.
-        first: `(S,)` int32, first column.
-        counts: `(S,)` int32, columns, may be 0.
-        entries_per_row: `(R,)` int64, sum of `counts` for each row of tiles.
+        grid: (rows, columns) of tiles in one image.
+        first_tile: number of the slice's first tile; tiles are numbered row by row, camera after camera.
+        offsets: `(T + 1,)` int64; the entries of tile t are `offsets[t]:offsets[t + 1]`.
+        entries: `(E,)` int32, position in `ids`, sorted by tile and then from front to back.
+        ids: `(n,)` int64, the rows of `ProjectedGaussians` that may have entries, in depth order.
+        order: `(E,)` int64, which place each entry has if they are sorted by `ids` first and then by tile.
     """
 
     tile_size: int
     grid: tuple[int, int]
+    first_tile: int
+    offsets: Tensor
+    entries: Tensor
     ids: Tensor
+    order: Tensor
+
+    @property
+    def num_tiles(self) -> int:
+        """How many tiles the slice has."""
+        return self.offsets.shape[0] - 1
+
+    @property
+    def by_gaussian(self) -> Tensor:
+        """The entries of `ids[0]`, then of `ids[1]`, ..., `(E,)` int64; computed at each call."""
+        entries = torch.arange(self.order.shape[0], device=self.order.device)
+        return torch.empty_like(self.order).scatter_(0, self.order, entries)
+
+    @property
+    def gaussian_offsets(self) -> Tensor:
+        """Where the entries of each of `ids` begin in `by_gaussian`, `(n,)` int64; computed at each call."""
+        counts = torch.bincount(self.entries, minlength=self.ids.shape[0])
+        return torch.cumsum(counts, 0) - counts
+
+
+@dataclass(frozen=True)
+class Spans:
+    """For each Gaussian and each row of tiles that it reaches the first tile and how many.
+
+    Args:
+        ranks: `(S,)` int32, position of the Gaussian in `Reach.ids`, ascending.
+        rows: `(S,)` int32, row of tiles.
+        first: `(S,)` int32, first column.
+        counts: `(S,)` int32, columns, may be 0.
+    """
+
     ranks: Tensor
     rows: Tensor
     first: Tensor
     counts: Tensor
-    entries_per_row: Tensor
 
-    def bands(self, max_entries: int) -> list[tuple[int, int]]:
-        """Consecutive ranges of rows with at most `max_entries` entries each.
+    def take(self, where: Tensor | slice) -> Spans:
+        """Some of the spans."""
+        fields = (self.ranks, self.rows, self.first, self.counts)
+        return Spans(*(x[where] if isinstance(where, slice) else x.index_select(0, where) for x in fields))
+
+
+class Reach:
+    """The rows of tiles that each Gaussian reaches; lists are made from it, a row slice and a depth slice at a time.
+
+    Memory is proportional to the Gaussians and, at any time, to at most `max_spans` spans.
+
+    Args:
+        projected: what `project` returned.
+        tile_size: side of a tile in pixels.
+        alpha_threshold: alphas below it do not count; with 0 every Gaussian reaches every tile of its camera.
+        max_spans: how many spans there is memory for.
+
+    Attributes:
+        ids: `(n,)`, rows of `projected` that reach a tile, in depth order; equal depths keep their order.
+        total_rows: R, rows of tiles of all cameras.
+        spans_per_row: `(R,)` int64.
+        entries_per_row: `(R,)` int64.
+        num_entries: of all tiles.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self, projected: ProjectedGaussians, tile_size: int, alpha_threshold: float, max_spans: int = 2**40
+    ) -> None:
+        height, self._width = projected.image_size
+        self.tile_size, self.grid = tile_size, (-(-height // tile_size), -(-self._width // tile_size))
+        self.total_rows = projected.num_cameras * self.grid[0]
+        cut = cut_squared(projected.opacities, alpha_threshold)
+        xx, xy, yy, det = variances(projected.factors, projected.eps2d)
+        reach = (cut.clamp_min(0.0) * yy).sqrt()
+        x, y = projected.means2d.unbind(1)
+        top = torch.ceil(y - reach).clamp(0, height)
+        bottom = torch.floor(y + reach).clamp(-1, height - 1)
+        ids = ((cut > 0) & (bottom >= top)).nonzero()[:, 0]
+        ids = ids.index_select(0, torch.sort(projected.depths.index_select(0, ids), stable=True).indices)
+        self.ids = ids
+        self._camera_row = projected.camera_ids.index_select(0, ids).int().mul_(self.grid[0])
+        self._first_row = (top.index_select(0, ids) / tile_size).floor().int()
+        self._num_rows = (bottom.index_select(0, ids) / tile_size).floor().int() - self._first_row + 1
+        # a column of numbers per Gaussian, gathered once for each row of tiles that it reaches
+        table = torch.stack([x, y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()])
+        table = table.index_select(1, ids)
+        self._table = torch.where(table.isfinite(), table, torch.inf)
+        self._count(max_spans)
+
+    def _count(self, max_spans: int) -> None:
+        """Count spans and entries; keep the spans where there is room for all."""
+        ends = torch.cumsum(self._num_rows, 0)
+        zeros = self.ids.new_zeros(self.total_rows + 1)
+        first = (self._camera_row + self._first_row).long()
+        steps = zeros.index_add(0, first, torch.ones_like(first)).index_add_(
+            0, first + self._num_rows, -torch.ones_like(first)
+        )
+        self.spans_per_row, self.entries_per_row = torch.cumsum(steps, 0)[:-1], zeros[:-1].clone()
+        self._entries_up_to, self._all = torch.empty_like(ends), None
+        bounds, total = [0], int(ends[-1]) if ends.shape[0] else 0
+        most = max(max_spans, self.grid[0])  # a Gaussian is never divided
+        while bounds[-1] < ends.shape[0]:
+            before = int(ends[bounds[-1] - 1]) if bounds[-1] else 0
+            limit = ends.new_tensor(before + most if total > max_spans else total)
+            bounds.append(int(torch.searchsorted(ends, limit, right=True)))
+        counted = 0
+        for low, high in pairwise(bounds):
+            spans = self.spans(0, self.total_rows, low, high)
+            self.entries_per_row.index_add_(0, spans.rows, spans.counts.long())
+            places = (ends[low:high] - (ends[low] - self._num_rows[low])) - 1
+            entries = torch.cumsum(spans.counts, 0).add_(counted).index_select(0, places)
+            self._entries_up_to[low:high] = entries
+            counted = int(entries[-1])
+            self._all = spans if len(bounds) == 2 else None
+        self.num_entries = counted
+
+    def row_slices(self, max_bytes: int, per_span: int, per_entry: int) -> list[tuple[int, int]]:
+        """Consecutive rows whose spans and entries take at most `max_bytes` together.
 
         Raises:
-            ValueError: one row of tiles alone has more.
+            ValueError: one row of tiles alone takes more.
         """
-        bands, begin, total = [], 0, 0
-        for row, entries in enumerate(self.entries_per_row.tolist()):
-            if entries > max_entries:
+        slices, begin, total = [], 0, 0
+        for row, need in enumerate((self.spans_per_row * per_span + self.entries_per_row * per_entry).tolist()):
+            if need > max_bytes:
                 raise ValueError(
-                    f"max_bytes: one row of tiles needs {entries} entries, the budget allows {max_entries}; "
+                    f"max_bytes: one row of tiles needs {need} bytes, expected at least that, got {max_bytes} for it; "
                     "raise max_bytes, or render fewer or smaller Gaussians"
                 )
-            if total + entries > max_entries:
-                bands.append((begin, row))
+            if total + need > max_bytes:
+                slices.append((begin, row))
                 begin, total = row, 0
-            total += entries
-        bands.append((begin, self.entries_per_row.shape[0]))
-        return bands
+            total += need
+        return [*slices, (begin, self.total_rows)]
 
-    def depth_ranges(self, layers: int) -> list[tuple[int, int]]:
-        """Consecutive ranges of `ids`, nearest first, of about `layers` entries a tile each."""
-        total, tiles = int(self.entries_per_row.sum()), self.entries_per_row.shape[0] * self.grid[1]
-        count = max(1, round(total / max(1, layers * tiles)))
-        if count == 1:
-            return [(0, self.ids.shape[0])]
-        entries = torch.cumsum(self.counts, 0)
-        targets = torch.arange(1, count, device=entries.device) * (total // count)
-        cuts = self.ranks.index_select(0, torch.searchsorted(entries, targets)).unique().tolist()
-        bounds = [0, *(cut for cut in cuts if cut > 0), self.ids.shape[0]]
-        return list(pairwise(bounds))
+    def depth_slices(self, layers: int) -> list[tuple[int, int]]:
+        """Consecutive ranges of `ids`, nearest first, of about `layers` entries per tile each."""
+        count = max(1, round(self.num_entries / max(1, layers * self.total_rows * self.grid[1])))
+        targets = torch.arange(1, count, device=self.ids.device) * (self.num_entries // count)
+        cuts = torch.searchsorted(self._entries_up_to, targets).unique().tolist()
+        return list(pairwise([0, *(cut for cut in cuts if cut > 0), self.ids.shape[0]]))
 
-    def bin(self, begin: int, end: int, ranks: tuple[int, int] | None = None, live: Tensor | None = None) -> TileBins:
-        """The lists of the tiles in rows `begin` to `end` (exclusive).
+    def spans(self, begin: int, end: int, low: int = 0, high: int | None = None) -> Spans:
+        """The spans of the Gaussians `ids[low:high]` in the rows `begin` to `end` (exclusive)."""
+        if (begin, end, low, high) == (0, self.total_rows, 0, None) and self._all is not None:
+            return self._all
+        camera_row, first_row, num_rows = (x[low:high] for x in (self._camera_row, self._first_row, self._num_rows))
+        if (begin, end) != (0, self.total_rows):
+            last = (camera_row + first_row + num_rows).clamp_(begin, end)
+            first = (camera_row + first_row).clamp_(begin, end)
+            first_row, num_rows = first - camera_row, last - first
+        ranks = torch.repeat_interleave(_arange(num_rows), num_rows, output_size=int(num_rows.sum(dtype=torch.int64)))
+        start = torch.cumsum(num_rows, 0, dtype=torch.int32) - num_rows
+        rows = _arange(ranks) + (first_row - start).index_select(0, ranks)
+        columns = (column[low:high].index_select(0, ranks) for column in self._table)
+        x, y, reach, cut, slope, across, inverse_yy, rightmost = columns
+        top = rows * float(self.tile_size) - y
+        bottom = torch.minimum(top + (self.tile_size - 1), reach)
+        top = torch.maximum(top, -reach)
+        everywhere = torch.isinf(cut)
+
+        def edge(sign: int) -> Tensor:
+            dy = torch.minimum(torch.maximum(sign * rightmost, top), bottom)
+            half = ((cut - dy * dy * inverse_yy).clamp_min_(0.0) * across).sqrt_()
+            found = torch.addcmul(x, slope, dy).add_(half, alpha=sign)
+            return torch.where(everywhere, sign * torch.inf, found)
+
+        left = torch.ceil(edge(-1)).clamp_(0, self._width)
+        right = torch.floor(edge(1)).clamp_(-1, self._width - 1)
+        first = (left / self.tile_size).floor().int()
+        counts = ((right / self.tile_size).floor().int() - first + 1).mul_(right >= left)
+        rows += camera_row.index_select(0, ranks)
+        return Spans(ranks + low if low else ranks, rows, first, counts)
+
+    def lists(
+        self, spans: Spans, begin: int, end: int, ranks: tuple[int, int] | None = None, live: Tensor | None = None
+    ) -> TileLists:
+        """The lists of the tiles in a row slice.
 
         Args:
+            spans: those of the row slice.
             begin: first row of tiles.
             end: one past the last row.
-            ranks: range of `ids` to list; None: all.
+            ranks: the depth slice, a range of `ids`; None: all.
             live: which of these tiles want a list, `(T,)`; None: all.
         """
-        spans: tuple[Tensor, ...] = (self.ranks, self.rows, self.first, self.counts)
         low, high = ranks or (0, self.ids.shape[0])
         if (low, high) != (0, self.ids.shape[0]):
-            cuts = torch.searchsorted(self.ranks, torch.tensor([low, high], device=self.ranks.device)).tolist()
-            spans = tuple(x[slice(*cuts)] for x in spans)
-        if (begin, end) != (0, self.entries_per_row.shape[0]):
-            inside = ((spans[1] >= begin) & (spans[1] < end)).nonzero()[:, 0]
-            spans = tuple(x.index_select(0, inside) for x in spans)
+            cuts = torch.searchsorted(spans.ranks, torch.tensor([low, high], device=self.ids.device)).tolist()
+            spans = spans.take(slice(*cuts))
+        columns = self.grid[1]
         if live is not None:
             alive = F.pad(torch.cumsum(live.int(), 0, dtype=torch.int32), (1, 0))
-            left = (spans[1] - begin) * self.grid[1] + spans[2]
-            inside = (alive.index_select(0, left + spans[3]) > alive.index_select(0, left)).nonzero()[:, 0]
-            spans = tuple(x.index_select(0, inside) for x in spans)
-        rank, rows, first, counts = spans
-        columns = self.grid[1]
-        num_tiles = (end - begin) * columns
-        num_entries = int(counts.sum(dtype=torch.int64))
+            left = (spans.rows - begin) * columns + spans.first
+            inside = alive.index_select(0, left + spans.counts) > alive.index_select(0, left)
+            spans = spans.take(inside.nonzero()[:, 0])
+        counts, num_tiles = spans.counts, (end - begin) * columns
         # in the order of the Gaussians: entry e of a span is tile (row, first + e)
         start = torch.cumsum(counts, 0, dtype=torch.int32) - counts
-        span = torch.repeat_interleave(_arange(counts), counts, output_size=num_entries)
-        tiles = _arange(span) + ((rows - begin) * columns + first - start).index_select(0, span)
-        entries = (rank - low).index_select(0, span)
+        span = torch.repeat_interleave(_arange(counts), counts, output_size=int(counts.sum(dtype=torch.int64)))
+        tiles = _arange(span) + ((spans.rows - begin) * columns + spans.first - start).index_select(0, span)
+        entries = (spans.ranks - low).index_select(0, span)
         if live is not None:
             inside = live.index_select(0, tiles).nonzero()[:, 0]
             tiles, entries = tiles.index_select(0, inside), entries.index_select(0, inside)
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
         per_tile = torch.bincount(keys, minlength=num_tiles)
-        return TileBins(
+        return TileLists(
             tile_size=self.tile_size,
             grid=self.grid,
             first_tile=begin * columns,
@@ -142,53 +260,30 @@ class TileSpans:
         )
 
 
-@torch.no_grad()
-def tile_spans(projected: ProjectedGaussians, tile_size: int, alpha_threshold: float) -> TileSpans:
-    """The exact span of every Gaussian in every row of tiles; see the head of this file."""
-    height, width = projected.image_size
-    grid = (-(-height // tile_size), -(-width // tile_size))
-    cut = cut_squared(projected.opacities, alpha_threshold)
-    xx, xy, yy, det = variances(projected.factors, projected.eps2d)
-    reach = (cut.clamp_min(0.0) * yy).sqrt()
-    y = projected.means2d[:, 1]
-    top = torch.ceil(y - reach).clamp(0, height)
-    bottom = torch.floor(y + reach).clamp(-1, height - 1)
-    ids = ((cut > 0) & (bottom >= top)).nonzero()[:, 0]
-    depths = projected.depths.index_select(0, ids)
-    ids = ids.index_select(0, torch.sort(depths, stable=True).indices)
+def bin_to_tiles(
+    projected: ProjectedGaussians,
+    tile_size: int = RasterOptions.tile_size,
+    alpha_threshold: float = RasterOptions.alpha_threshold,
+) -> TileLists:
+    """The lists of all tiles of all cameras at once; see `Reach`. A Gaussian of opacity 0 is in none."""
+    reach = Reach(projected, tile_size, alpha_threshold)
+    return reach.lists(reach.spans(0, reach.total_rows), 0, reach.total_rows)
 
-    # a column of numbers a Gaussian, gathered once for each row of tiles that it touches
-    first_row = (top.index_select(0, ids) / tile_size).floor().int()
-    num_rows = (bottom.index_select(0, ids) / tile_size).floor().int() - first_row + 1
-    num_spans = int(num_rows.sum(dtype=torch.int64))
-    ranks = torch.repeat_interleave(_arange(num_rows), num_rows, output_size=num_spans)
-    start = torch.cumsum(num_rows, 0, dtype=torch.int32) - num_rows
-    rows = _arange(ranks) + (first_row - start).index_select(0, ranks)
-    table = torch.stack(
-        [projected.means2d[:, 0], y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()]
-    ).index_select(1, ids)
-    table = torch.where(table.isfinite(), table, torch.inf)
-    x, y, reach, cut, slope, across, inverse_yy, rightmost = (column.index_select(0, ranks) for column in table)
-    low = rows * float(tile_size) - y
-    high = torch.minimum(low + (tile_size - 1), reach)
-    low = torch.maximum(low, -reach)
-    everywhere = torch.isinf(cut)
 
-    def edge(sign: int) -> Tensor:
-        dy = torch.minimum(torch.maximum(sign * rightmost, low), high)
-        half = ((cut - dy * dy * inverse_yy).clamp_min_(0.0) * across).sqrt_()
-        return torch.addcmul(x, slope, dy).add_(half, alpha=sign)
+def to_images(tiles: Tensor, grid: tuple[int, int], image_size: tuple[int, int]) -> Tensor:
+    """`(C * rows * columns, F, P)` to `(C, F, H, W)`."""
+    (rows, columns), size, (height, width) = grid, math.isqrt(tiles.shape[2]), image_size
+    cameras, channels = tiles.shape[0] // (rows * columns), tiles.shape[1]
+    images = tiles.view(cameras, rows, columns, channels, size, size).permute(0, 3, 1, 4, 2, 5)
+    return images.reshape(cameras, channels, rows * size, columns * size)[:, :, :height, :width].clone()
 
-    left = torch.where(everywhere, -torch.inf, edge(-1))
-    right = torch.where(everywhere, torch.inf, edge(1))
-    left = torch.ceil(left).clamp_(0, width)
-    right = torch.floor(right).clamp_(-1, width - 1)
-    first = (left / tile_size).floor().int()
-    counts = ((right / tile_size).floor().int() - first + 1).mul_(right >= left)
-    rows += projected.camera_ids.index_select(0, ids).int().mul_(grid[0]).index_select(0, ranks)
-    entries_per_row = torch.zeros(projected.num_cameras * grid[0], dtype=torch.int64, device=rows.device)
-    entries_per_row.index_add_(0, rows, counts.long())
-    return TileSpans(tile_size, grid, ids, ranks, rows, first, counts, entries_per_row)
+
+def to_tiles(images: Tensor, grid: tuple[int, int], size: int) -> Tensor:
+    """The inverse of `to_images`; pixels beyond the image are 0."""
+    (rows, columns), (cameras, channels, height, width) = grid, images.shape
+    images = F.pad(images, (0, columns * size - width, 0, rows * size - height))
+    tiles = images.view(cameras, channels, rows, size, columns, size).permute(0, 2, 4, 1, 3, 5)
+    return tiles.reshape(cameras * rows * columns, channels, size * size)
 
 
 def _arange(like: Tensor) -> Tensor:

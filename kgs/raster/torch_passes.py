@@ -1,268 +1,169 @@
-"""One step of compositing, forward and backward, for one thread with its own buffers.
+"""Compositing in torch: an autograd function that goes through row slices and depth slices, forward and backward.
 
-The formulas are those of `compositing`, the arrangement that of `chunks`.
+One row slice is kept for the backward pass, several are made again there.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from .tasks import Band
+from kgs.covariance import footprint_table, moment_gradients
+from kgs.full_precision import full_precision
+from kgs.types import Composited, ProjectedGaussians, RasterOptions
 
-__all__ = ["ALPHA_MAX", "Backward", "Forward", "Group", "Step"]
+from .tasks import Rules, Slice, buffer_bytes, bytes_per_entry, bytes_per_span, choose_chunk_size
+from .threads import run_all
+from .tiles import Reach, TileLists, to_images, to_tiles
+from .torch_steps import Backward, Forward
 
-ALPHA_MAX = 0.99
-_LIVE_SHARE = 0.8  # a group is compacted when fewer of its tiles than this still let light through
+__all__ = ["composite_torch"]
+
+_LAYERS = 192  # entries per tile in a depth slice: few pixels see more before their light is gone
+DepthSlices = list[tuple[tuple[int, int], Slice]]  # ranks, and what was done with them
+
+
+def composite_torch(
+    projected: ProjectedGaussians,
+    features: Tensor,
+    options: RasterOptions,
+    median_depth: bool = False,
+    chunk_size: int | None = None,
+) -> Composited:
+    """`kgs.composite` in torch, for every device and dtype; trusts its arguments."""
+    inputs = (projected.means2d, projected.factors, projected.opacities, features)
+    keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+    dtype, buffers = features.dtype, buffer_bytes(options.max_bytes, features)
+    budget = options.max_bytes - buffers * (4 if features.device.type == "cpu" else 1)  # some threads, one GPU
+    per_span, per_entry = bytes_per_span(dtype), bytes_per_entry(features.shape[1], options.tile_size, dtype)
+    reach = Reach(projected, options.tile_size, options.alpha_threshold, budget // (2 * per_span))
+    slices = reach.row_slices(budget, per_span, per_entry)
+    size = chunk_size or choose_chunk_size(reach)
+    rules = Rules(options.alpha_threshold, options.transmittance_stop, median_depth, size, buffers)
+    spare = budget - per_entry * reach.num_entries - per_span * int(reach.spans_per_row.sum()) // 4
+    passes = _Passes(projected, reach, slices, rules, spare if len(slices) == 1 else 0)
+    sums, transmittance, median = _Composite.apply(*inputs, passes, keep)
+    return Composited(sums, transmittance, median if median_depth else None)
 
 
 @dataclass(frozen=True)
-class Step:
-    """One step of a group, as the backward pass needs it."""
+class _Passes:
+    """Both passes over a row slice: one depth slice after the other, nearest first, while light is left.
 
-    chunk: int
-    rows: Tensor | None  # positions in the group of its tiles; None: the first ones
-    count: int
-    transmittance: Tensor  # before the step, (count, P)
-    alpha: Tensor | None  # (K, count, P), where there is memory to keep it
-    ended: bool  # whether the transmittance of a pixel fell to the stop
-
-
-@dataclass
-class Group:
-    """Tiles that are worked on together, longest list first, and the steps that were done on them."""
-
-    tiles: Tensor  # (m,) numbers in the band
-    starts: Tensor  # (m,) first entry
-    ends: Tensor  # (m,) one past the last entry
-    chunks: list[int]  # descending
-    steps: list[Step] = field(default_factory=list)
-
-
-class _Worker:
-    """Buffers of one thread, and the alphas of a step in them.
-
-    Layer k of all tiles of a step is one contiguous slab: what goes from layer to layer runs over long vectors.
+    Lists are made for the tiles alone that the depth slices before have left light in.
     """
 
-    def __init__(self, band: Band, buffers: int) -> None:
-        self.band = band
-        largest = max((len(group.chunks) for group in band.groups), default=0)
-        size = largest * (band.chunk_size + 1) * band.pixels
-        self.memory = [band.table.new_empty(size) for _ in range(buffers)]
+    projected: ProjectedGaussians
+    reach: Reach
+    row_slices: list[tuple[int, int]]
+    rules: Rules
+    spare: int  # bytes to keep alphas for the backward pass
 
-    def buffer(self, index: int, layers: int, n: int) -> Tensor:
-        """One of the buffers as `(layers, n, P)`."""
-        return self.memory[index][: layers * n * self.band.pixels].view(layers, n, self.band.pixels)
+    def forward(self, inputs: tuple[Tensor, ...], rows: tuple[int, int], keep: bool) -> tuple[Any, DepthSlices]:
+        """Sums, transmittance and median depth of the tiles, `(T, _, P)`; and what `backward` wants."""
+        spans, spare, live = self.reach.spans(*rows), self.spare, None
+        sums: tuple[Tensor, ...] = ()
+        done: DepthSlices = []
+        for ranks in self.reach.depth_slices(_LAYERS):
+            part = self._slice(inputs, self.reach.lists(spans, *rows, ranks, live), ranks)
+            sums = sums or part.blank()
+            keep_alphas = keep and part.alpha_bytes <= spare
+            spare -= part.alpha_bytes * keep_alphas
+            run_all(
+                part.groups,
+                partial(Forward, part, sums, keep, keep_alphas),
+                spans.rows.device,
+            )
+            if keep:
+                done.append((ranks, part))
+            live = sums[0].amax((1, 2)) > 0
+            if ranks[1] < self.reach.ids.shape[0] and not bool(live.any()):
+                break
+        transmittance, median, *features = sums
+        return (torch.cat(features, 1), transmittance, median), done
 
-    def entries(self, starts: Tensor, ends: Tensor, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Where a step's entries are `(K, n)`, which are beyond their tile's list, and their Gaussians `(K n,)`."""
-        band = self.band
-        positions = starts + (band.slots + chunk * band.chunk_size)[:, None]
-        beyond = positions >= ends
-        ids = band.entries.index_select(0, positions.view(-1)).masked_fill_(beyond.view(-1), band.features.shape[0] - 1)
-        return positions, beyond, ids
-
-    def offsets(self, places: Tensor, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """From the centres of n tiles to Gaussians at `places` `(2, K n)`."""
-        centres = self.band.centres.index_select(1, tiles)
-        ux, uy = (places.view(2, -1, tiles.shape[0]) - centres[:, None]).view(2, -1)
-        return ux, uy
-
-    def evaluate(self, ids: Tensor, tiles: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-        """Fill `alpha` `(K, n, P)`; returns the offsets."""
-        band = self.band
-        table = band.table.index_select(1, ids)
-        ux, uy = self.offsets(table[1:3], tiles)
-        ax, ay, bx, by = table[6], table[7], table[8], table[9]
-        va = torch.mul(ax, ux).addcmul_(ay, uy)
-        vb = torch.mul(bx, ux).addcmul_(by, uy)
-        table[0].addcmul_(va, va, value=-0.5).addcmul_(vb, vb, value=-0.5)
-        torch.mul(ax, va, out=table[1]).addcmul_(bx, vb)
-        torch.mul(ay, va, out=table[2]).addcmul_(by, vb)
-        flat = alpha.view(-1, band.pixels)
-        torch.mm(table[:6].t(), band.monomials, out=flat)
-        flat.clamp_(min=band.floor).exp_()
-        F.threshold(flat, band.cut, 0.0, inplace=True)
-        if band.clamps:
-            flat.clamp_(max=ALPHA_MAX)
-        return ux, uy
-
-    def scan(self, alpha: Tensor, before: Tensor) -> Tensor:
-        """The transmittance before each layer and after the last, `(K + 1, n, P)`, without the stop."""
-        light = self.buffer(0, alpha.shape[0] + 1, alpha.shape[1])
-        light[0] = before
-        if self.band.by_layer:
-            layers = light.unbind(0)
-            for k, a in enumerate(alpha.unbind(0)):
-                torch.addcmul(layers[k], layers[k], a, value=-1, out=layers[k + 1])
-        else:
-            torch.mul(torch.cumprod(1 - alpha, 0), light[:1], out=light[1:])
-        return light
-
-
-class Forward(_Worker):
-    """Adds the layers of a group to the sums, front to back."""
-
-    def __init__(
-        self, band: Band, blocks: tuple[Tensor, ...], outputs: tuple[Tensor, ...], keep: bool, keep_alphas: bool
+    def backward(
+        self, done: DepthSlices, grads: Tensor, behind: Tensor, total: Tensor, moments: bool, features: bool
     ) -> None:
-        super().__init__(band, buffers=2)
-        self.blocks, self.outputs, self.keep, self.keep_alphas = blocks, outputs, keep, keep_alphas
+        """Add to `total` what each Gaussian gets: six moments of dL/d ln alpha about its centre, and dL/d features.
 
-    def __call__(self, group: Group) -> None:
-        """Composite a group."""
-        band, size = self.band, self.band.chunk_size
-        tiles, starts, ends, chunks = group.tiles, group.starts, group.ends, group.chunks
-        state = tuple(output.index_select(0, tiles) for output in self.outputs)
-        rows: Tensor | None = None
-        group.steps = []
-        n, j = len(chunks), 0
-        while chunks[0] > j:
-            while chunks[n - 1] <= j:
-                n -= 1
-            light, median, *sums = (x[:n] for x in state)
-            _, _, ids = self.entries(starts[:n], ends[:n], j)
-            buffer = self.buffer(1, size, n)
-            alpha = torch.empty_like(buffer) if self.keep_alphas else buffer
-            self.evaluate(ids, tiles[:n], alpha)
-            layers = self.scan(alpha, light[:, 0])
-            # T never grows, so cutting afterwards is cutting at each layer
-            ended = float(layers[-1].min()) <= band.stop
-            if ended:
-                F.threshold(layers, band.stop, 0.0, inplace=True)
-            if self.keep:
-                kept = alpha if self.keep_alphas else None
-                group.steps.append(Step(j, rows, n, light[:, 0].clone(), kept, ended))
-            if band.depths is not None:
-                crossing = ((layers[:-1] >= 0.5) & (layers[1:] < 0.5)).to(light.dtype)
-                median.baddbmm_(
-                    band.depths.index_select(0, ids).view(size, n, 1).permute(1, 2, 0), crossing.transpose(0, 1)
-                )
-            weights = torch.mul(alpha, layers[:-1], out=buffer).transpose(0, 1)
-            for block, total in zip(self.blocks, sums, strict=True):
-                total.baddbmm_(block.index_select(0, ids).view(size, n, -1).permute(1, 2, 0), weights)
-            light[:, 0] = layers[-1]
-            if ended:
-                live = light[:, 0].amax(1) > 0
-                live_count = int(live.sum())
-                if live_count == 0:
-                    break
-                if live_count < _LIVE_SHARE * n:
-                    self._write(tiles, state)
-                    kept = live.nonzero()[:, 0]
-                    tiles, starts, ends = (x.index_select(0, kept) for x in (tiles, starts, ends))
-                    state = tuple(x.index_select(0, kept) for x in state)
-                    rows = kept if rows is None else rows.index_select(0, kept)
-                    chunks = [chunks[i] for i in kept.tolist()]
-                    n = len(chunks)
-            j += 1
-        self._write(tiles, state)
+        Args:
+            done: what `forward` returned.
+            grads: dL/d sums, `(T, F, P)`.
+            behind: V behind the last layer, `(T, 1, P)`, see `kgs.raster`; used up.
+            total: `(n, 6 + F)`, without the columns that are not wanted.
+            moments: whether the moments are wanted.
+            features: whether dL/d features is wanted.
+        """
+        for (low, high), part in reversed(done):
+            entries = part.lists.entries.shape[0]
+            if entries == 0:
+                continue
+            rows = total.new_zeros(entries + 1, total.shape[1])
+            run_all(part.groups, partial(Backward, part, grads, behind, rows, moments, features), rows.device)
+            # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
+            lists = part.lists
+            total[low:high] += F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
-    def _write(self, tiles: Tensor, state: tuple[Tensor, ...]) -> None:
-        for output, value in zip(self.outputs, state, strict=True):
-            output.index_copy_(0, tiles, value)
+    def _slice(self, inputs: tuple[Tensor, ...], lists: TileLists, ranks: tuple[int, int]) -> Slice:
+        """A slice with what its steps need of each Gaussian, and a dummy at the end that has no effect."""
+        means2d, factors, opacities, features = (x.index_select(0, lists.ids) for x in inputs)
+        table = F.pad(footprint_table(means2d, factors, opacities, self.projected.eps2d), (0, 1))
+        table[0, -1] = -torch.inf
+        depths: Tensor | None = None
+        if self.rules.median_depth:
+            depths = F.pad(self.projected.depths.detach().index_select(0, lists.ids), (0, 1))
+        features = torch.cat([features, features.new_zeros(1, features.shape[1])])
+        return Slice(table, features, depths, lists, self.rules)
 
 
-class Backward(_Worker):
-    """Takes the kept steps of a group from back to front and writes the gradients of their entries.
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means2d: Tensor, factors: Tensor, opacities: Tensor, features: Tensor, passes: _Passes, keep: bool
+    ) -> tuple[Tensor, ...]:
+        inputs = (means2d, factors, opacities, features)
+        keep_slice = keep and len(passes.row_slices) == 1
+        with full_precision(means2d.device):
+            parts, done = zip(*(passes.forward(inputs, rows, keep_slice) for rows in passes.row_slices), strict=True)
+        ctx.save_for_backward(*inputs)
+        ctx.passes, ctx.kept = passes, done[0] if keep_slice else None
+        grid, size = passes.reach.grid, passes.projected.image_size
+        images = tuple(to_images(torch.cat(x), grid, size) for x in zip(*parts, strict=True))
+        ctx.mark_non_differentiable(images[2])
+        return images
 
-    Args:
-        band: with the steps of its forward pass.
-        grads: dL/d sums, `(T, F, P)`.
-        behind: V behind the last layer, `(T, 1, P)`; becomes V before the first.
-        rows: one a entry and a last one for nobody; six moments where `moments`, then F where `features`.
-        moments: whether geometry or opacities want a gradient.
-        features: whether the features want one.
-    """
+    @staticmethod
+    def backward(ctx: Any, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "composite: expected backward without create_graph, the renderer has no second derivative"
+            )
+        passes, inputs, reach = ctx.passes, ctx.saved_tensors, ctx.passes.reach
+        _, factors, opacities, _ = inputs
+        grads, behind = (to_tiles(x, reach.grid, reach.tile_size) for x in (grad_sums, grad_transmittance))
+        moments, width = any(ctx.needs_input_grad[:3]), grads.shape[1] if ctx.needs_input_grad[3] else 0
+        total = factors.new_zeros(reach.ids.shape[0], 6 * moments + width)
+        with full_precision(factors.device):
+            for begin, end in passes.row_slices:
+                done, ctx.kept = ctx.kept, None  # its memory is free after this; a second backward makes it again
+                if done is None:
+                    done = passes.forward(inputs, (begin, end), keep=True)[1]
+                tiles = slice(begin * reach.grid[1], end * reach.grid[1])
+                passes.backward(done, grads[tiles], behind[tiles], total, moments, width > 0)
+                del done
+        found: tuple[Tensor | None, ...] = (None, None, None, total[:, total.shape[1] - width :])
+        if moments:
+            used, opaque = (x.index_select(0, reach.ids) for x in (factors, opacities))
+            found = (*moment_gradients(total[:, :6], used, opaque, passes.projected.eps2d), found[3])
 
-    def __init__(self, band: Band, grads: Tensor, behind: Tensor, rows: Tensor, moments: bool, features: bool) -> None:
-        super().__init__(band, buffers=5 if moments else 3)
-        self.grads, self.behind, self.rows, self.moments, self.features = grads, behind, rows, moments, features
-        self.colors = band.features.t().contiguous()
+        def of_all(value: Tensor) -> Tensor:
+            return value.new_zeros(factors.shape[0], *value.shape[1:]).index_copy_(0, reach.ids, value)
 
-    def __call__(self, group: Group) -> None:
-        """Differentiate a group."""
-        grads = self.grads.index_select(0, group.tiles)
-        behind = self.behind.index_select(0, group.tiles)[:, 0]
-        for step in reversed(group.steps):
-            if step.rows is None:
-                tiles, starts, ends = (x[: step.count] for x in (group.tiles, group.starts, group.ends))
-                self._step(step, tiles, starts, ends, grads[: step.count], behind[: step.count])
-            else:
-                rows = step.rows[: step.count]
-                tiles, starts, ends, g, later = (
-                    x.index_select(0, rows) for x in (group.tiles, group.starts, group.ends, grads, behind)
-                )
-                self._step(step, tiles, starts, ends, g, later)
-                behind.index_copy_(0, rows, later)
-        self.behind.index_copy_(0, group.tiles, behind[:, None])
-
-    def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
-        """Gradients of one step; `behind` becomes V before the step, see `compositing`."""
-        band, n, size = self.band, step.count, self.band.chunk_size
-        positions, beyond, ids = self.entries(starts, ends, step.chunk)
-        if step.alpha is None:
-            alpha = self.buffer(1, size, n)
-            ux, uy = self.evaluate(ids, tiles, alpha)
-        else:
-            alpha = step.alpha
-            ux, uy = self.offsets(band.table[1:3].index_select(1, ids), tiles)
-        light = self.scan(alpha, step.transmittance)
-        if step.ended:
-            F.threshold(light, band.stop, 0.0, inplace=True)
-        weights = torch.mul(alpha, light[:-1], out=self.buffer(2, size, n))
-        rows = self.rows.new_empty(n * size, self.rows.shape[1])
-        if self.features:
-            d_features = torch.bmm(weights.transpose(0, 1), grads.transpose(1, 2))
-            rows[:, rows.shape[1] - d_features.shape[2] :] = d_features.transpose(0, 1).reshape(n * size, -1)
-        if self.moments:
-            value = self.buffer(3, size, n).zero_()
-            for color, grad in zip(self.colors.index_select(1, ids).view(-1, size, n, 1), grads.unbind(1), strict=True):
-                value.addcmul_(color, grad)
-            later = self._scan_back(alpha, light, weights, value, behind, step.ended)
-            behind.copy_(later[0])
-            value.sub_(later[1:]).mul_(weights)
-            if band.clamps:  # no derivative where alpha is held at its maximum
-                value.mul_(torch.sub(ALPHA_MAX, alpha, out=self.buffer(0, size, n)).sign_())
-            moments = torch.mm(band.monomials, value.view(-1, band.pixels).t())
-            rows[:, :6] = _about_centre(moments, ux, uy).t()
-        positions.masked_fill_(beyond, self.rows.shape[0] - 1)
-        self.rows.index_copy_(0, positions.view(-1), rows)
-
-    def _scan_back(
-        self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor, ended: bool
-    ) -> Tensor:
-        """V of each layer and behind the last, `(K + 1, n, P)`; `light` is used up."""
-        later = self.buffer(4, alpha.shape[0] + 1, alpha.shape[1])
-        if self.band.by_layer:
-            later[-1] = behind
-            values, alphas, layers = value.unbind(0), alpha.unbind(0), later.unbind(0)
-            reached = light[1:].sign_().unbind(0) if ended else None
-            for k in reversed(range(len(values))):
-                if reached is not None:
-                    layers[k + 1].mul_(reached[k])
-                torch.lerp(layers[k + 1], values[k], alphas[k], out=layers[k])
-        else:  # the light that comes from behind a layer over the light that gets there; both are 0 behind the end
-            torch.mul(weights, value, out=later[:-1])
-            torch.mul(light[-1], behind, out=later[-1])
-            torch.div(later.flip(0).cumsum(0).flip(0), light.clamp_(min=torch.finfo(light.dtype).tiny), out=later)
-        return later
-
-
-def _about_centre(moments: Tensor, ux: Tensor, uy: Tensor) -> Tensor:
-    """Moments 1, x, y, xx, xy, yy about the tile's centre, in place to those about the Gaussian's."""
-    m0, mx, my, mxx, mxy, myy = moments
-    sx = torch.addcmul(mx, ux, m0, value=-1)
-    sy = torch.addcmul(my, uy, m0, value=-1)
-    mxx.addcmul_(ux, mx.add_(sx), value=-1)
-    mxy.addcmul_(ux, my, value=-1).addcmul_(uy, sx, value=-1)
-    myy.addcmul_(uy, my.add_(sy), value=-1)
-    mx.copy_(sx)
-    my.copy_(sy)
-    return moments
+        wanted = zip(found, ctx.needs_input_grad, strict=False)
+        return *(of_all(x) if needed and x is not None else None for x, needed in wanted), None, None

@@ -1,0 +1,76 @@
+"""Which implementation runs which stage: the one place where compiled stages stand beside those in torch.
+
+Each stage has one contract. The torch implementation covers every call and defines what is right; another one may
+cover fewer, gives the same within the rounding of its dtype, and differentiates what torch differentiates. Arguments
+are checked before a stage is called.
+
+    "projection"   (gaussians, cameras, image size, RasterOptions, with colours) -> ProjectedGaussians
+    "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
+    "loss"         (image, target, ...), as `kgs.losses.photometric_loss` calls it -> 0-d tensor
+
+The lists of tiles are no stage of their own: they are laid out for the kernels that read them, so each "compositing"
+makes its own. They decide nothing: a pixel depends on the alphas of its layers alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+__all__ = ["available", "check_backend", "choose", "register"]
+
+STAGES = ("projection", "compositing", "loss")
+
+
+class _Implementation(NamedTuple):
+    run: Callable[..., Any]
+    covers: Callable[..., bool]
+
+
+_registry: dict[str, dict[str, _Implementation]] = {stage: {} for stage in STAGES}
+
+
+def register(stage: str, backend: str, run: Callable[..., Any], covers: Callable[..., bool] = lambda *_: True) -> None:
+    """Add an implementation of a stage.
+
+    Args:
+        stage: one of `STAGES`.
+        backend: its name; what is registered later comes first for "auto".
+        run: with the contract of the stage.
+        covers: with the arguments of `run`, whether it can do this call; cheap, reads no values of tensors.
+
+    Raises:
+        ValueError: an unknown stage.
+    """
+    if stage not in _registry:
+        raise ValueError(f"stage: expected one of {STAGES}, got {stage!r}")
+    _registry[stage] = {backend: _Implementation(run, covers)} | _registry[stage]
+
+
+def available() -> tuple[str, ...]:
+    """The names that a `backend` argument may have."""
+    return ("auto", *sorted({name for stage in _registry.values() for name in stage}))
+
+
+def check_backend(backend: str) -> None:
+    """Raise a ValueError that names what there is, for a backend that there is not."""
+    if backend not in available():
+        raise ValueError(f"backend: expected one of {available()}, got {backend!r}")
+
+
+def choose(stage: str, backend: str, *arguments: Any) -> Callable[..., Any]:
+    """The implementation of a stage for these arguments.
+
+    "auto" takes the latest that covers them. One that is named runs the stages that it has, torch the others.
+
+    Raises:
+        ValueError: there is no such backend, or it is named and does not cover the call.
+    """
+    check_backend(backend)
+    there = _registry[stage]
+    if backend != "auto" and backend in there:
+        if not there[backend].covers(*arguments):
+            raise ValueError(f'backend: {backend!r} does not cover this call of {stage}, expected "auto" or "torch"')
+        return there[backend].run
+    names = there if backend == "auto" else ("torch",)
+    return next(there[name].run for name in names if there[name].covers(*arguments))
