@@ -40,8 +40,9 @@ def on_files(files, config):
     for name, page in PAGES.items():
         text = moved((ROOT / name).read_text(encoding="utf-8"))
         files.append(File.generated(config, page, content=f"---\nhide: [navigation]\n---\n\n{text}"))
-    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        files.append(File(f"notebooks/{path.name}", str(ROOT), config.site_dir, config.use_directory_urls))
+    for path in [ROOT / "CITATION.cff", *sorted((ROOT / "notebooks").glob("*.ipynb"))]:
+        name = path.relative_to(ROOT).as_posix()
+        files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
     return files
 
 
