@@ -52,9 +52,10 @@ class TargetMoments:
 
 def photometric_loss(
     image: Tensor,
-    target: Tensor,
+    target: Tensor | TargetMoments,
     dssim_weight: float = 0.2,
     *,
+    mask: Tensor | None = None,
     fast: bool = True,
     moments: TargetMoments | None = None,
 ) -> Tensor:
@@ -65,8 +66,11 @@ def photometric_loss(
 
     Args:
         image: `(B, C, H, W)`, float32 or float64, H, W >= 6 (any at weight 0); meant for [0, 1], never clamped.
-        target: like `image`.
+        target: like `image`, or `target_moments` of such an image.
         dssim_weight: weight of 1 - SSIM, >= 0; at 0 no SSIM is computed.
+        mask: the pixels that count, bool or 0 and 1, `(H, W)`, `(1, H, W)` or, one per image, `(B, 1, H, W)`. The
+            first term is the mean over these pixels, the second that over the windows (11 x 11, less at the border)
+            that lie in the mask whole, 0 where there are none. What is outside has no gradient and may be NaN.
         fast: False keeps to Kornia's own operations, as second derivatives need.
         moments: `target_moments(target)` of this very target, to save that work. Used by the fast path only.
 
@@ -75,7 +79,7 @@ def photometric_loss(
 
     Raises:
         TypeError: an image is no tensor, or neither float32 nor float64, or the two differ in dtype or device.
-        ValueError: shapes or the weight do not fit.
+        ValueError: shapes or the weight do not fit, or the mask is empty or has other values than 0 and 1.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
     Example:
@@ -83,24 +87,42 @@ def photometric_loss(
         >>> float(photometric_loss(target, target)) < 1e-4
         True
     """
+    if isinstance(target, TargetMoments):
+        moments = target
+    _check_images(image, image)
+    shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
+    if moments is not None:
+        if (moments.mean.shape, moments.mean.dtype, moments.mean.device) != (shape, image.dtype, image.device):
+            raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
+        if moments is target:
+            target = moments.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
         raise ValueError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
-    l1 = F.l1_loss(image, target)
+    outside = None
+    if mask is None:
+        loss = F.l1_loss(image, target)
+    else:
+        outside = _outside(mask, image)
+        image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
+        loss = _mean((image - target).abs(), outside)
     if dssim_weight == 0.0:
-        return l1
-    height, width = image.shape[-2:]
-    if min(height, width) <= RADIUS:
-        raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {height} x {width}")
-    if not fast or target.requires_grad or image.dtype != torch.float32 or min(height, width) < WINDOW:
-        return l1 + 2.0 * dssim_weight * ssim_loss(image, target, WINDOW)
+        return loss
+    if min(shape[-2:]) <= RADIUS:
+        raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}")
+    if outside is not None:  # from here on, of windows: those that touch a pixel outside
+        outside = F.max_pool2d(F.max_pool2d(_pad(outside.float()), (WINDOW, 1), 1), (1, WINDOW), 1) > 0
+        if bool(outside.all()):
+            return loss
+    if not fast or target.requires_grad or image.dtype != torch.float32 or min(shape[-2:]) < WINDOW:
+        return loss + 2.0 * dssim_weight * _mean(ssim_loss(image, target, WINDOW, reduction="none"), outside)
     if moments is None:
         moments = target_moments(target)
-    shape = (1, image.shape[0] * image.shape[1], height, width)
-    if moments.mean.shape != shape or moments.mean.dtype != target.dtype or moments.mean.device != target.device:
-        raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
-    mean_ssim: Tensor = _MeanSsim.apply(image.reshape(shape), moments.padded, moments.mean, moments.variance)
-    return l1 + dssim_weight * (1.0 - mean_ssim)
+    if outside is not None:
+        outside = outside.expand_as(image).reshape(shape)
+    # the one place where another implementation of the loss would be chosen
+    mean_ssim: Tensor = _MeanSsim.apply(image.reshape(shape), moments.padded, moments.mean, moments.variance, outside)
+    return loss + dssim_weight * (1.0 - mean_ssim)
 
 
 @torch.no_grad()
@@ -111,7 +133,7 @@ def target_moments(target: Tensor) -> TargetMoments:
         target: `(B, C, H, W)`, float32 or float64, H, W >= 6. No gradient flows to it.
 
     Returns:
-        The moments, to be given to :func:`photometric_loss` with the same target.
+        The moments, to be given to :func:`photometric_loss` with the same target or in its place.
 
     Raises:
         TypeError: `target` is no tensor, or neither float32 nor float64.
@@ -126,14 +148,16 @@ def target_moments(target: Tensor) -> TargetMoments:
 
 
 class _MeanSsim(torch.autograd.Function):
-    """Mean of the SSIM map of an image `(1, K, H, W)` with a target given by its moments.
+    """Mean of the SSIM map of an image `(1, K, H, W)` with a target given by its moments, over windows not `outside`.
 
     The derivatives of the map by the image's local mean, square and product with the target are pointwise; one more
     blur, the adjoint of the first, brings them to the pixels.
     """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, mean_y: Tensor, variance_y: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mean_y: Tensor, variance_y: Tensor, outside: Tensor | None
+    ) -> Tensor:
         padded = _pad(image)
         mean = _blur(padded)
         mean_squared, mean_product = mean * mean, mean * mean_y
@@ -151,11 +175,15 @@ class _MeanSsim(torch.autograd.Function):
             by_mean = (b - a).mul_(inverse).mul_(mean_y)
             by_mean.sub_(d.mul_(scaled).add_(by_square).mul_(mean)).mul_(2.0)
             by_product = a.mul_(inverse).mul_(2.0)
+            if outside is not None:
+                for derivative in (by_mean, by_square, by_product):
+                    derivative.masked_fill_(outside, 0.0)
             ctx.save_for_backward(padded, target, by_mean, by_square, by_product)
-        return ssim.mean()
+            ctx.count = ssim.numel() if outside is None else int((~outside).sum())
+        return _mean(ssim, outside)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
         # once_differentiable would stay silent here: the incoming gradient of a loss is a constant.
         if torch.is_grad_enabled():
             raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
@@ -163,8 +191,29 @@ class _MeanSsim(torch.autograd.Function):
         by_pixel = _blur_adjoint(by_mean)
         by_pixel.addcmul_(padded, _blur_adjoint(by_square), value=2.0)
         by_pixel.addcmul_(target, _blur_adjoint(by_product))
-        image_grad = _fold(by_pixel)
-        return image_grad.mul_(grad / image_grad.numel()), None, None, None
+        return _fold(by_pixel).mul_(grad / ctx.count), None, None, None, None
+
+
+def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
+    """The mean of `(B, C, H, W)` over what is not outside, `(B, 1, H, W)` or `(B, C, H, W)`."""
+    if outside is None:
+        return values.mean()
+    outside = outside.expand_as(values)
+    return values.masked_fill(outside, 0.0).sum() / (~outside).sum()
+
+
+def _outside(mask: Tensor, image: Tensor) -> Tensor:
+    """The pixels that do not count, bool `(B, 1, H, W)`."""
+    images, size = image.shape[0], tuple(image.shape[-2:])
+    if not isinstance(mask, Tensor) or tuple(mask.shape) not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
+        got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
+        raise ValueError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {got}")
+    outside = mask == 0
+    if not bool((outside | (mask == 1)).all()):
+        raise ValueError("mask: expected True and False, or 0 and 1; for other values write mask > 0.5")
+    if bool(outside.all()):
+        raise ValueError("mask: expected at least one pixel that counts, got none")
+    return outside.expand(images, 1, *size)
 
 
 def _pad(image: Tensor) -> Tensor:
