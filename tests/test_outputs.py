@@ -89,12 +89,31 @@ def test_no_results_among_the_files_of_a_scene(tmp_path):
     check_folder(scene / "results", ["a.png"], scene)  # again: those pictures are kgs's
 
 
-def test_a_folder_that_cannot_be_written_is_found_at_once(tmp_path):
+@pytest.mark.parametrize("name", ["file", "file/below", "file/below/that", "dangling"])
+def test_a_folder_that_cannot_be_is_found_at_once(tmp_path, name):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="exists|directory"):
-        check_folder(tmp_path / "file", [])
-    with pytest.raises(OSError, match="directory"):
-        check_folder(tmp_path / "file" / "below", [])
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="expected a folder for results"):
+        check_folder(tmp_path / name, [])
+
+
+def test_a_folder_without_permission_is_found_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)  # tests may run as root, who has every permission
+    with pytest.raises(DataError, match="no permission for"):
+        check_folder(tmp_path / "new", [])
+
+
+def test_looking_makes_nothing(tmp_path):
+    check_folder(tmp_path / "new" / "folder", ["a.png"], make=False)
+    assert os.listdir(tmp_path) == []
+    check_folder(tmp_path / "new" / "folder", ["a.png"])
+    assert os.listdir(tmp_path / "new") == ["folder"]
+
+
+def test_a_file_in_the_place_of_a_folder_is_kept(tmp_path):
+    (tmp_path / "test").write_text("mine")
+    with pytest.raises(DataError, match="was not written by kgs"):
+        check_folder(tmp_path, ["test/a.png"])
 
 
 def test_pictures_of_a_former_run_go_and_no_others(tmp_path):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,11 +20,12 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
-from kgs.datasets.scene import Views
+from kgs.datasets.scene import Scene, Views
+from kgs.errors import DataError
 
 from .lpips import Lpips
 
-__all__ = ["MEASURES", "evaluate"]
+__all__ = ["MEASURES", "evaluate", "measure_again"]
 
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
 WINDOW = 11
@@ -61,6 +63,44 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         rows.append(_measure(image.clamp(0.0, 1.0), target.to(image), lpips))
     means = {key: _mean([row[key] for row in rows]) for key in MEASURES}
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
+
+
+def measure_again(
+    path: Path,
+    metrics: dict[str, Any],
+    scene: Scene,
+    render: Callable[[PinholeCamera], Tensor],
+    lpips: Lpips | None = None,
+) -> dict[str, Any]:
+    """The metrics.json of a fit with the measures of its renders taken again; without `lpips` those of LPIPS stay.
+
+    Args:
+        path: where the metrics are from, for messages.
+        metrics: what the file holds.
+        scene: the fit's.
+        render: as `evaluate` wants it.
+        lpips: as `evaluate` wants it.
+
+    Raises:
+        DataError: the views of the scene are not those that the metrics are about.
+    """
+    fresh: dict[str, Any] = {}
+    for part, views in (("test", scene.test), ("train", scene.train)):
+        old = metrics.get(part) or {"views": []}
+        try:
+            known = {row["name"]: row for row in old["views"]}
+        except (KeyError, TypeError) as error:
+            raise DataError(path, part, "expected the measures of a fit, got others") from error
+        if set(known) != set(views.names):
+            raise DataError(path, part, f"is about other views than the {len(views)} of {scene.root}: fit again")
+        if not known:
+            fresh[part] = None
+            continue
+        fresh[part] = new = evaluate(render, views, lpips)
+        if lpips is None:
+            for row, before in [(new, old), *((row, known[row["name"]]) for row in new["views"])]:
+                row |= {key: before.get(key) for key in MEASURES if key.startswith("lpips")}
+    return metrics | fresh
 
 
 def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:

@@ -65,29 +65,35 @@ def run_metrics(
     }
 
 
-def check_folder(out: Path, files: Iterable[str], scene: Path | None = None) -> None:
+def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, make: bool = True) -> None:
     """Make the folder for results, once it is sure that this command can write there and overwrites no user's file.
 
     Args:
         out: the folder.
         files: what the command is going to write, relative to `out`.
-        scene: the scene's folder; no results go where it keeps its own files.
+        scene: the scene's folder; no results go where it keeps its own photos.
+        make: False only looks.
 
     Raises:
-        DataError: `out` is a scene, holds photos of `scene`, or has one of `files` that kgs did not write.
-        OSError: the folder cannot be made or written to.
+        DataError: `out` is no folder, cannot be written to, is a scene or holds photos of `scene`, or has one of
+            `files` that kgs did not write.
     """
-    out.mkdir(parents=True, exist_ok=True)
     advice = "choose another folder with -o"
+    there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
+    if not there.is_dir():
+        raise DataError(out, "", f"expected a folder for results, but {there} is none")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
-    photos = [path for path in list_images(out) if not is_own(path)] if inside else []
+    photos = [path for path in list_images(out) if not is_own(path)] if inside and there == out else []
     if photos or any((out / name).exists() for name in _SCENES):
         raise DataError(out, "", f"holds files of a scene: {advice}")
-    for name in files:
-        if (out / name).exists() and not is_own(out / name):
-            raise DataError(out / name, "", f"was not written by kgs and would be overwritten: {advice}")
-    write_whole(out / ".kgs", b"")
-    (out / ".kgs").unlink()
+    for path in (out / name for name in files):
+        folder = path.parent
+        if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(folder) and not folder.is_dir()):
+            raise DataError(path, "", f"was not written by kgs and would be overwritten: {advice}")
+    if make:
+        out.mkdir(parents=True, exist_ok=True)
 
 
 def is_own(path: Path) -> bool:

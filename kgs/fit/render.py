@@ -13,6 +13,7 @@ from kgs.renderer import GaussianRenderer
 
 from .config import Recipe
 from .outputs import check_folder, png_names, write_png
+from .progress import progress
 from .starts import typical_depths
 
 __all__ = ["render_views"]
@@ -26,17 +27,16 @@ def render_views(ply: Path, scene: Scene, out: Path, device: str = "cpu") -> int
     Raises:
         DataError: the PLY is broken, or `out` holds files that kgs did not write and would overwrite.
     """
+    model = load_ply(ply, origin=scene.offset)
+    near_plane = Recipe().near_plane * typical_depths(scene.train, model.means.detach())[0]
     names = png_names([*scene.train.names, *scene.test.names])
     check_folder(out, names.values(), scene.root)
-    model = load_ply(ply)
-    with torch.no_grad():
-        model.means.sub_(scene.offset.to(model.means))
-    near_plane = Recipe().near_plane * typical_depths(scene.train, model.means.detach())[0]
     renderer = GaussianRenderer(near_plane=near_plane).eval()
     model, background = model.to(device), scene.background.to(device)
-    for views in (scene.train, scene.test):
-        for i, name in enumerate(views.names):
-            camera = move_camera(views.camera(i), torch.device(device))
-            with torch.no_grad():
+    with progress(len(names), "pictures", unit="view") as advance, torch.no_grad():
+        for views in (scene.train, scene.test):
+            for i, name in enumerate(views.names):
+                camera = move_camera(views.camera(i), torch.device(device))
                 write_png(out / names[name], renderer(model(), camera, background).image[0])
+                advance()
     return len(names)

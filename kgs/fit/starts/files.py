@@ -42,19 +42,19 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
     for magic, name in _PACKED.items():
         if head.startswith(magic):
             raise DataError(path, "", f"expected a point cloud or mesh, got a {name} archive: unpack it first")
-    points, colors = _splat(path) if head.startswith(b"ply") and b" f_dc_0" in head else _cloud(path)
-    points = (points if origin is None else points - origin).float()
+    is_splat = head.startswith(b"ply") and b" f_dc_0" in head
+    points, colors = _splat(path, origin) if is_splat else _cloud(path, origin)
     if not len(points) or not bool(points.isfinite().all()):
         raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
     return points, colors
 
 
-def _splat(path: Path) -> tuple[Tensor, Tensor]:
-    model = load_ply(path)
-    return model.means.detach().double(), (0.5 + SH_C0 * model.sh_dc.detach()[:, 0]).clamp(0.0, 1.0)
+def _splat(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
+    model = load_ply(path, origin=origin)
+    return model.means.detach(), (0.5 + SH_C0 * model.sh_dc.detach()[:, 0]).clamp(0.0, 1.0)
 
 
-def _cloud(path: Path) -> tuple[Tensor, Tensor]:
+def _cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
     try:
         geometry: Any = trimesh.load(path, process=False, skip_materials=True)
         geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
@@ -62,6 +62,7 @@ def _cloud(path: Path) -> tuple[Tensor, Tensor]:
         values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
     except Exception as error:  # each of trimesh's readers raises what its parser meets
         raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
+    points = (points if origin is None else points - origin).float()
     if len(values) != len(points):
         return points, torch.full((len(points), 3), 0.5)
     return points, torch.tensor(values)[:, :3].float() / 255.0
