@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -46,36 +47,26 @@ class Frame:
     pose: Tensor
 
     def __post_init__(self) -> None:
-        lens, center = self.intrinsics, self.pose[:3, 3]
+        wrong = partial(DataError, self.source, self.name)
+        lens, center, rotation = self.intrinsics, self.pose[:3, 3], self.pose[:3, :3]
         numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
         if not np.isfinite(numbers).all():
-            raise DataError(self.source, self.name, "expected finite intrinsics, got NaN or infinity")
+            raise wrong("expected finite intrinsics, got NaN or infinity")
         if not (min(lens.fx, lens.fy) * LARGEST >= 1 and lens.width >= 1 and lens.height >= 1):
-            raise DataError(
-                self.source,
-                self.name,
-                "expected a focal length and an image size above 0, "
-                f"got {lens.fx:g}, {lens.fy:g} and {lens.width}x{lens.height}",
-            )
+            got = f"{lens.fx:g}, {lens.fy:g} and {lens.width}x{lens.height}"
+            raise wrong(f"expected a focal length and an image size above 0, got {got}")
         if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
-            raise DataError(self.source, self.name, "expected a finite 4x4 pose")
+            raise wrong("expected a finite 4x4 pose")
         if max(lens.width, lens.height, *map(abs, numbers), float(center.abs().max())) > LARGEST:
-            raise DataError(self.source, self.name, f"expected intrinsics and a camera centre up to {LARGEST:g}")
-        rotation = self.pose[:3, :3]
+            raise wrong(f"expected intrinsics and a camera centre up to {LARGEST:g}")
         error = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
         if not (error <= 1e-3 and float(torch.linalg.det(rotation)) > 0):  # the products may be NaN
-            raise DataError(self.source, self.name, "expected a pose with a right-handed rotation, got another matrix")
+            raise wrong("expected a pose with a right-handed rotation, got another matrix")
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points that come with a layout.
-
-    Args:
-        points: `(P, 3)` float64, in the world of the poses.
-        colors: `(P, 3)` in [0, 1].
-        kind: what `Scene.init_kind` says of them.
-    """
+    """Points `(P, 3)` float64 in the world of the poses, colours `(P, 3)` in [0, 1], and `Scene.init_kind` of both."""
 
     points: Tensor
     colors: Tensor
@@ -119,9 +110,10 @@ def path_inside(source: Path, root: Path, name: str, folder: Path | None = None)
     Raises:
         DataError: the name is empty, absolute, has a part "..", or passes through a link that leads out of `root`.
     """
+    wrong = partial(DataError, source, repr(name[:200]))
     given = PureWindowsPath(name)  # knows both separators and drives
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
-        raise DataError(source, repr(name[:200]), "expected the name of a file inside the scene's folder")
+        raise wrong("expected the name of a file inside the scene's folder")
     path = (folder or root) / name
     try:
         if not path.is_file():
@@ -129,9 +121,7 @@ def path_inside(source: Path, root: Path, name: str, folder: Path | None = None)
         path.is_file()
         target = Path(os.path.realpath(path))
     except (OSError, ValueError) as error:  # too long, or not to be written in the file system's encoding
-        reason = f"expected the name of a file, got an impossible one ({error})"
-        raise DataError(source, repr(name[:200]), reason) from error
+        raise wrong(f"expected the name of a file, got an impossible one ({error})") from error
     if not target.is_relative_to(os.path.realpath(root)):
-        reason = "expected a file inside the scene's folder, got a link that leads out"
-        raise DataError(source, repr(name[:200]), reason)
+        raise wrong("expected a file inside the scene's folder, got a link that leads out")
     return path

@@ -1,7 +1,6 @@
 """What an image's bytes say before they are decoded: its size, whether it is whole, how its pixels are stored.
 
-Decoding needs up to 24 bytes a pixel (16 bit RGBA as it is stored and as float32). That is foretold here from the
-header, and refused where it is out of all proportion to the file: see `_most_pixels`.
+Decoding takes up to 24 bytes per pixel (16 bit RGBA, also as float32): out of all proportion to a file it is refused.
 
 Sources: PNG (ISO 15948, 11.2.1), JPEG (ITU T.81, B.2), WebP (RFC 9649), BMP (Windows' BITMAPCOREHEADER and
 BITMAPINFOHEADER), TIFF 6.0 (sections 2, 8 and 18).
@@ -25,11 +24,7 @@ _WIDTH, _HEIGHT, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPL
 
 
 def image_size(path: Path, data: Buffer) -> tuple[int, int]:
-    """Width and height as the header of a PNG, JPEG, WebP, BMP or TIFF image says.
-
-    Args:
-        path: named in errors.
-        data: the file's bytes.
+    """Width and height as the header of a PNG, JPEG, WebP, BMP or TIFF image says; errors name `path`.
 
     Raises:
         DataError: it is none of these formats, its header is cut short, or decoding would take memory out of all
@@ -46,18 +41,16 @@ def image_size(path: Path, data: Buffer) -> tuple[int, int]:
         raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
     for wide, high in ((width, height), tile or (1, 1)):
         if wide * high > _most_pixels(len(data)):
-            raise DataError(
-                path, "header", f"claims {wide}x{high} pixels in {len(data)} bytes: a decompression bomb, not decoded"
-            )
+            claim = f"claims {wide}x{high} pixels in {len(data)} bytes"
+            raise DataError(path, "header", f"{claim}: a decompression bomb, not decoded")
     return width, height
 
 
 def _most_pixels(size: int) -> int:
-    """The most pixels that a file of so many bytes may have.
+    """The most pixels that a file of so many bytes may have: photos have fewer than 20 a byte, a plain PNG 1032.
 
-    Any file may have 2^21 (2 Mpx, 48 MiB while they are decoded). Up to 2^24 (16 Mpx, 384 MiB) a PNG of one colour
-    (1032 pixels a byte) is read; larger images, up to 2^28 pixels, need a byte for every 32 of them. Photos have
-    fewer than 20 a byte.
+    Any file may have 2^21 (48 MiB while they are decoded). Up to 2^24 (384 MiB) plain images are read; larger ones,
+    up to 2^28 pixels, need a byte for every 32 of them.
     """
     return min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
 
@@ -65,8 +58,7 @@ def _most_pixels(size: int) -> int:
 def plain_jpeg(data: bytes) -> bytes:
     """A JPEG up to the end of its first image: some phones put a video or a second picture behind it.
 
-    The parameters of a scan that only progressive images have are set to what they have to be in others: some phones
-    leave them 0, which decoders ignore but warn of.
+    Scan parameters that only progressive images need are set right in others: some phones leave them 0.
 
     Raises:
         ValueError: the file ends before its image does.
@@ -80,14 +72,14 @@ def plain_jpeg(data: bytes) -> bytes:
             parts[end - 3 : end] = b"\0\x3f\0"
         elif marker == 0xD9:
             return bytes(parts[:at])
-    raise ValueError
+    raise ValueError("the JPEG ends before its image does (a truncated file?)")
 
 
 def plain_tiff(data: bytes) -> tuple[bytes, bool]:
     """A TIFF whose pixels decoders give as they are stored, and whether these are multiplied by their alpha.
 
-    Decoders turn and mirror an image as its orientation tag says, and multiply 8 bit colours by an alpha that says
-    it is independent of them. Both tags are overwritten.
+    Decoders turn an image as its orientation tag says, and multiply 8 bit colours by an alpha that is not multiplied
+    in. Both tags are overwritten.
 
     Raises:
         ValueError: it is grey with an alpha channel, which decoders leave out.

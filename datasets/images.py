@@ -1,4 +1,4 @@
-"""Photos as arrays: reading, removing the lens's distortion, reducing; each step returns the intrinsics that result."""
+"""Photos as arrays: reading, removing the lens's distortion, reducing, and the intrinsics that result."""
 
 from __future__ import annotations
 
@@ -15,18 +15,8 @@ from kgs.errors import DataError
 
 from .image_size import image_size, plain_jpeg, plain_tiff
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "Image",
-    "Intrinsics",
-    "image_folder",
-    "list_images",
-    "read_image",
-    "read_size",
-    "rectification",
-    "remap",
-    "resize",
-]
+__all__ = ["IMAGE_SUFFIXES", "Image", "Intrinsics", "image_folder", "list_images", "read_bytes", "read_image"]
+__all__ += ["read_size", "rectification", "remap", "resize"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -46,15 +36,11 @@ class Intrinsics:
         image are these times the ratio of the sizes. `matrix` has kgs's integer pixel centres.
 
     Args:
-        width: in pixels, > 0.
-        height: in pixels, > 0.
-        fx: focal length in pixels, > 0.
-        fy: focal length in pixels, > 0.
-        cx: principal point in pixels.
-        cy: principal point in pixels.
-        distortion: coefficients in OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) where
-            `fisheye`; empty for a pinhole.
-        fisheye: the coefficients are those of `cv2.fisheye`.
+        width, height: in pixels, > 0.
+        fx, fy: focal lengths in pixels, > 0.
+        cx, cy: principal point in pixels.
+        distortion: coefficients in OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6); empty for a pinhole.
+        fisheye: the coefficients are those of `cv2.fisheye`, (k1, k2, k3, k4).
     """
 
     width: int
@@ -69,9 +55,8 @@ class Intrinsics:
     def scaled(self, width: int, height: int) -> Intrinsics:
         """The same lens on an image of another size."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+        numbers = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return Intrinsics(width, height, *numbers, self.distortion, self.fisheye)
 
     def same_aspect(self, width: int, height: int) -> bool:
         """Whether an image of this size can be a resized one, each side rounded to whole pixels."""
@@ -96,12 +81,16 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: p.name)
 
 
-def read_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header alone.
+def read_bytes(path: Path) -> bytes:
+    """A whole file, or a DataError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
 
-    Raises:
-        DataError: as in :func:`image_size`, or the file cannot be read.
-    """
+
+def read_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image, from its header alone, with the errors of :func:`image_size`."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             return image_size(path, data)
@@ -112,10 +101,7 @@ def read_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path) -> Image:
-    """Read an 8 or 16 bit image as it is stored: a rotation noted in its metadata is not applied.
-
-    Args:
-        path: a PNG, JPEG, WebP, BMP or TIFF image.
+    """Read an 8 or 16 bit PNG, JPEG, WebP, BMP or TIFF as it is stored: a rotation in its metadata is not applied.
 
     Returns:
         RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
@@ -124,10 +110,7 @@ def read_image(path: Path) -> Image:
         DataError: the file cannot be read, is of another format, truncated or a decompression bomb, is a JPEG that
             libjpeg finds damage in, or holds other numbers than 8 or 16 bit integers.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+    data = read_bytes(path)
     size = image_size(path, data)
     data, premultiplied = _plain(path, data)
     try:
@@ -138,11 +121,9 @@ def read_image(path: Path) -> Image:
         raise DataError(path, "", "OpenCV cannot decode this as an image (truncated, or no image?)")
     if image.dtype not in (np.uint8, np.uint16):
         raise DataError(path, "", f"expected 8 or 16 bit integers, got {image.dtype}")
-    channels = image.shape[2] if image.ndim == 3 else 1
-    if image.shape[1::-1] != size or channels not in _TO_RGB:
-        raise DataError(
-            path, "", f"expected {size} pixels of 1, 3 or 4 channels, got {image.shape[1::-1]} of {channels}"
-        )
+    channels, got = image.shape[2] if image.ndim == 3 else 1, image.shape[1::-1]
+    if got != size or channels not in _TO_RGB:
+        raise DataError(path, "", f"expected {size} pixels of 1, 3 or 4 channels, got {got} of {channels}")
     image = cv2.cvtColor(image, _TO_RGB[channels])
     result = np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
     if premultiplied and channels == 4:
@@ -152,34 +133,24 @@ def read_image(path: Path) -> Image:
 
 def _plain(path: Path, data: bytes) -> tuple[bytes, bool]:
     """The image's bytes for OpenCV, checked, and whether it stores colours that are multiplied by their alpha."""
-    if data.startswith((b"II", b"MM")):
-        try:
+    try:
+        if data.startswith((b"II", b"MM")):
             return plain_tiff(data)
-        except ValueError as error:
-            raise DataError(path, "", str(error)) from error
-    if data.startswith(b"\xff\xd8"):
-        try:
+        if data.startswith(b"\xff\xd8"):
             data = plain_jpeg(data)
-        except ValueError as error:
-            raise DataError(path, "", "the JPEG ends before its image does (a truncated file?)") from error
-        try:  # OpenCV only prints the decoder's warnings, and a damaged image comes in wrong colours
+            # OpenCV only prints the decoder's warnings, and a damaged image comes in wrong colours
             kornia_io.decode_image_jpegturbo(data, "mono")
-        except Exception as error:  # its base class is no other
-            raise DataError(path, "", "the JPEG is damaged, or has other colours than grey or RGB") from error
+    except ValueError as error:
+        raise DataError(path, "", str(error)) from error
+    except Exception as error:  # kornia_rs has no error of its own
+        raise DataError(path, "", "the JPEG is damaged, or has other colours than grey or RGB") from error
     return data, False
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:
-    """Reduce an image to the given size, each new pixel the mean over the area it covers.
+    """Reduce an image `(H, W)` or `(H, W, K)` and its intrinsics to a size that is not above its own.
 
-    Args:
-        image: `(H, W)` or `(H, W, K)`.
-        intrinsics: of `image`.
-        width: not above the image's.
-        height: not above the image's.
-
-    Returns:
-        The reduced image, and the intrinsics scaled by the exact ratio of each axis.
+    Each new pixel is the mean over the area it covers; the intrinsics are scaled by the exact ratio of each axis.
     """
     if (width, height) == (intrinsics.width, intrinsics.height):
         return image, intrinsics
@@ -208,11 +179,11 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
     """
     if not intrinsics.fisheye and not any(intrinsics.distortion):
         return replace(intrinsics, distortion=()), None
-    if max(intrinsics.width, intrinsics.height) > _LONGEST_REMAPPED:
+    width, height = intrinsics.width, intrinsics.height
+    if max(width, height) > _LONGEST_REMAPPED:
         raise ValueError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels a side, the image has more")
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
-    width, height = intrinsics.width, intrinsics.height
     rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap
     coefficients = np.array(intrinsics.distortion)
     x, y = rectify(intrinsics.matrix(), coefficients, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)

@@ -16,7 +16,7 @@ from torch import Tensor
 from kgs.errors import DataError
 
 from .frames import LARGEST, Frame, FrameSet
-from .images import Image, read_image, read_size, rectification, remap, resize
+from .images import read_image, read_size, rectification, remap, resize
 from .layouts import find_layout
 from .scene import Scene, Views, pinholes
 from .splits import select_evenly, split_by_name
@@ -24,7 +24,6 @@ from .splits import select_evenly, split_by_name
 __all__ = ["load_scene"]
 
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-_POINTS = ("none", "model-points")
 _LISTED = 20
 _FINE_PIXELS = 1_000_000  # of the images for the first points: twice the pixels a side halves the error of the depths
 
@@ -51,8 +50,8 @@ def load_scene(
 
     Args:
         path: the scene's folder.
-        train_views: how many views to train on, spread evenly over those that are not held out; None takes all.
-            Every eighth photo by name is held out, unless the files themselves name the test views.
+        train_views: how many views to train on, spread evenly over those that are not held out (every eighth photo by
+            name is, unless the files name the test views); None takes all.
         downscale: how many times smaller the images shall be than those that are read (`images/`, else the largest
             `images_k/`), >= 1; None leaves them as they are.
         background: "black" or "white", put behind images with an alpha channel.
@@ -73,19 +72,18 @@ def load_scene(
         ...     print(view["name"], view["image"].shape, view["extrinsics"].shape)
         >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
-    if background not in _BACKGROUNDS:
-        raise ValueError(f"background: expected one of {sorted(_BACKGROUNDS)}, got {background!r}")
-    if points not in _POINTS:
-        raise ValueError(f"points: expected one of {list(_POINTS)}, got {points!r}")
+    for name, value, known in (("background", background, _BACKGROUNDS), ("points", points, ("none", "model-points"))):
+        if value not in known:
+            raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
     if downscale is not None and not (isinstance(downscale, (int, float)) and 1 <= downscale < math.inf):
         raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
     root = Path(path)
     found = find_layout(root)
-    if points == "model-points" and found.model_points is None:
-        raise DataError(root, "points", "model-points are not available: there is no COLMAP model in sparse/0")
     train, test = _split(root, found, train_views)
     cloud = found.points
-    if points == "model-points" and found.model_points is not None:
+    if points == "model-points":
+        if found.model_points is None:
+            raise DataError(root, "points", "model-points are not available: there is no COLMAP model in sparse/0")
         cloud = found.model_points(train)
     if not bool((cloud.points.abs() <= LARGEST).all()):
         raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
@@ -95,6 +93,7 @@ def load_scene(
     height, width = size = _common_size([*train, *test], downscale)
     fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
     is_finer = photos and downscale is not None and fine_downscale < downscale
+    finer = _views(train, _common_size(train, fine_downscale), offset, color, photos) if is_finer else None
     return Scene(
         train=_views(train, size, offset, color, photos),
         test=_views(test, size, offset, color, photos),
@@ -104,7 +103,7 @@ def load_scene(
         offset=offset,
         background=color,
         root=root,
-        finer=_views(train, _common_size(train, fine_downscale), offset, color, photos) if is_finer else None,
+        finer=finer,
         notes=found.notes,
     )
 
@@ -115,7 +114,7 @@ def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[F
     times = Counter(frame.path for frame in every)
     for frame in every:
         if times[frame.path] > 1:
-            both = frame not in frames or frame.path in [other.path for other in found.test or ()]
+            both = {frame.path} <= {f.path for f in frames} & {f.path for f in found.test or ()}
             where = "in the training and in the test views" if both else "several times"
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
     if found.test is None:
@@ -139,25 +138,18 @@ def _check_present(root: Path, paths: Sequence[Path]) -> None:
 
 def _common_size(frames: Sequence[Frame], downscale: float | None) -> tuple[int, int]:
     """(height, width) of all images after downscaling, from the headers of the photos."""
-    first = None
+    sizes: dict[tuple[int, int], str] = {}
     for frame in frames:
-        width, height = read_size(frame.path)
-        lens = frame.intrinsics
+        (width, height), lens = read_size(frame.path), frame.intrinsics
         if not lens.same_aspect(width, height):
-            raise DataError(
-                frame.path,
-                "",
-                f"has {width}x{height} pixels, which is no scaled version of the {lens.width}x{lens.height} that "
-                f"{frame.source.name} describes",
-            )
-        by = downscale or 1
-        size = max(1, round(height / by)), max(1, round(width / by))
-        first = first or (size, f"{width}x{height}")
-        if size != first[0]:
-            raise DataError(frame.path, "", f"expected {first[1]} pixels as the other images, got {width}x{height}")
-    if first is None:
-        raise ValueError("frames: expected one or more, got none")
-    return first[0]
+            described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
+            raise DataError(frame.path, "", f"has {width}x{height} pixels, which is no scaled version of {described}")
+        size = max(1, round(height / (downscale or 1))), max(1, round(width / (downscale or 1)))
+        sizes.setdefault(size, f"{width}x{height}")
+        if len(sizes) > 1:
+            first, got = sizes.values()
+            raise DataError(frame.path, "", f"expected {first} pixels as the other images, got {got}")
+    return next(iter(sizes))
 
 
 def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, background: Tensor, photos: bool) -> Views:
@@ -174,7 +166,11 @@ def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, backg
         except ValueError as error:
             raise DataError(frame.source, frame.name, str(error)) from error
         if photos:
-            image, lens = resize(remap(_composited(frame.path, background), maps), lens, size[1], size[0])
+            image = read_image(frame.path)
+            if image.shape[2] == 4:
+                alpha = image[..., 3:]
+                image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
+            image, lens = resize(remap(image, maps), lens, size[1], size[0])
             pixels = torch.from_numpy(image).permute(2, 0, 1)
             images[i] = pixels[:3]
             if len(pixels) == 4:
@@ -189,15 +185,6 @@ def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, backg
         names=tuple(frame.name for frame in frames),
         masks=torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None,
     )
-
-
-def _composited(path: Path, background: Tensor) -> Image:
-    """A photo's RGB on the background, with its alpha behind if it has one."""
-    image = read_image(path)
-    if image.shape[2] == 4:
-        alpha = image[..., 3:]
-        image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
-    return image
 
 
 def _extrinsics(frames: Sequence[Frame], offset: Tensor) -> Tensor:

@@ -98,9 +98,7 @@ class Views:
     def camera(self, index: SupportsIndex | Sequence[SupportsIndex] | Tensor) -> PinholeCamera:
         """The cameras at the given positions, one or several (Kornia's class cannot be indexed).
 
-        Raises:
-            TypeError: the positions are no integers.
-            IndexError: there is no such view.
+        Positions that are no integers are a TypeError, views that are not there an IndexError.
         """
         rows = torch.as_tensor(index)
         if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
@@ -113,18 +111,13 @@ class Views:
     def select(self, indices: Sequence[int]) -> Views:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64)
-        return Views(
-            cameras=self.camera(rows),
-            images=self.images[rows],
-            names=tuple(self.names[i] for i in indices),
-            masks=None if self.masks is None else self.masks[rows],
-        )
+        masks = None if self.masks is None else self.masks[rows]
+        return Views(self.camera(rows), self.images[rows], tuple(self.names[i] for i in indices), masks)
 
     def halved(self) -> Views:
         """The views in half the pixels a side: means of 2 x 2; an odd last row or column is left out.
 
-        Raises:
-            ValueError: the images have a single row or column.
+        Images of a single row or column are a ValueError.
         """
         height, width = self.images.shape[-2] // 2, self.images.shape[-1] // 2
         if height == 0 or width == 0:
@@ -132,12 +125,9 @@ class Views:
         intrinsics = self.cameras.intrinsics.clone()
         intrinsics[:, :2, :3] *= 0.5
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
-        return Views(
-            cameras=pinholes(intrinsics, self.cameras.extrinsics, (height, width)),
-            images=avg_pool2d(self.images, 2),
-            names=self.names,
-            masks=None if self.masks is None else avg_pool2d(self.masks, 2),
-        )
+        cameras = pinholes(intrinsics, self.cameras.extrinsics, (height, width))
+        masks = None if self.masks is None else avg_pool2d(self.masks, 2)
+        return Views(cameras, avg_pool2d(self.images, 2), self.names, masks)
 
 
 @dataclass(frozen=True)
@@ -174,8 +164,6 @@ class Scene:
             raise DataError(self.root, "train", "expected at least one training view, got none")
         if self.finer is not None and self.finer.names != self.train.names:
             raise ValueError(f"finer: expected the views {self.train.names} as train, got {self.finer.names}")
-        if self.points.shape != self.point_colors.shape or self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise ValueError(
-                f"points, point_colors: expected two of shape (P, 3), got {tuple(self.points.shape)} "
-                f"and {tuple(self.point_colors.shape)}"
-            )
+        shapes = tuple(self.points.shape), tuple(self.point_colors.shape)
+        if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3:
+            raise ValueError(f"points, point_colors: expected two of shape (P, 3), got {shapes[0]} and {shapes[1]}")

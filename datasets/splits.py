@@ -17,15 +17,11 @@ def split_by_name(names: Sequence[str], train_views: int | None = None) -> tuple
 
     Names are sorted by code point ("img10" before "img2"), as the published splits were; the first one is a test view.
 
-    Args:
-        names: the views, in any order.
-        train_views: how many training views to choose; None takes all that are not held out.
-
     Returns:
         Positions in `names` of the training and of the test views, both in the order of the sorted names.
 
     Raises:
-        ValueError: train_views is outside [1, number of views that are not held out].
+        ValueError: as :func:`select_evenly`, for the views that are not held out.
     """
     order = sorted(range(len(names)), key=lambda i: names[i])
     test = order[::TEST_EVERY]
@@ -36,14 +32,8 @@ def split_by_name(names: Sequence[str], train_views: int | None = None) -> tuple
 def select_evenly(count: int, train_views: int | None = None) -> list[int]:
     """Choose positions evenly among `count`, the first and the last included.
 
-    The positions are linspace(0, count - 1, train_views), rounded half to even: other roundings give other views.
-
-    Args:
-        count: how many there are to choose from.
-        train_views: how many to choose; None takes all.
-
-    Returns:
-        Increasing positions in [0, count - 1].
+    The increasing positions are linspace(0, count - 1, train_views), rounded half to even: other roundings give other
+    views. None takes all.
 
     Raises:
         ValueError: train_views is no whole number in [1, count].

@@ -39,7 +39,7 @@ def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path
     with pytest.raises(DataError, match="got a file$"):
         load_scene(tmp_path / "other" / "a.json")
     (tmp_path / "my scene" / "notes.txt").touch()
-    with pytest.raises(DataError, match=r"got a file: the scene is the folder.*my scene"):
+    with pytest.raises(DataError, match=r"got a file: the scene is .*my scene$"):
         load_scene(tmp_path / "my scene" / "notes.txt")
 
 
@@ -63,7 +63,7 @@ def test_what_is_no_scene_is_named(tmp_path: Path, folder: str, names: list[str]
 
 def test_a_video_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "walk.mov").touch()
-    with pytest.raises(DataError, match="got a video: take photos out of it"):
+    with pytest.raises(DataError, match="got a video: take photos out"):
         load_scene(tmp_path / "walk.mov")
 
 

@@ -24,7 +24,8 @@ _LAYOUTS = (
 )
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 _UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif", ".jxl", ".exr")
-_ON_PHOTOS = "run COLMAP (its model goes to sparse/0) or nerfstudio's ns-process-data (transforms.json) on them first"
+_NO_POSES = "run COLMAP (its model goes to sparse/0) or nerfstudio's ns-process-data (transforms.json) on them first"
+_NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
 def find_layout(root: Path) -> FrameSet:
@@ -49,9 +50,8 @@ def _about_file(path: Path) -> str:
     if not path.exists():
         return "expected a folder, there is none"
     if path.suffix.lower() in _VIDEOS:
-        return "expected a folder, got a video: take photos out of it (ns-process-data video does that and finds poses)"
-    inside = f": the scene is the folder that it lies in, {path.parent}" if _is_scene(path.parent) else ""
-    return f"expected a folder, got a file{inside}"
+        return f"expected a folder, got a video: {_NO_PHOTOS}"
+    return "expected a folder, got a file" + (f": the scene is {path.parent}" if _is_scene(path.parent) else "")
 
 
 def _about_folder(root: Path) -> str:
@@ -59,19 +59,14 @@ def _about_folder(root: Path) -> str:
     for folder in (*sorted(p for p in root.iterdir() if p.is_dir()), *list(root.resolve().parents)[:2]):
         if _is_scene(folder):
             return f"is no scene, but {folder} is one: give that folder"
-    photo_folder = image_folder(root) or root
-    photos = len(list_images(photo_folder))
-    if photos:
-        return f"has {photos} photos but no camera poses: {_ON_PHOTOS}"
-    files = [p for folder in {root, photo_folder} for p in folder.iterdir() if not p.name.startswith(".")]
-    for suffixes, advice in (
-        (_UNREADABLE, "photos that cannot be read: convert them to JPEG or PNG"),
-        (_VIDEOS, "videos: take photos out of them (ns-process-data video does that and finds poses)"),
-    ):
-        kinds = sorted({p.suffix[1:].upper() for p in files if p.suffix.lower() in suffixes})
-        if kinds:
-            count = sum(p.suffix.lower() in suffixes for p in files)
-            return f"is no scene: it holds {count} {' and '.join(kinds)} {advice}"
+    photos = image_folder(root) or root
+    if count := len(list_images(photos)):
+        return f"has {count} photos but no camera poses: {_NO_POSES}"
+    endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
+    unreadable = "photos that cannot be read: convert them to JPEG or PNG"
+    for suffixes, advice in ((_UNREADABLE, unreadable), (_VIDEOS, f"videos: {_NO_PHOTOS}")):
+        if found := [ending[1:].upper() for ending in endings if ending in suffixes]:
+            return f"is no scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
     return (
         "is no scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
         "transforms.json (nerfstudio)"

@@ -12,7 +12,7 @@ import torch
 from kgs.datasets.frames import FrameSet, PointCloud
 from kgs.datasets.splits import BLENDER_TRAIN_FRAMES
 
-from .transforms import read_transforms
+from .nerfstudio import read_transforms
 
 __all__ = ["load_blender"]
 
@@ -23,10 +23,7 @@ def load_blender(root: Path) -> FrameSet:
     """Read the two json files, see :func:`read_transforms`, as NeRF's scenes and scenes of one's own have them.
 
     All frames of the test file are test views. Eight training views are the published ones (2, 16, 26, 55, 73, 76,
-    86, 93 in the file's order). First points are random in [-1, 1]^3.
-
-    Raises:
-        DataError: a file is missing or damaged.
+    86, 93 in the file's order). First points are random in [-1, 1]^3. A missing or damaged file is a DataError.
     """
     train, _, notes = read_transforms(root, "transforms_train.json")
     test, _, more = read_transforms(root, "transforms_test.json")

@@ -1,7 +1,4 @@
-"""Scenes with a COLMAP model: `sparse/0` (binary or text) beside `images/`.
-
-Sources: https://colmap.github.io/format.html, https://colmap.github.io/cameras.html.
-"""
+"""Scenes with a COLMAP model: `sparse/0` beside `images/` (https://colmap.github.io/cameras.html)."""
 
 from __future__ import annotations
 
@@ -21,13 +18,10 @@ __all__ = ["camera_to_world", "load_colmap", "track_points"]
 
 
 def load_colmap(root: Path) -> FrameSet:
-    """Read a COLMAP model in `sparse/0` or `sparse`; distorted lenses are undone when photos are read.
+    """Read a COLMAP model in `sparse/0` or `sparse`; a missing or damaged one is a DataError.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes already; its first pixel's centre is at (0.5, 0.5).
-
-    Raises:
-        DataError: the model is missing or damaged.
     """
     folder = find_model(root)
     if folder is None:
@@ -46,9 +40,7 @@ def load_colmap(root: Path) -> FrameSet:
         ids[path] = image_id
     others = [p.name for p in sorted(folder.parent.iterdir()) if p.name.isdecimal() and p != folder and p.is_dir()]
     notes = (f"sparse/: only model 0 is read, not {', '.join(others[:20])}",) if folder.name == "0" and others else ()
-    return FrameSet(
-        frames, model_points=lambda train: track_points(folder, {ids[frame.path] for frame in train}), notes=notes
-    )
+    return FrameSet(frames, model_points=lambda t: track_points(folder, {ids[f.path] for f in t}), notes=notes)
 
 
 def camera_to_world(image: ColmapImage) -> Tensor:
@@ -60,17 +52,14 @@ def camera_to_world(image: ColmapImage) -> Tensor:
 
 
 def track_points(folder: Path, image_ids: set[int]) -> PointCloud:
-    """The points of a model that at least two of the given images observe, as first points.
-
-    Their positions were refined with all images, test views among them: `kind` says "model-points".
-    """
+    """The points that at least two of the given images observe; their positions were refined with all images."""
     points, colors = read_points(model_file(folder, "points3D"), image_ids)
     return PointCloud(torch.from_numpy(points), torch.from_numpy(colors).float() / 255.0, "model-points")
 
 
 def _intrinsics(camera: ColmapCamera) -> Intrinsics:
     numbers, model = camera.params, camera.model
-    if model.startswith("SIMPLE_") or model.startswith("RADIAL"):
+    if model.startswith(("SIMPLE_", "RADIAL")):
         numbers = (numbers[0], *numbers)
     fx, fy, cx, cy, *distortion = numbers
     # Radial models end with k1 or k1, k2; what OpenCV's order has next (p1, p2; k3, k4 of a fisheye) is 0 then.

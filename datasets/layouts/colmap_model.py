@@ -1,7 +1,7 @@
 """COLMAP's sparse models, binary and text, as plain numbers.
 
-Source: https://colmap.github.io/format.html; rigs and frames of newer versions repeat what images.* says and are not
-read. Every count is held against the file's length before anything of that size is made.
+Source: https://colmap.github.io/format.html. The rigs and frames of newer versions repeat what images.* says and are
+not read. Every count is held against the file's length before memory of that size is taken.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs.datasets.images import read_bytes
 from kgs.errors import DataError
 
 __all__ = ["ColmapCamera", "ColmapImage", "find_model", "model_file", "read_cameras", "read_images", "read_points"]
@@ -22,32 +23,13 @@ __all__ = ["ColmapCamera", "ColmapImage", "find_model", "model_file", "read_came
 T = TypeVar("T")
 
 _LONGEST_NAME = 4096
-# Names in the order of COLMAP's model ids.
+# In the order of COLMAP's model ids; the numbers of parameters of those that are read.
 _MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
+    "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV SIMPLE_RADIAL_FISHEYE "
+    "RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"
 )
-# The models that are read, with their number of parameters.
-_PARAMETERS = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12,
-    "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5,
-}
+_PARAMETERS = dict(SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5)
+_PARAMETERS |= dict(OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12)
 
 
 @dataclass(frozen=True)
@@ -79,11 +61,7 @@ def find_model(root: Path) -> Path | None:
 
 
 def model_file(folder: Path, stem: str) -> Path:
-    """The binary file of that stem, else the text file.
-
-    Raises:
-        DataError: there is neither.
-    """
+    """The binary file of that stem, else the text file, else a DataError."""
     for suffix in ("bin", "txt"):
         if (folder / f"{stem}.{suffix}").is_file():
             return folder / f"{stem}.{suffix}"
@@ -94,15 +72,14 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Read cameras.bin or cameras.txt.
 
     Raises:
-        DataError: the file is damaged, an id is there twice, or a camera model is not one of those that can be
-            undistorted.
+        DataError: the file is damaged, an id is there twice, or a camera model cannot be undistorted.
     """
     cameras: dict[int, ColmapCamera] = {}
     if path.suffix == ".bin":
         data = _Binary(path)
         for _ in range(data.count("number of cameras", 24)):
             camera_id, model_id, width, height = data.take("<IiQQ", "camera")
-            model = _MODELS[model_id] if 0 <= model_id < len(_MODELS) else f"number {model_id}"
+            model = dict(enumerate(_MODELS.split())).get(model_id, f"number {model_id}")
             params = data.take(f"<{_parameter_count(path, camera_id, model)}d", f"camera {camera_id}")
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
         data.finish()
@@ -116,18 +93,14 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
-    """Read images.bin or images.txt; the 2D observations are passed over.
-
-    Raises:
-        DataError: the file is damaged or an id is there twice.
-    """
+    """Read images.bin or images.txt without the 2D observations; damage or an id there twice is a DataError."""
     images: dict[int, ColmapImage] = {}
     if path.suffix == ".bin":
         data = _Binary(path)
         for _ in range(data.count("number of images", 73)):
             image_id, *pose, camera_id = data.take("<I7dI", "image")
             name = data.string(f"image {image_id}")
-            data.skip(24 * data.count(f"observations of {name}", 24))
+            data.skip(f"observations of {name}", 24)
             _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
         data.finish()
     else:
@@ -143,28 +116,12 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
 
 
 def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Read those points of points3D.bin or points3D.txt that at least two of the given images observe.
-
-    Returns:
-        Positions `(P, 3)` and RGB `(P, 3)`.
+    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe.
 
     Raises:
         DataError: the file is damaged or a position is not finite.
     """
-    rows: list[tuple[Any, ...]] = []
-    if path.suffix == ".bin":
-        data = _Binary(path)
-        for _ in range(data.count("number of points", 51)):
-            _, *row, _ = data.take("<Q3d3Bd", "point")
-            track = data.take(f"<{2 * data.count('track', 8)}I", "track")
-            if len(image_ids.intersection(track[::2])) >= 2:
-                rows.append(tuple(row))
-        data.finish()
-    else:
-        for line in filter(None, _lines(path)):
-            _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, _integers))
-            if len(image_ids.intersection(track[::2])) >= 2:
-                rows.append(tuple(row))
+    rows = [row for row, track in _tracks(path) if len(image_ids.intersection(track[::2])) >= 2]
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")
@@ -173,19 +130,32 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
     return points, np.array([row[3:] for row in rows], np.uint8).reshape(-1, 3)
 
 
+def _tracks(path: Path) -> Iterator[tuple[list[Any], tuple[int, ...]]]:
+    """Position and colour of each point, and its track: an image's id and an observation's number, again and again."""
+    if path.suffix == ".bin":
+        data = _Binary(path)
+        for _ in range(data.count("number of points", 51)):
+            _, *row, _ = data.take("<Q3d3Bd", "point")
+            yield row, data.take(f"<{2 * data.count('track', 8)}I", "track")
+        data.finish()
+    else:
+        for line in filter(None, _lines(path)):
+            _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, _integers))
+            yield row, track
+
+
 class _Binary:
     """A file's bytes with a position that cannot leave them."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._data = _read_bytes(path)
-        self._at = 0
+        self._path, self._data, self._at = path, read_bytes(path), 0
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
         """The next values, of a format of `struct`."""
-        self._need(struct.calcsize(form), what)
-        self._at += struct.calcsize(form)
-        return struct.unpack_from(form, self._data, self._at - struct.calcsize(form))
+        at, size = self._at, struct.calcsize(form)
+        self._need(size, what)
+        self._at += size
+        return struct.unpack_from(form, self._data, at)
 
     def count(self, what: str, least_bytes: int) -> int:
         """The next 64 bit count, of things that take at least that many bytes each."""
@@ -204,12 +174,13 @@ class _Binary:
         except UnicodeDecodeError as error:
             raise DataError(self._path, what, f"expected a name in UTF-8, got {text!r}") from error
 
-    def skip(self, size: int) -> None:
-        """Pass over bytes whose presence `count` has checked."""
-        self._at += size
+    def skip(self, what: str, size: int) -> None:
+        """Pass over things of that many bytes each, behind their count."""
+        number = self.count(what, size)
+        self._at += size * number
 
     def finish(self) -> None:
-        """Make sure that nothing is left."""
+        """Refuse what is left."""
         if self._at != len(self._data):
             raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
 
@@ -219,17 +190,10 @@ class _Binary:
             raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
 
 
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
-
-
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text model without its comments, stripped; empty ones included."""
     try:
-        text = _read_bytes(path).decode("utf-8-sig")
+        text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(path, "", "expected text in UTF-8") from error
     return (line.strip() for line in text.split("\n") if not line.startswith("#"))
@@ -256,16 +220,15 @@ def _is_observations(line: str) -> bool:
     """Whether a line can be an image's observations: x, y and a point's id, again and again."""
     words = line.split()
     try:
-        return len(words) % 3 == 0 and len(_floats(" ".join(words[:12]))) > 0
+        return len(words) % 3 == 0 and bool(_floats(" ".join(words[:12])))
     except ValueError:
         return False
 
 
 def _parameter_count(path: Path, camera_id: int, model: str) -> int:
     if model not in _PARAMETERS:
-        raise DataError(
-            path, f"camera {camera_id}", f"camera model {model} cannot be read, only {', '.join(_PARAMETERS)}"
-        )
+        reason = f"camera model {model} cannot be read, only {', '.join(_PARAMETERS)}"
+        raise DataError(path, f"camera {camera_id}", reason)
     return _PARAMETERS[model]
 
 

@@ -1,7 +1,4 @@
-"""LLFF scenes: `poses_bounds.npy` beside `images/` or `images_k/`.
-
-Source: https://github.com/Fyusion/LLFF, "Using your own poses without running COLMAP".
-"""
+"""LLFF scenes: `poses_bounds.npy` beside `images/` or `images_k/` (https://github.com/Fyusion/LLFF)."""
 
 from __future__ import annotations
 
@@ -25,13 +22,12 @@ __all__ = ["load_llff"]
 def load_llff(root: Path) -> FrameSet:
     """Read `poses_bounds.npy`, one row an image in the order of the names in `images/` or else `images_k/`.
 
+    A damaged file, or one with more or fewer rows than there are images, is a DataError.
+
     Convention:
         A row is a 3x5 matrix and two depths, which are not used. Its columns are the camera's down, right and
         backward axes and its centre in the world, then height, width and focal length in pixels; the principal point
         is the image's centre. The focal length is scaled to the images that are read.
-
-    Raises:
-        DataError: the file is damaged, or its rows are not as many as the images.
     """
     source, folder = root / "poses_bounds.npy", image_folder(root)
     rows = _read_rows(source)
@@ -85,8 +81,6 @@ def _model_points(root: Path, frames: Sequence[Frame], train: Sequence[Frame]) -
         span = (given[:, :3, 3] - given[:, :3, 3].mean(dim=0)).abs().max()
         difference = (given - model).abs().amax(dim=0)
         if bool((difference[:, :3] < 1e-3).all()) and bool((difference[:, 3] <= 1e-3 * span).all()):
-            chosen = {frame.name for frame in train}
-            return track_points(
-                folder, {image[0] for image, frame in zip(images, frames, strict=True) if frame.name in chosen}
-            )
+            ids = {frame.name: image_id for (image_id, _), frame in zip(images, frames, strict=True)}
+            return track_points(folder, {ids[frame.name] for frame in train})
     raise DataError(folder, "points", "model-points are not available: the model's poses are not those of the scene")

@@ -1,26 +1,58 @@
-"""Scenes with one `transforms.json`, as nerfstudio and instant-ngp write them."""
+"""Scenes with one `transforms.json`, as nerfstudio and instant-ngp write them, and the reader of such files.
+
+What a file says of a lens or a pose is used or refused; other keys that are not known are named in a note.
+
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeGuard
 
-from kgs.datasets.frames import Frame, FrameSet
+import kornia.geometry as kg
+import torch
+from torch import Tensor
+
+from kgs.datasets.frames import Frame, FrameSet, path_inside
+from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics, read_size
 from kgs.errors import DataError
+from kgs.json_files import read_json
 
-from .transforms import find_photo, read_transforms
+__all__ = ["load_nerfstudio", "read_transforms"]
 
-__all__ = ["load_nerfstudio"]
+Object = dict[str, Any]
+
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
+_BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")  # in OpenCV's order
+_COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
+_KNOWN = """
+    frames file_path transform_matrix train_filenames val_filenames test_filenames
+    camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
+"""
+# How a tool sorts, frames or normalises a scene, and what it did to the world, which stays the file's.
+_HARMLESS = """
+    aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
+    applied_transform applied_scale orientation_override auto_scale_poses_override
+"""
+_GEOMETRY = re.compile(
+    r"angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
+    r"camera|fisheye|ftheta|latlong|equirect|panoram|spheric|ortho|omni|projection|skew|shear|aspect|rolling|shutter|"
+    r"mask|crop|width|height|resolution|pose|matrix|extrins|intrins|transl|rotat|quat|orient|flip|^from_|axis|axes|"
+    r"handed|convention|c2w|w2c",
+    re.IGNORECASE,
+)
 
 
 def load_nerfstudio(root: Path) -> FrameSet:
-    """Read `transforms.json`, see :func:`read_transforms`; distorted lenses are undone when photos are read.
+    """Read `transforms.json`, see :func:`read_transforms`; damage and lenses that cannot be undone are DataErrors.
 
     `applied_transform` is not undone: the world is the file's. Where the file has `test_filenames` (or else
     `val_filenames`), these are the test views; training views are those of `train_filenames`, or all others.
-
-    Raises:
-        DataError: a file is missing or damaged, or a lens is of a kind that cannot be undone.
     """
     frames, data, notes = read_transforms(root, "transforms.json")
     lists = {key: _listed(root, data, f"{key}_filenames", frames) for key in ("train", "val", "test")}
@@ -30,22 +62,169 @@ def load_nerfstudio(root: Path) -> FrameSet:
         held_out = [frame for frame in frames if frame not in train]
     if not train or (lists["train"] and not held_out):
         raise DataError(root / "transforms.json", "train_filenames", "expected views to train on and others to test on")
-    unused = len(frames) - len(train) - len(held_out)
-    if held_out and unused > 0:
+    if (unused := len(frames) - len(train) - len(held_out)) > 0:
         notes += (f"transforms.json: {unused} frames are neither training nor test views",)
     return FrameSet(train, held_out or None, notes=notes)
 
 
-def _listed(root: Path, data: dict[str, Any], key: str, frames: list[Frame]) -> list[Frame]:
+def _listed(root: Path, data: Object, key: str, frames: list[Frame]) -> list[Frame]:
     """The frames that a list of file names names, sorted by name."""
-    source, names = root / "transforms.json", data.get(key)
-    if names is None:
-        return []
+    source, names = root / "transforms.json", data.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise DataError(source, key, "expected a list of file names")
     by_name = {frame.name: frame for frame in frames}
-    found = sorted({find_photo(source, root, name) for name in names})
-    missing = [name for name in found if name not in by_name]
-    if missing:
+    found = sorted({_find_photo(source, root, name) for name in names})
+    if missing := [name for name in found if name not in by_name]:
         raise DataError(source, key, f"expected names of frames, got {missing[0][:200]!r}")
     return [by_name[name] for name in found]
+
+
+def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[str, ...]]:
+    """Read such a file.
+
+    Convention:
+        `transform_matrix` is camera-to-world with OpenGL axes (x right, y up, z backward). A lens's numbers stand in
+        the frame or, for all frames, at the top; `camera_angle_x` and `_y` are fields of view, used where there is no
+        `fl_x` or `fl_y`. Without them pixels are square, the lens is centred and has the first photo's size.
+
+    Returns:
+        The frames, at least one; the whole object; notes about what is not used.
+
+    Raises:
+        DataError: the file cannot be read, see :func:`kgs.json_files.read_json`, lacks a field, or says something
+            of lenses or poses that cannot be used.
+    """
+    source = root / name
+    data = read_json(source)
+    entries = data.get("frames")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise DataError(source, "frames", "expected a list of objects, not empty")
+    notes = _check_keys(source, [data, *entries])
+    names = [_find_photo(source, root, _text(source, "file_path", entry)) for entry in entries]
+    paths = [path_inside(source, root, name) for name in names]
+    size = next((read_size(path) for path in paths if path.is_file()), (1, 1))
+    frames = [
+        Frame(source, name, path, _lens(source, entry, data, size), _opencv_pose(source, entry))
+        for name, path, entry in zip(names, paths, entries, strict=True)
+    ]
+    return frames, data, notes
+
+
+def _find_photo(source: Path, root: Path, name: str) -> str:
+    """The name of a photo within the scene's folder: as given, or with the ending that the file has."""
+    name = str(PurePosixPath(name.replace("\\", "/")))
+    candidates = [name, *(name + ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper()))]
+    otherwise = name if PurePosixPath(name).suffix else f"{name}.png"
+    return next((candidate for candidate in candidates if path_inside(source, root, candidate).is_file()), otherwise)
+
+
+def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
+    """Refuse what bears on lenses and poses and is not known; a note on other things that are not known."""
+    known, unused = {*_KNOWN.split(), *_HARMLESS.split()}, set()
+    for item in objects:
+        for key in item.keys() - known:
+            if not _says_nothing(item[key]):
+                if _GEOMETRY.search(key):
+                    reason = f"cannot be used: expected none, 0 or false, got {_shown(item[key])}"
+                    raise DataError(source, key[:60], reason)
+                unused.add(key[:60])
+    return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
+
+
+def _says_nothing(value: Any) -> bool:
+    return all(map(_says_nothing, value)) if isinstance(value, list) else not value
+
+
+def _lens(source: Path, frame: Object, data: Object, size: tuple[int, ...]) -> Intrinsics:
+    """A frame's lens; where the file does not tell the image size, it is that of the first photo."""
+
+    def number(key: str, default: float) -> float:
+        return _number(source, key, frame, data, default=default)
+
+    fisheye = _is_fisheye(source, frame, data)
+    width, height = number("w", size[0]), number("h", size[1])
+    if not (width.is_integer() and height.is_integer()):
+        raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
+    fx, fy = (_focal(source, axis, length, frame, data) for axis, length in (("x", width), ("y", height)))
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
+    used = _KANNALA if fisheye else _BROWN
+    of_this_lens = (frame,) if {"camera_model", "is_fisheye"} & frame.keys() else (frame, data)
+    for key in _COEFFICIENTS:
+        if key not in used and (value := _number(source, key, *of_this_lens, default=0.0)) != 0:
+            kind = "a fisheye lens" if fisheye else "a lens that is no fisheye, where tools disagree on its meaning"
+            raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
+    distortion = tuple(number(key, 0.0) for key in used)
+    cx, cy = number("cx", width / 2), number("cy", height / 2)
+    return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
+
+
+def _is_fisheye(source: Path, frame: Object, data: Object) -> bool:
+    """Whether it is one: nerfstudio names the model; instant-ngp says `is_fisheye`."""
+    model = _text(source, "camera_model", frame, data, default="")
+    flag, known = _first("is_fisheye", (frame, data)), (*_PERSPECTIVE, _FISHEYE)
+    if model not in ("", *known):
+        raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {', '.join(known)}")
+    if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
+        raise DataError(source, "is_fisheye", f"expected true or false, got {_shown(flag)}")
+    if flag is not None and model and bool(flag) != (model == _FISHEYE):
+        raise DataError(source, "is_fisheye", f"is {str(bool(flag)).lower()}, but camera_model is {model}")
+    return bool(flag) or model == _FISHEYE
+
+
+def _focal(source: Path, axis: str, length: float, *objects: Object) -> float | None:
+    """The focal length in pixels along an axis, from `fl_` or else the field of view over a length; None without."""
+    for item in objects:
+        if f"fl_{axis}" in item:
+            return _number(source, f"fl_{axis}", item)
+        if (key := f"camera_angle_{axis}") in item:
+            angle = _number(source, key, item)
+            if not 0 < angle / 2 < math.pi / 2:
+                raise DataError(source, key, f"expected an angle between 0 and pi, got {angle:g}")
+            return length / (2 * math.tan(angle / 2))
+    return None
+
+
+def _number(path: Path, key: str, *objects: Object, default: float | None = None) -> float:
+    if not _is_finite(value := _first(key, objects, default)):
+        raise DataError(path, key, f"expected a finite number, got {_shown(value)}")
+    return float(value)
+
+
+def _text(path: Path, key: str, *objects: Object, default: str | None = None) -> str:
+    if not isinstance(value := _first(key, objects, default), str):
+        raise DataError(path, key, f"expected a text, got {_shown(value)}")
+    return value
+
+
+def _first(key: str, objects: Iterable[Object], default: Any = None) -> Any:
+    """What stands under a key in the first of the objects that has it."""
+    return next((item[key] for item in objects if key in item), default)
+
+
+def _shown(value: Any) -> str:
+    return "none" if value is None else repr(value)[:60]
+
+
+def _opencv_pose(path: Path, frame: Object) -> Tensor:
+    """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64.
+
+    The last row may be off 0, 0, 0, 1 by 1e-6, as an inverse has it.
+    """
+    rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
+    rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
+    rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
+    if len(rows) != 4 or not all(_is_finite(x) for row in rows for x in row):
+        raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
+    matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
+    last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if float((matrix[0, 3] - last).abs().max()) > 1e-6:
+        raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {matrix[0, 3].tolist()}")
+    matrix[0, 3] = last
+    return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]
+
+
+def _is_finite(value: Any) -> TypeGuard[float]:
+    """Whether a value is a number that float64 holds; JSON's integers have no limit."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300

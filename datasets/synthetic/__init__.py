@@ -1,8 +1,7 @@
 """A synthetic scene with exact poses and exact depth: textured objects before a textured background.
 
-Meshes are trimesh's; `raycast` finds the first surface of each pixel, and a procedural texture is evaluated at that
-very point, so nothing of kgs takes part in making the images. Four rays a pixel are averaged. Surfaces are matt: a
-point has one colour in all views that see it.
+Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing
+of kgs takes part in making the images. Four rays per pixel are averaged. Surfaces are matt.
 
 The world's axes are OpenCV's: x right, y down, z away from the forward-facing cameras. The floor is at y = 1.2 and
 the objects stand around (0, 0.5, 4.4). The world depends on `kind` and `seed` only, never on the cameras.
@@ -58,26 +57,16 @@ def synthetic_scene(
     Raises:
         ValueError: the kind is unknown, or a number is out of range.
     """
-    if train_views < 1:
-        raise ValueError(f"train_views: expected at least 1, got {train_views}")
-    if test_views < 0:
-        raise ValueError(f"test_views: expected at least 0, got {test_views}")
-    if min(size) < 1:
-        raise ValueError(f"size: expected a positive height and width, got {size}")
+    for name, value, least in (("train_views", train_views, 1), ("test_views", test_views, 0), ("size", min(size), 1)):
+        if value < least:
+            raise ValueError(f"{name}: expected at least {least}, got {value}")
     world = make_world(kind, seed)
     rng = np.random.default_rng([seed, 1])
     place = _patch_eyes if kind == "forward" else _orbit_eyes
     train_eyes, test_eyes = place(train_views, test_views, rng)
-    return Scene(
-        train=_views(world, train_eyes, size, "train"),
-        test=_views(world, test_eyes, size, "test"),
-        points=torch.zeros(0, 3, dtype=torch.float32),
-        point_colors=torch.zeros(0, 3, dtype=torch.float32),
-        init_kind="none",
-        offset=torch.zeros(3, dtype=torch.float64),
-        background=torch.zeros(3, dtype=torch.float32),
-        root=Path("synthetic"),
-    )
+    train, test = (_views(world, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
+    none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
+    return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
 
 
 def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 0) -> Tensor:
@@ -119,11 +108,8 @@ def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> View
         # rounded to float32 first and then drawn: the images show exactly what the cameras say
         extrinsics[i] = torch.from_numpy(_look_at(eye, CENTER))
         images[i] = _render(world, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
-    return Views(
-        cameras=pinholes(intrinsics, extrinsics, size),
-        images=torch.from_numpy(images),
-        names=tuple(f"{split}_{i:02d}" for i in range(count)),
-    )
+    names = tuple(f"{split}_{i:02d}" for i in range(count))
+    return Views(pinholes(intrinsics, extrinsics, size), torch.from_numpy(images), names)
 
 
 def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:

@@ -29,7 +29,7 @@ def raycast(
         Kornia's: world-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
 
     Args:
-        triangles: corners in world units, `(F, 3, 3)`.
+        triangles: corners in world units, `(F, 3, 3)`; another shape is a ValueError.
         intrinsics: pinhole matrix in pixels, `(3, 3)` or `(4, 4)`.
         extrinsics: world-to-camera matrix, `(4, 4)`.
         size: (height, width) in pixels.
@@ -37,9 +37,6 @@ def raycast(
     Returns:
         depths: z in the camera frame, float64 `(H, W)`; 0 where no triangle is hit.
         faces: the triangle that is hit, int64 `(H, W)`; -1 where there is none.
-
-    Raises:
-        ValueError: `triangles` has another shape.
     """
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
         raise ValueError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")

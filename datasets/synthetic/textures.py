@@ -1,8 +1,7 @@
 """Procedural solid textures, limited in band so that a camera can resolve them.
 
-A texture is a function of the point alone. Detail comes from random fields, sums of cosine waves with random
-directions and phases (the spectral form of a stationary Gaussian field), whose wavelengths are chosen: the finest is
-about 4 pixels of the default synthetic scene.
+A texture is a function of the point alone. Detail comes from sums of cosine waves with random directions and phases
+(the spectral form of a stationary Gaussian field); the finest is about 4 pixels of the default synthetic scene.
 """
 
 from __future__ import annotations
@@ -25,18 +24,15 @@ BRICK_TABLE = 64  # the shades of bricks repeat after so many
 
 
 def random_texture(kind: str, rng: np.random.Generator) -> Texture:
-    """Draw a texture of one kind.
+    """Draw a texture of one kind, with all its randomness from `rng`; an unknown kind is a ValueError.
 
     Args:
         kind: "stone", "marble", "rings", "spots", "leaf", "tiles" (cubes with a side of 0.2), "wall" (bricks in the
             x-y plane) or "floor" (slabs in the x-z plane).
-        rng: all randomness comes from here.
+        rng: the stream.
 
     Returns:
         A function from points `(n, 3)` float32 in the object's own frame, in world units, to colours `(n, 3)` float32.
-
-    Raises:
-        ValueError: the kind is unknown.
     """
     coarse, fine = _field(rng, 0.32, 1.2), _field(rng, 0.1, 0.32)
     ramp, other = _ramp(rng), _ramp(rng)

@@ -39,17 +39,12 @@ _Part = tuple[trimesh.Trimesh, Array, Texture]
 
 
 def make_world(kind: str, seed: int) -> World:
-    """Build the world.
+    """Build the world: "forward" in a room that fills the view, "orbit" on a square of floor with nothing around it.
+
+    An unknown kind or a negative seed is a ValueError.
 
     Convention:
         OpenCV's axes: x right, y down, z away from the forward-facing cameras, which stand around the origin.
-
-    Args:
-        kind: "forward": in a room that fills the view; "orbit": on a square of floor, with nothing around it.
-        seed: at least 0.
-
-    Raises:
-        ValueError: the kind is unknown, or the seed is negative.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
@@ -73,13 +68,7 @@ def make_world(kind: str, seed: int) -> World:
 def shade(world: World, points: Array, faces: NDArray[np.int64]) -> Array:
     """Colour surface points: the texture, lit by the sky and by one distant light (Lambert).
 
-    Args:
-        world: what they are part of.
-        points: in world units, `(n, 3)`.
-        faces: the triangle on which each point lies, `(n,)`.
-
-    Returns:
-        RGB in [0, 1], `(n, 3)`.
+    From points `(n, 3)` in world units and the triangle on which each lies, `(n,)`, to RGB in [0, 1], `(n, 3)`.
     """
     owners = world.owners[faces]
     normals = world.normals[faces]
