@@ -22,6 +22,7 @@ __all__ = ["DensifyReport", "Densifier", "camera_extent"]
 
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
+_NOT_BY_ROWS = (torch.optim.LBFGS, torch.optim.Adafactor, torch.optim.Rprop)
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,9 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: any optimiser that holds each of the model's parameters; other parameters are left alone.
+        optimizer: holds each of the model's parameters, and other ones that are left alone. Any whose state for a
+            parameter is made of tensors of its shape that begin at 0, and scalars: Adam and its kin, SGD, RMSprop,
+            Adagrad; not LBFGS, Adafactor and Rprop.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
@@ -65,7 +68,8 @@ class Densifier:
         generator: the stream for the children's places; None makes one of its own, seeded with 0.
 
     Raises:
-        ValueError: a number is out of range, or the optimizer does not hold the model's parameters.
+        ValueError: a number is out of range, or the optimizer does not hold the model's parameters or keeps another
+            state; the latter from `step` and `reset_opacity` too, which change nothing then.
 
     Example:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
@@ -93,12 +97,10 @@ class Densifier:
             raise ValueError(f"grad_threshold: expected a number >= 0, got {grad_threshold}")
         if not 0.0 <= prune_opacity <= 1.0:
             raise ValueError(f"prune_opacity: expected a number in [0, 1], got {prune_opacity}")
-        if max_gaussians is not None and max_gaussians < 1:
+        if max_gaussians is not None and (max_gaussians % 1 != 0 or max_gaussians < 1):
             raise ValueError(f"max_gaussians: expected an integer >= 1 or None, got {max_gaussians}")
-        held = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
-        for name, parameter in model.named_parameters():
-            if id(parameter) not in held:
-                raise ValueError(f"optimizer: expected it to hold all of the model's parameters, got none for {name}")
+        if isinstance(optimizer, _NOT_BY_ROWS):
+            raise ValueError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
         self.model = model
         self.optimizer = optimizer
         self.extent = float(extent)
@@ -108,6 +110,7 @@ class Densifier:
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
         self._reset_statistics(torch.zeros_like(model.means[:, 0]))
+        self._check()
 
     @property
     def mean_gradients(self) -> Tensor:
@@ -127,6 +130,7 @@ class Densifier:
         Raises:
             ValueError: `projected.means2d` has no gradient, or the number of Gaussians is another.
         """
+        self._check()
         if projected.num_gaussians != len(self.model):
             raise ValueError(
                 f"projected: expected a render of the model's {len(self.model)} Gaussians, "
@@ -152,6 +156,7 @@ class Densifier:
         New Gaussians have zero Adam moments, the others keep theirs bit for bit. The parameters become new objects in
         the model and the optimizer alike, without `.grad`: call it between `optimizer.step` and the next render.
         """
+        self._check()
         model = self.model
         before = len(model)
         average = self._gradient_sums / self._counts.clamp(min=1)
@@ -182,6 +187,7 @@ class Densifier:
         """
         if not 0.0 < ceiling < 1.0:
             raise ValueError(f"ceiling: expected a number in (0, 1), got {ceiling}")
+        self._check()
         lowered = self.model.opacity_logits.clamp(max=math.log(ceiling / (1.0 - ceiling)))
         self._replace("opacity_logits", lowered, kept=torch.empty(0, dtype=torch.int64, device=lowered.device))
 
@@ -206,10 +212,27 @@ class Densifier:
         for name in ("gradient_sums", "counts", "last_gradients"):
             if state[name].shape != (len(self.model),):
                 raise ValueError(f"{name}: expected shape ({len(self.model)},), got {tuple(state[name].shape)}")
+        self._reset_statistics(state["last_gradients"].to(self.model.means, copy=True))
         self._gradient_sums.copy_(state["gradient_sums"])
         self._counts.copy_(state["counts"])
-        self._last_gradients.copy_(state["last_gradients"])
         self.generator.set_state(state["generator"].cpu())
+
+    def _check(self) -> None:
+        """Raise where the model, its statistics and the optimizer's state do not belong together."""
+        if len(self._counts) != len(self.model):
+            raise ValueError(
+                f"model: expected {len(self._counts)} Gaussians, got {len(self.model)}; load the state too"
+            )
+        held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
+        for name, parameter in self.model.named_parameters():
+            if id(parameter) not in held:
+                raise ValueError(f"optimizer: expected it to hold all of the model's parameters, got none for {name}")
+            for key, entry in self.optimizer.state.get(parameter, {}).items():
+                if isinstance(entry, Tensor) and entry.numel() != 1 and entry.shape != parameter.shape:
+                    raise ValueError(
+                        f"optimizer: expected the state {key} of {name} to have shape {tuple(parameter.shape)}, "
+                        f"got {tuple(entry.shape)}"
+                    )
 
     def _choose(self, hot: Tensor, average: Tensor, remaining: int) -> tuple[Tensor, int]:
         """Leave of `hot` no more than may be added (each one adds 1), the largest first; and how many were left out."""
