@@ -1,15 +1,15 @@
 """The option `--tables=FOLDER`: a run of the tests ends with tables of what they found, printed and written there.
 
-    pytest tests/fuzz tests/faults -m "" --tables=docs/results
+    pytest tests/fuzz tests/faults tests/stiff -m "" --tables=docs/results
 
-A test leaves a row with `record_property(table, row)`, with or without pytest-xdist. Of rows with the same first column
-the one with the most trials is shown, so that the slow tests replace what the fast ones found.
+A test leaves a row with `record_property(table, row)`, with or without pytest-xdist. Of rows with the same name the one
+with the most trials is shown, so that the slow tests replace what the fast ones found.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--tables",
         type=Path,
         metavar="FOLDER",
-        help="print the tables of damaged files and of faults, and write them as Markdown, CSV and JSON into FOLDER",
+        help="print the tables of tests/fuzz, faults and stiff, and write them as Markdown, CSV and JSON into FOLDER",
     )
 
 
@@ -43,34 +43,35 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         return
     reports = [report for group in terminalreporter.stats.values() for report in group]
     found = [p for r in reports if isinstance(r, pytest.TestReport) and r.when == "call" for p in r.user_properties]
-    for name, make in _TABLES.items():
-        rows = _of_most_trials(row for table, row in found if table == name)
-        if rows:
-            (folder / name).mkdir(parents=True, exist_ok=True)
-            path = folder / name / name
-            path.with_suffix(".md").write_text(text := make(rows), encoding="utf-8")
+    for name, (place, make) in _TABLES.items():
+        if rows := [row for table, row in found if table == name]:
+            path = folder / place / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            text = make(rows := _of_most_trials(rows), path)
+            path.with_suffix(".md").write_text(text, encoding="utf-8")
             content = json.dumps({"rows": rows, "versions": versions()}, indent=1)
             path.with_suffix(".json").write_text(content + "\n", encoding="utf-8")
             write_csv(path.with_suffix(".csv"), rows)
             terminalreporter.write_line(text)
 
 
-def _of_most_trials(rows: Iterable[Row]) -> list[Row]:
+def _of_most_trials(rows: list[Row]) -> list[Row]:
+    """One row per name, sorted by it; rows without trials are left as they came."""
+    if "trials" not in rows[0]:
+        return rows
     kept: dict[str, Row] = {}
-    for row in rows:
-        name, trials, *_ = row.values()
-        if name not in kept or trials > list(kept[name].values())[1]:
-            kept[name] = row
-    return [kept[name] for name in sorted(kept, key=str.casefold)]
+    for row in sorted(rows, key=lambda row: (row["name"].casefold(), row["trials"])):
+        kept[row["name"]] = row
+    return list(kept.values())
 
 
-def _hostile(rows: list[Row]) -> str:
+def _hostile(rows: list[Row], _: Path) -> str:
     def mib(value: int | None) -> str:
         return "not measured" if value is None else f"{value / 2**20:.1f}"
 
-    counts = ("tried", "sound", "DataError", "other")
+    counts = ("trials", "sound", "DataError", "other")
     lines = [
-        [r["reader"], *(r[key] for key in counts), r["slowest_s"], mib(r["memory"]), mib(r["allowed"])] for r in rows
+        [r["name"], *(r[key] for key in counts), r["slowest_s"], mib(r["memory"]), mib(r["allowed"])] for r in rows
     ]
     memory = max((row["memory"] for row in rows if row["memory"] is not None), default=None)
     total = [sum(row[key] for row in rows) for key in counts]
@@ -82,9 +83,43 @@ def _hostile(rows: list[Row]) -> str:
     return markdown_table(title, heads, lines, first="reader")
 
 
-def _faults(rows: list[Row]) -> str:
+def _faults(rows: list[Row], _: Path) -> str:
     heads = ("trials", "lost", "what was found", "verdict")
     return markdown_table("Faults of long fits", heads, [list(row.values()) for row in rows], first="fault")
 
 
-_TABLES: dict[str, Callable[[list[Row]], str]] = {"hostile": _hostile, "faults": _faults}
+def _bits(rows: list[Row], _: Path) -> str:
+    heads = ("what is stiff", "float32", "float64", "treatment")
+    lines = [[f"{x:.0e}" if isinstance(x, float) else x for x in row.values()] for row in rows]
+    return markdown_table("Largest difference of images and gradients, which must be 0", heads, lines, first="case")
+
+
+def _projection(rows: list[Row], path: Path) -> str:
+    """Also plots."""
+    from matplotlib.figure import Figure
+
+    figure, angles = Figure(figsize=(9, 3.8), layout="constrained"), {row["angle"]: [] for row in rows}
+    for row in rows:
+        angles[row["angle"]].append(row)
+    names = {"covariance_error": "relative error of the covariance", "mean_error_sigmas": "error of the mean [sigma]"}
+    for axis, (column, label) in zip(figure.subplots(1, 2), names.items(), strict=True):
+        for angle in list(angles)[column == "mean_error_sigmas" :]:  # on the axis the mean is exact
+            x, y = zip(*((row["sigma_over_z"], row[column]) for row in angles[angle]), strict=True)
+            axis.loglog(x, y, "o-", label=f"{angle}°")
+        axis.set(xlabel="sigma / z", ylabel=label)
+        axis.legend(title="off axis")
+    figure.savefig(path.with_suffix(".png"), dpi=120)
+    sigmas = [row["sigma_over_z"] for row in next(iter(angles.values()))]
+    lines = [[f"{angle}°", *(f"{row['covariance_error']:.1e}" for row in of)] for angle, of in angles.items()]
+    changes = [max(row["quadrature_change"] for row in rows if row["sigma_over_z"] == sigma) for sigma in sigmas]
+    lines.append(["change with 4 for 5 quadrature nodes", *(f"{value:.0e}" for value in changes)])
+    title = "First-order footprint: relative error of the covariance by angle and sigma / z"
+    return markdown_table(title, sigmas, lines)
+
+
+_TABLES: dict[str, tuple[str, Callable[[list[Row], Path], str]]] = {  # by folder
+    "hostile": ("hostile", _hostile),
+    "faults": ("faults", _faults),
+    "bits": ("extremes", _bits),
+    "projection": ("precision", _projection),
+}

@@ -46,13 +46,13 @@ def bench(
         ValueError: `quick` together with another preset.
     """
     if what == "speed":
-        from .speed import measure_speed
+        from .speed import speed
 
-        measure_speed(out, quick=quick, device=device)
+        speed(out=out, quick=quick, device=device)
     elif what == "precision":
-        from .precision import measure_precision
+        from .precision import precision
 
-        measure_precision(out, quick=quick)
+        precision(out=out, quick=quick)
     elif what == "training":
         from .training import measure_training
 
@@ -64,11 +64,11 @@ def bench(
             raise ValueError(f"preset: expected none but quick together with --quick, got {preset!r}")
         measure_sparse(out, preset or "quick", processes=processes, scheduler=scheduler, lpips_weights=lpips_weights)
     elif what == "starts":
-        from .starts import measure_starts
+        from .starts import starts
 
-        measure_starts(out, quick=quick)
+        starts(out=out, quick=quick)
     else:
-        from .extremes import measure_extremes
+        from .extremes import extremes
 
-        return int(measure_extremes(out, quick=quick)["missed"] > 0)
+        return extremes(out=out, quick=quick)
     return 0

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import html
+import math
 import re
+import statistics
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["html_table", "latex_escape", "latex_table", "markdown_table", "write_csv"]
+__all__ = ["html_table", "latex_escape", "latex_table", "markdown_table", "mean_sd", "write_csv"]
 
 _LATEX = str.maketrans(
     {
@@ -74,6 +76,15 @@ def html_table(title: str, columns: Iterable[object], rows: Iterable[Iterable[ob
     begin = f'<figure><figcaption>{html.escape(title)}</figcaption>\n<div class="scroll"><table>'
     end = "</tbody>\n</table></div></figure>"
     return "\n".join([begin, f"<thead><tr>{head}</tr></thead>", "<tbody>", *body, end, ""])
+
+
+def mean_sd(values: Iterable[float], decimals: int) -> str:
+    """As "24.31 (0.12)", mean and sample standard deviation; "24.31" of one number, "-" of none. NaN does not count."""
+    numbers = [value for value in values if not math.isnan(value)]
+    if not numbers:
+        return "-"
+    spread = f" ({statistics.stdev(numbers):.{decimals}f})" if len(numbers) > 1 else ""
+    return f"{statistics.fmean(numbers):.{decimals}f}{spread}"
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -1,8 +1,7 @@
 """Error against run time: what each knob of the renderer costs in accuracy, in the image and in its gradients.
 
 Errors are against `kgs.reference`: dense, in float64, both thresholds 0. Scenes are drawn in float64 and rounded once
-for float32, so that rounding is part of the float32 error. The first-order footprint itself is measured against the
-moments of the perspective projection (M. Zwicker et al., "EWA Volume Splatting", 2001).
+for float32, so that rounding is part of the float32 error.
 """
 
 from __future__ import annotations
@@ -12,29 +11,26 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 import kgs.reference
-from kgs.fit.outputs import versions, write_json
+from kgs.options import alias
 from kgs.projection import project
 from kgs.raster import composite
 from kgs.types import Gaussians
 
-from .output import markdown_table, write_csv
-from .scenes import layered_scene
+from .output import markdown_table
+from .results import write_results
+from .scenes import DTYPES, PARAMETERS, Scene, cast, centred_camera, gradients, layered_scene, relative_errors
 from .timing import take_turns
 
-__all__ = ["DEFAULT", "EXACT", "KNOBS", "SCENES", "Setting", "measure_precision"]
+__all__ = ["DEFAULT", "EXACT", "KNOBS", "SCENES", "Setting", "precision"]
 
-FLOAT32_FLOOR, HALF_GREY_LEVEL = 1.4e-6, 2e-3
-PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
-SIGMAS, ANGLES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.3), (0, 20, 40, 55)
-NODES = 5  # the outermost lies 2.9 sigma out: in front of the camera for all of SIGMAS
+LEVELS = {"half a grey level, 2e-3": (2e-3, "--"), "float32 floor, 1.4e-6": (1.4e-6, ":")}
 NEAR_PLANE = 0.01
 
 
@@ -68,77 +64,64 @@ _COLUMNS = {"default": DEFAULT, "alpha 1/1024": replace(DEFAULT, alpha_threshold
 _COLUMNS |= {"exact, float32": EXACT, "exact, float64": EXACT64}
 
 
-def measure_precision(out: Path, *, quick: bool = False, say: Callable[[str], None] = print) -> dict[str, Any]:
-    """Measure, and write precision.csv, .json and .md, projection.csv, render.png, gradients.png and projection.png.
+def precision(*, out: Annotated[Path, alias("-o")], quick: bool = False) -> int:
+    """Errors of images, gradients and footprints against the time they take, for each knob of the renderer.
+
+    Writes precision.csv, .json and .md, render.png and gradients.png. Examples:
+
+    kgs bench precision -o precision           five minutes
+
+    kgs bench precision -o precision --quick   half a minute
 
     Args:
         out: folder for the results, made if it is not there.
-        quick: small images with few Gaussians: half a minute instead of five.
-        say: where lines for the user go.
+        quick: small images with few Gaussians.
 
     Returns:
-        What precision.json holds.
+        The exit code, 0.
     """
     out.mkdir(parents=True, exist_ok=True)
     rows, flatness = [], {}
     for name, make in SCENES.items():
-        say(f"{name} ...")
+        print(f"{name} ...")
         scene = make(*((300, 48) if quick else (3000, 96)))
         rows += [{"scene": name, **row} for row in scene.measure(repeats=1 if quick else 3)]
         flatness[name] = scene.flatness()
-    projection = _projection_errors()
-    result: dict[str, Any] = {"rows": rows, "flatness": flatness, "projection": projection}
-    result |= {"threads": torch.get_num_threads(), "versions": versions()}
-    for name, lines in (("precision", rows), ("projection", projection)):
-        write_csv(out / f"{name}.csv", lines)
-    write_json(out / "precision.json", result)
-    (out / "precision.md").write_text(table := _markdown(rows, flatness, projection))
     _plot_scenes(out / "render.png", rows, "max_error", "forward_s", "largest error of the image")
     _plot_scenes(out / "gradients.png", rows, "gradient", "backward_s", "largest relative error of a gradient")
-    _plot_projection(out / "projection.png", projection)
-    say(table)
-    return result
+    write_results(out / "precision", rows, _markdown(rows, flatness), flatness=flatness)
+    return 0
 
 
-class _Scene:
+class _Measured:
     """Gaussians in float64 before one camera, black background."""
 
-    def __init__(self, gaussians: Gaussians, c: PinholeCamera, near_plane: float = NEAR_PLANE) -> None:
-        self.near_plane, self.inputs = near_plane, {}
-        for dtype in (torch.float32, torch.float64):
-            leaves = Gaussians(*(getattr(gaussians, p).detach().to(dtype).requires_grad_() for p in PARAMETERS))
-            camera = PinholeCamera(c.intrinsics.to(dtype), c.extrinsics.to(dtype), c.height, c.width)
-            self.inputs[str(dtype).removeprefix("torch.")] = leaves, camera
-        shape, generator = (1, 3, int(c.height), int(c.width)), torch.Generator().manual_seed(0)
-        self.weights = torch.randn(shape, generator=generator, dtype=torch.float64)
+    def __init__(self, scene: Scene, near_plane: float = NEAR_PLANE) -> None:
+        self.near_plane, self.inputs = near_plane, {name: cast(scene, dtype) for name, dtype in DTYPES.items()}
 
     def image(self, s: Setting, grad: bool = False) -> Tensor:
-        gaussians, camera = self.inputs[s.dtype]
         options = {name: value for name, value in asdict(s).items() if name != "dtype"}
         with torch.set_grad_enabled(grad):
-            projected = project(gaussians, camera, near_plane=self.near_plane, alpha_threshold=s.alpha_threshold)
+            projected = project(*self.inputs[s.dtype], near_plane=self.near_plane, alpha_threshold=s.alpha_threshold)
             return composite(projected, projected.colors, **options).features
 
-    def backward(self, s: Setting, image: Tensor | None = None) -> dict[str, Tensor]:
-        """Gradients of a sum of the pixels with random weights, the same for all images."""
-        image = self.image(s, grad=True) if image is None else image
-        loss = (image * self.weights.to(image.dtype)).sum()
-        leaves = [getattr(self.inputs[s.dtype][0], p) for p in PARAMETERS]
-        return dict(zip(PARAMETERS, torch.autograd.grad(loss, leaves), strict=True))
+    def backward(self, s: Setting) -> dict[str, Tensor]:
+        return gradients(self.image(s, grad=True), self.inputs[s.dtype][0])
 
     def measure(self, repeats: int) -> list[dict[str, Any]]:
-        """One row a setting: the setting, errors, median seconds and their range."""
+        """One row per setting: the setting, errors, median seconds and their range."""
         exact = kgs.reference.render(*self.inputs["float64"], None, 0.0, 0.0, self.near_plane)
-        gradients = self.backward(EXACT64, exact)
+        expected = gradients(exact, self.inputs["float64"][0])
         settings = list(dict.fromkeys(s for knob in KNOBS.values() for s in knob))
         forward = take_turns({str(s): partial(self.image, s) for s in settings}, repeats + 2)
         backward = take_turns({str(s): partial(self.backward, s) for s in settings}, repeats)
         rows = []
         for s in settings:
             error = (self.image(s) - exact.detach()).abs()
-            parts = {p: (g - gradients[p]).abs().max() / gradients[p].abs().max() for p, g in self.backward(s).items()}
+            parts = relative_errors(self.backward(s), expected)
             row = {**asdict(s), "max_error": float(error.max()), "rmse": float(error.square().mean().sqrt())}
-            row |= {"gradient": float(max(parts.values())), **{f"gradient_{p}": float(g) for p, g in parts.items()}}
+            row |= {"gradient": float(parts.max())}
+            row |= {f"gradient_{name}": float(part) for name, part in zip(PARAMETERS, parts, strict=True)}
             for name, times in (("forward", forward[str(s)]), ("backward", backward[str(s)])):
                 row |= {f"{name}_s": times.wall, f"{name}_best_s": times.best, f"{name}_worst_s": times.worst}
             rows.append(row)
@@ -154,21 +137,21 @@ class _Scene:
         return found
 
 
-def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> _Scene:
+def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> _Measured:
     """As training leaves it; in other units, or turned and moved `far` from the origin together with the camera."""
     model, camera = layered_scene(count, (size, size))
     with torch.no_grad():
         g = model.double()()
-    pose = torch.eye(4, dtype=torch.float64)
+    camera, pose = centred_camera((size, size), float(camera.fx)), torch.eye(4, dtype=torch.float64)
     if far:
         pose[:3, :3] = torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]], dtype=torch.float64)
         pose[:3, 3] = -pose[:3, :3] @ (far * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64))
+    camera.extrinsics.copy_(pose)
     means = (unit * g.means - pose[:3, 3]) @ pose[:3, :3]
-    camera = PinholeCamera(camera.intrinsics.double(), pose[None], camera.height, camera.width)
-    return _Scene(Gaussians(means, g.quats, unit * g.scales, g.opacities, g.colors), camera, NEAR_PLANE * unit)
+    return _Measured((replace(g, means=means, scales=unit * g.scales), camera), NEAR_PLANE * unit)
 
 
-def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, float]) -> _Scene:
+def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, float]) -> _Measured:
     """A cloud that fills the picture; `spread`: longest standard deviation in pixels, `ratios`: to the others."""
     bounds = {"depths": (2.0, 6.0), "spread": (1.0, 5.0), "ratios": (1.0, 4.0), "opacities": (0.05, 0.95), **changes}
     n, rng, half = count // 2, np.random.default_rng([7, count]), math.tan(math.radians(angle) / 2)
@@ -179,17 +162,10 @@ def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, 
     means = np.concatenate([rng.uniform(-1.1, 1.1, (n, 2)) * half * z, z], 1)
     opacities = rng.uniform(*bounds["opacities"], n)
     parts = (means, rng.normal(size=(n, 4)), scales, opacities, rng.uniform(0, 1, (n, 3)))
-    return _Scene(Gaussians(*(torch.from_numpy(part) for part in parts)), _camera(size, size / 2 / half))
+    return _Measured((Gaussians(*map(torch.from_numpy, parts)), centred_camera((size, size), size / 2 / half)))
 
 
-def _camera(size: int, focal: float) -> PinholeCamera:
-    """Square and centred, at the origin, float64."""
-    matrix = torch.diag(torch.tensor([focal, focal, 1.0, 1.0], dtype=torch.float64))
-    matrix[:2, 2] = (size - 1) / 2
-    return PinholeCamera(matrix[None], torch.eye(4).double()[None], torch.tensor([size]), torch.tensor([size]))
-
-
-SCENES: dict[str, Callable[[int, int], _Scene]] = {
+SCENES: dict[str, Callable[[int, int], _Measured]] = {
     "ordinary": _ordinary,
     "3-view": partial(_random, spread=(4.0, 30.0), ratios=(2.0, 50.0), opacities=(0.1, 0.7)),
     "needles": partial(_random, spread=(5.0, 40.0), ratios=(1e3, 1e6)),
@@ -201,60 +177,20 @@ SCENES: dict[str, Callable[[int, int], _Scene]] = {
 }
 
 
-def _projection_errors() -> list[dict[str, float]]:
-    """First-order moments against exact ones, one row an angle off axis and sigma / z."""
-    cases = [(angle, sigma) for angle in ANGLES for sigma in SIGMAS]
-    n, size, focal = len(cases), 2048, 512.0
-    centres = torch.tensor([[math.tan(math.radians(angle)), 0, 1] for angle, _ in cases], dtype=torch.float64)
-    scales = torch.tensor([[sigma] * 3 for _, sigma in cases], dtype=torch.float64)
-    quats, ones = torch.eye(4).double()[:1].expand(n, 4), torch.ones(n, 3).double()
-    drawn = project(Gaussians(centres, quats, scales, ones[:, 0], ones), _camera(size, focal), eps2d=0.0)
-    rows = []
-    for k, (angle, sigma) in enumerate(cases):
-        first_order = drawn.factors[k] @ drawn.factors[k].mT / focal**2
-        mean, exact = _moments(centres[k], sigma, NODES)
-        shift = mean - (drawn.means2d[k] - (size - 1) / 2) / focal
-        error = float((exact - first_order).norm() / exact.norm())
-        _, coarse = _moments(centres[k], sigma, NODES - 1)
-        row = {"angle": angle, "sigma_over_z": sigma, "covariance_error": error}
-        row["mean_error_sigmas"] = float((shift @ torch.linalg.inv(first_order) @ shift).sqrt())
-        rows.append({**row, "quadrature_change": abs(float((coarse - first_order).norm() / coarse.norm()) / error - 1)})
-    return rows
-
-
-def _moments(centre: Tensor, sigma: float, nodes: int) -> tuple[Tensor, Tensor]:
-    """Mean `(2,)` and covariance `(2, 2)` of (x / z, y / z), (x, y, z) normal, by Gauss-Hermite quadrature."""
-    knots, weights = (torch.from_numpy(a) for a in np.polynomial.hermite_e.hermegauss(nodes))
-    points = centre + sigma * torch.cartesian_prod(knots, knots, knots)
-    share = torch.cartesian_prod(weights, weights, weights).prod(1) / weights.sum() ** 3
-    plane = points[:, :2] / points[:, 2:]
-    mean = share @ plane
-    return mean, (share[:, None] * (plane - mean)).mT @ (plane - mean)
-
-
 def _find(rows: list[dict[str, Any]], scene: str, setting: Setting) -> dict[str, Any]:
     return next(row for row in rows if row["scene"] == scene and row.items() >= asdict(setting).items())
 
 
-def _markdown(rows: list[dict[str, Any]], flatness: dict[str, Any], projection: list[dict[str, float]]) -> str:
-    errors, angles = [], []
+def _markdown(rows: list[dict[str, Any]], flatness: dict[str, Any]) -> str:
+    errors = []
     for scene in flatness:
-        found = [_find(rows, scene, setting) for setting in _COLUMNS.values()]
+        found = (_find(rows, scene, setting) for setting in _COLUMNS.values())
         errors.append([scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)])
     flat = [[scene, *(f"{value:.1e}" for value in values.values())] for scene, values in flatness.items()]
-    for angle in ANGLES:
-        found = [row for row in projection if row["angle"] == angle]
-        angles.append([f"{angle}°", *(f"{row['covariance_error']:.1e}" for row in found)])
-    changes = [max(row["quadrature_change"] for row in projection if row["sigma_over_z"] == sigma) for sigma in SIGMAS]
-    angles.append([f"change with {NODES - 1} for {NODES} quadrature nodes", *(f"{value:.0e}" for value in changes)])
-    return (
-        markdown_table(
-            "Largest error of the image / of a gradient, the latter over its largest value", _COLUMNS, errors
-        )
-        + markdown_table("Largest difference between float32 images", next(iter(flatness.values())), flat)
-        + markdown_table(
-            "First-order footprint: relative error of the covariance by angle and sigma / z", SIGMAS, angles
-        )
+    title = "Largest error of the image / of a gradient, the latter over its largest value"
+    first = next(iter(flatness.values()))
+    return markdown_table(title, _COLUMNS, errors) + markdown_table(
+        "Largest difference between float32 images", first, flat
     )
 
 
@@ -272,8 +208,8 @@ def _plot_scenes(path: Path, rows: list[dict[str, Any]], error: str, seconds: st
             axis.loglog(*zip(*points, strict=True), f"{marker}-", markersize=4, linewidth=1, alpha=0.8, label=knob)
         row = _find(rows, scene, DEFAULT)
         axis.loglog(1e3 * row[seconds], row[error], "k*", markersize=13, label="the default", zorder=5)
-        axis.axhline(HALF_GREY_LEVEL, color="grey", linestyle="--", label="half a grey level, 2e-3")
-        axis.axhline(FLOAT32_FLOOR, color="grey", linestyle=":", label="float32 floor, 1.4e-6")
+        for name, (level, style) in LEVELS.items():
+            axis.axhline(level, color="grey", linestyle=style, label=name)
         axis.set(title=scene, xlabel="wall time [ms]", ylim=(6e-9, 2))
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.xaxis.set(major_formatter=ScalarFormatter(), minor_formatter="")
@@ -281,16 +217,3 @@ def _plot_scenes(path: Path, rows: list[dict[str, Any]], error: str, seconds: st
     figure.supylabel(f"{label}, at least 1e-8")
     figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     figure.savefig(path, dpi=100)
-
-
-def _plot_projection(path: Path, rows: list[dict[str, float]]) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.8), layout="constrained")
-    names = {"covariance_error": "relative error of the covariance", "mean_error_sigmas": "error of the mean [sigma]"}
-    for axis, (column, label) in zip(figure.subplots(1, 2), names.items(), strict=True):
-        for angle in ANGLES[column == "mean_error_sigmas" :]:  # on the axis the mean is exact
-            axis.loglog(SIGMAS, [row[column] for row in rows if row["angle"] == angle], "o-", label=f"{angle}°")
-        axis.set(xlabel="sigma / z", ylabel=label)
-        axis.legend(title="off axis")
-    figure.savefig(path, dpi=120)

@@ -9,14 +9,20 @@ from pathlib import Path
 import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
 
 from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
+from kgs.types import Gaussians
 
-__all__ = ["SYNTHETIC", "check_scenes", "layered_scene"]
+__all__ = ["DTYPES", "PARAMETERS", "SYNTHETIC", "Scene", "cast", "centred_camera", "check_scenes", "gradients"]
+__all__ += ["layered_scene", "relative_errors"]
 
 SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+Scene = tuple[Gaussians, PinholeCamera]
 
 _DEPTHS = np.array([2.2, 3.0, 4.0, 5.5, 7.5, 9.5])
 _SHARES = np.array([0.10, 0.18, 0.22, 0.20, 0.16, 0.14])
@@ -45,22 +51,48 @@ def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0)
     z = np.maximum(z + 0.15 * np.sin(3 * x) * np.cos(2 * y), 1.0)
     spread = np.exp(rng.normal(math.log(2.0), 0.6, count)) * z / focal
     colors = 0.5 + 0.35 * np.sin(np.stack([2 * x + z, 1.5 * y - z, x + y], -1)) + rng.normal(0, 0.1, (count, 3))
+    values = {
+        "means": np.stack([x, y, z], -1),
+        "quats": rng.normal(size=(count, 4)),
+        "log_scales": np.log(spread)[:, None] + rng.normal(0, 0.5, (count, 3)),
+        "opacity_logits": rng.normal(0, 1.5, count),
+        "sh_dc": ((np.clip(colors, 0.02, 0.98) - 0.5) / SH_C0)[:, None],
+        "sh_rest": rng.normal(0, 0.06, (count, 15, 3)),
+    }
+    model = GaussianModel(**{name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()})
+    return model, cast_camera(centred_camera(size, focal), torch.float32)
 
-    def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.asarray(values, dtype=np.float32))
 
-    model = GaussianModel(
-        means=tensor(np.stack([x, y, z], -1)),
-        quats=tensor(rng.normal(size=(count, 4))),
-        log_scales=tensor(np.log(spread)[:, None] + rng.normal(0, 0.5, (count, 3))),
-        opacity_logits=tensor(rng.normal(0, 1.5, count)),
-        sh_dc=tensor((np.clip(colors, 0.02, 0.98) - 0.5) / SH_C0)[:, None],
-        sh_rest=tensor(rng.normal(0, 0.06, (count, 15, 3))),
-    )
-    intrinsics = torch.eye(4)[None]
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = focal
-    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
-    return model, PinholeCamera(intrinsics, torch.eye(4)[None], torch.tensor([height]), torch.tensor([width]))
+def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:
+    """At the origin, float64; `size` is height and width."""
+    height, width = size
+    matrix = torch.diag(torch.tensor([focal, focal, 1.0, 1.0], dtype=torch.float64))
+    matrix[:2, 2] = torch.tensor([(width - 1) / 2, (height - 1) / 2])
+    return PinholeCamera(matrix[None], torch.eye(4).double()[None], torch.tensor([height]), torch.tensor([width]))
+
+
+def cast_camera(camera: PinholeCamera, dtype: torch.dtype) -> PinholeCamera:
+    """The camera, rounded to a dtype."""
+    return PinholeCamera(camera.intrinsics.to(dtype), camera.extrinsics.to(dtype), camera.height, camera.width)
+
+
+def cast(scene: Scene, dtype: torch.dtype) -> Scene:
+    """The scene rounded to a dtype; its Gaussians are leaves that want gradients."""
+    leaves = (getattr(scene[0], name).detach().to(dtype).requires_grad_() for name in PARAMETERS)
+    return Gaussians(*leaves), cast_camera(scene[1], dtype)
+
+
+def gradients(image: Tensor, gaussians: Gaussians) -> dict[str, Tensor]:
+    """Those of a sum of the pixels with random weights, which are the same for all images of one size."""
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    leaves = [getattr(gaussians, name) for name in PARAMETERS]
+    found = torch.autograd.grad((image * weights.to(image.dtype)).sum(), leaves)
+    return dict(zip(PARAMETERS, found, strict=True))
+
+
+def relative_errors(got: dict[str, Tensor], expected: dict[str, Tensor]) -> Tensor:
+    """The largest error of each parameter's gradient over its largest value, `(5,)` float64; NaN stays."""
+    return torch.stack([((got[p] - expected[p]).abs().max() / expected[p].abs().max()).double() for p in PARAMETERS])
 
 
 def check_scenes(data: Path, scenes: Iterable[str]) -> None:

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from kgs.fit.outputs import peak_rss_mb, versions, write_json
+from kgs.camera import move_camera
+from kgs.fit.machine import check_device, peak_rss_mb
+from kgs.losses import photometric_loss, target_moments
+from kgs.options import alias
+from kgs.projection import project
+from kgs.raster import composite
+from kgs.raster.tiles import bin_to_tiles
+from kgs.renderer import GaussianRenderer
+from kgs.types import Gaussians
 
-from .cases import Cases
-from .output import markdown_table, write_csv
-from .timing import Times, calibrations, take_turns
+from .output import markdown_table
+from .results import write_results
+from .scenes import PARAMETERS, layered_scene
+from .timing import Times, calibrations, take_turns, time_parts
 
-__all__ = ["SIZE", "TARGETS", "measure_speed"]
+__all__ = ["SIZE", "TARGETS", "Cases", "speed"]
 
 SIZE = (378, 504)
 # What kgs is held to on two cores, by count of Gaussians: seconds, and MiB over what importing takes.
@@ -28,194 +39,225 @@ TARGETS = {
     "training step": {10_000: 0.125, 50_000: 0.330, 200_000: 0.540},
     "peak memory": {10_000: 250.0, 50_000: 450.0, 200_000: 900.0},
 }
+Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of the results.
+def speed(*, out: Annotated[Path, alias("-o")], quick: bool = False, device: str = "cpu") -> int:
+    """Time and memory of renders and training steps on this machine, by stage and by what is asked for.
 
-    Args:
-        table: "main", "stages", "left out" or "scaling".
-        case: what was done.
-        count: Gaussians.
-        size: height and width.
-        pairs: of pixel and Gaussian in the tiles' lists, in millions.
-        times: wall clock and processor time.
-        target: seconds it is held to, if it is.
-    """
+    Writes speed.csv, speed.json, speed.md and scaling.png. Examples:
 
-    table: str
-    case: str
-    count: int
-    size: tuple[int, int]
-    pairs: float
-    times: Times
-    target: float | None = None
+    kgs bench speed -o speed                         minutes
 
-
-def measure_speed(
-    out: Path, *, quick: bool = False, device: str = "cpu", say: Callable[[str], None] = print
-) -> dict[str, Any]:
-    """Measure, and write speed.csv, speed.json, speed.md and scaling.png.
+    kgs bench speed -o speed --quick --device cuda   tens of seconds, on a GPU
 
     Args:
         out: folder for the results, made if it is not there.
-        quick: fewer Gaussians and repetitions: tens of seconds instead of minutes.
-        device: where to render.
-        say: where lines for the user go.
+        quick: fewer Gaussians and repetitions.
+        device: where to render: cpu, cuda, cuda:1, ...
 
     Returns:
-        What speed.json holds.
+        The exit code, 0.
+
+    Raises:
+        ValueError: the device is unknown or not there.
     """
+    where = check_device(device)
     out.mkdir(parents=True, exist_ok=True)
-    where, repeats = torch.device(device), 3 if quick else 7
-    counts = (2_000, 10_000) if quick else (10_000, 50_000, 200_000)
-    rows: list[Row] = []
-    memory = {}
+    repeats, counts = (3, (2_000, 10_000)) if quick else (7, (10_000, 50_000, 200_000))
+    units, rows = calibrations(where), []
+
+    def note(table: str, cases: Cases, found: dict[str, Times]) -> None:
+        for name, times in found.items():
+            row = {"table": table, "case": name, "gaussians": cases.count}
+            row |= {"height": cases.size[0], "width": cases.size[1], "pairs_millions": cases.pairs}
+            row |= {f"{key}_s": value for key, value in times._asdict().items()} | {"repeats": repeats}
+            row["target_s"] = TARGETS[name].get(cases.count) if table == "main" else None
+            rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / units["exp"]})
+
     for count in counts:
-        say(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
+        print(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
         cases = Cases(count, SIZE, where)
-        rows += [
-            Row("main", name, count, SIZE, cases.pairs, times, TARGETS[name].get(count))
-            for name, times in take_turns(cases.main(), repeats, where).items()
-        ]
-        rows += [
-            Row("stages", name, count, SIZE, cases.pairs, times)
-            for name, times in take_turns(cases.stages(), repeats, where).items()
-        ]
-        if where.type == "cpu":
-            memory[count] = _memory_of_its_own(count)
-    say("what is left out ...")
-    cases = Cases(counts[min(1, len(counts) - 1)], SIZE, where)
-    rows += [
-        Row("left out", name, cases.count, SIZE, cases.pairs, times)
-        for name, times in take_turns(cases.savings(), repeats, where).items()
-    ]
-    say("scaling ...")
+        main = dict(zip(TARGETS, (cases.forward, cases.both, cases.train), strict=False))
+        note("main", cases, take_turns(main, repeats, where))
+        note("stages", cases, time_parts(cases.stages, repeats, where))
+        if count == counts[1]:
+            note("left out", cases, take_turns(cases.savings(), repeats, where))
+    memory = {count: _memory_of_its_own(count) for count in counts if where.type == "cpu"}
     sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
     for count, size in dict.fromkeys(scaled):
         cases = Cases(count, size, where)
-        times = take_turns({"forward + backward": cases.main()["forward + backward"]}, repeats, where)
-        rows.append(Row("scaling", "forward + backward", count, size, cases.pairs, times["forward + backward"]))
-    units = calibrations(where)
-    exponents = {
-        "count": _exponent([(r.count, r.times.wall) for r in rows if r.table == "scaling" and r.size == SIZE]),
-        "pairs": _exponent([(r.pairs, r.times.wall) for r in rows if r.table == "scaling" and r.size == SIZE]),
-        "pixels": _exponent(
-            [(math.prod(r.size), r.times.wall) for r in rows if r.table == "scaling" and r.count == counts[0]]
-        ),
-    }
-    result = {
-        "rows": [asdict(row) for row in rows],
-        "peak_memory_mb": memory,
-        "calibrations": units,
-        "exponents": exponents,
-        "threads": torch.get_num_threads(),
-        "device": device,
-        "versions": versions(),
-    }
-    write_csv(out / "speed.csv", [_plain(row, units) for row in rows])
-    write_json(out / "speed.json", result)
-    table = _markdown(rows, memory, units, exponents)
-    (out / "speed.md").write_text(table)
-    _plot(out / "scaling.png", [row for row in rows if row.table == "scaling"])
-    say(table)
-    return result
+        note("scaling", cases, take_turns({"forward + backward": cases.both}, repeats, where))
+    points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
+    exponents = {name: _exponent(of) for name, of in points.items()}
+    more = {"peak_memory_mb": memory, "calibrations": units, "exponents": exponents, "device": device}
+    _plot(out / "scaling.png", points)
+    write_results(out / "speed", rows, _markdown(rows, memory, units, exponents), **more)
+    return 0
+
+
+class Cases:
+    """One scene and what there is to time on it; `pairs`: of pixel and Gaussian in its tiles' lists, in millions."""
+
+    def __init__(self, count: int, size: tuple[int, int], device: torch.device) -> None:
+        model, camera = layered_scene(count, size)
+        self.count, self.size, self.device = count, size, device
+        self.model, self.camera = model.to(device), move_camera(camera, device)
+        self.renderer = GaussianRenderer()
+        generator = torch.Generator().manual_seed(0)
+        self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
+        self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
+        self.moments = target_moments(self.photo)
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=0.0, fused=True)
+        with torch.no_grad():
+            bins = bin_to_tiles(project(self.model(), self.camera))
+        self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6
+
+    def forward(self) -> Tensor:
+        """Render without gradient."""
+        with torch.no_grad():
+            image: Tensor = self.renderer(self.model(), self.camera).image
+        return image
+
+    def both(self, gaussians: Gaussians | None = None, outputs: tuple[str, ...] = ("image",)) -> None:
+        """Render, and go back to all parameters that the Gaussians hang on."""
+        rendering = self.renderer(gaussians or self.model(), self.camera, outputs=outputs)
+        picture = rendering.image if rendering.image is not None else rendering.alpha
+        (picture * self.weights[:, : picture.shape[1]]).sum().backward()
+        self.model.zero_grad()
+
+    def train(self) -> None:
+        """One step of training, densification left aside."""
+        image = self.renderer(self.model(), self.camera).image
+        photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def stages(self) -> Iterator[str]:
+        """A training step in its parts; says the name of each when it is done."""
+        projected = project(self.model(), self.camera)
+        outputs = [projected.means2d, projected.factors, projected.opacities, projected.colors]
+        inputs = [x.detach().requires_grad_() for x in outputs]
+        yield "projection, harmonics"
+        bin_to_tiles(projected)
+        yield "binning"
+        names = ("means2d", "factors", "opacities", "colors")
+        composited = composite(replace(projected, **dict(zip(names, inputs, strict=True))), inputs[3]).features
+        yield "compositing, binning included"
+        image = composited.detach().requires_grad_()
+        photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
+        yield "loss, forward + backward"
+        grads = torch.autograd.grad(composited, inputs, image.grad)
+        yield "compositing, backward"
+        torch.autograd.backward(outputs, grads)
+        yield "projection, harmonics, backward"
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        yield "Adam"
+
+    def savings(self) -> dict[str, Callable[[], object]]:
+        """Forward + backward with one thing less each time."""
+
+        def frozen(*names: str) -> Callable[[], None]:
+            return changed(lambda g: {name: getattr(g, name).detach() for name in names})
+
+        def changed(change: Callable[[Gaussians], dict[str, Tensor]]) -> Callable[[], None]:
+            def run() -> None:
+                gaussians = self.model()
+                self.both(replace(gaussians, **change(gaussians)))
+
+            return run
+
+        half = (torch.arange(self.count, device=self.device) % 2).float()
+        behind = torch.tensor([0.0, 0.0, -100.0], device=self.device) * (1 - half)[:, None]
+        return {
+            "everything": self.both,
+            "no gradient at all": self.forward,
+            "colours frozen": frozen("colors"),
+            "geometry frozen": frozen("means", "quats", "scales"),
+            "all but colours frozen": frozen(*PARAMETERS[:4]),
+            "harmonics of degree 0": changed(lambda _: {"colors": self.model.sh_dc}),
+            "alpha only": lambda: self.both(outputs=("alpha",)),
+            "half of the Gaussians dropped": changed(lambda g: {"opacities": g.opacities * half}),
+            "half of the Gaussians behind the camera": changed(lambda g: {"means": g.means + behind}),
+        }
 
 
 def _memory_of_its_own(count: int) -> float:
     """MiB that rendering forward and backward takes over importing, in a process that does nothing else."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_memory, (count,))
+    program = f"from kgs.bench.speed import _memory; print(_memory({count}))"
+    return float(subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout)
 
 
 def _memory(count: int) -> float:
-    before = peak_rss_mb()
-    cases = Cases(count, SIZE, torch.device("cpu"))
+    before, cases = peak_rss_mb(), Cases(count, SIZE, torch.device("cpu"))
     for _ in range(3):
-        cases.both(cases.model())
-    return float(peak_rss_mb() - before)
+        cases.both()
+    return peak_rss_mb() - before
 
 
-def _exponent(points: list[tuple[float, float]]) -> float:
-    """Slope of the line through the logarithms."""
-    x, y = np.log(np.array(points)).T
-    return float(np.polyfit(x, y, 1)[0])
-
-
-def _plain(row: Row, units: dict[str, float]) -> dict[str, Any]:
-    """A line of speed.csv."""
-    t = row.times
-    return {
-        "table": row.table,
-        "case": row.case,
-        "gaussians": row.count,
-        "height": row.size[0],
-        "width": row.size[1],
-        "pairs_millions": row.pairs,
-        "wall_s": t.wall,
-        "best_s": t.best,
-        "worst_s": t.worst,
-        "cpu_s": t.cpu,
-        "repeats": t.repeats,
-        "target_s": row.target,
-        "wall_in_exp_per_pair": t.wall / (row.pairs * 1e6) / units["exp"],
+def _scaling(rows: list[Row], fewest: int) -> dict[str, np.ndarray]:
+    """Pairs of a size and seconds, `(P, 2)`: by Gaussians and pairs at the full size, by pixels at a fixed count."""
+    full = [row for row in rows if (row["height"], row["width"]) == SIZE]
+    fixed = [row for row in rows if row["gaussians"] == fewest]
+    points = {
+        "Gaussians": [(row["gaussians"], row["wall_s"]) for row in full],
+        "pairs": [(row["pairs_millions"], row["wall_s"]) for row in full],
+        "pixels": [(row["height"] * row["width"], row["wall_s"]) for row in fixed],
     }
+    return {name: np.array(sorted(of)) for name, of in points.items()}
+
+
+def _exponent(points: np.ndarray) -> float:
+    """Slope of the line through the logarithms."""
+    return float(np.polyfit(*np.log(points).T, 1)[0])
 
 
 def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float], exponents: dict[str, float]) -> str:
     tables: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
-        tables.setdefault(row.table, {}).setdefault(row.case, []).append(row)
-    counts = [f"{row.count // 1000}k" for row in next(iter(tables["main"].values()))]
-    main = [[name, *(_cell(row.times, row.target) for row in found)] for name, found in tables["main"].items()]
-    held = TARGETS["peak memory"]
+        tables.setdefault(row["table"], {}).setdefault(row["case"], []).append(row)
+    counts = [f"{row['gaussians'] // 1000}k" for row in next(iter(tables["main"].values()))]
+    main = [[name, *map(_cell, found)] for name, found in tables["main"].items()]
     if memory:
-        cells = [f"{mb:.0f} MiB" + (f"; {held[count]:.0f}" if count in held else "") for count, mb in memory.items()]
+        held = ((mb, TARGETS["peak memory"].get(count)) for count, mb in memory.items())
+        cells = (f"{mb:.0f} MiB" + ("" if most is None else f"; {most:.0f}") for mb, most in held)
         main.append(["peak memory over importing", *cells])
-    stages = [[name, *(f"{row.times.wall * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
+    stages = [[name, *(f"{row['wall_s'] * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
     savings = [row for found in tables["left out"].values() for row in found]
-    everything = savings[0].times.wall
-    left_out = [[row.case, f"{row.times.wall * 1e3:.0f}", f"{row.times.wall / everything:.2f}"] for row in savings]
-    size = f"{SIZE[1]}x{SIZE[0]}, harmonics of degree 3"
+    whole = savings[0]["wall_s"]
+    left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", f"{row['wall_s'] / whole:.2f}"] for row in savings]
+    title = f"{SIZE[1]}x{SIZE[0]}, harmonics of degree 3: wall clock, median (least to largest); what it is held to"
+    less = f"What is not asked for is not computed, {savings[0]['gaussians']} Gaussians, forward + backward"
     return (
-        markdown_table(f"{size}: wall clock, median (least to largest); what it is held to", counts, main)
+        markdown_table(title, counts, main)
         + markdown_table("Parts of a training step, ms", counts, stages)
-        + markdown_table(
-            f"What is not asked for is not computed, {savings[0].count} Gaussians, forward + backward",
-            ["ms", "of everything"],
-            left_out,
-        )
-        + f"Time grows as count^{exponents['count']:.2f}, pairs^{exponents['pairs']:.2f}, "
+        + markdown_table(less, ["ms", "of everything"], left_out)
+        + f"Time grows as count^{exponents['Gaussians']:.2f}, pairs^{exponents['pairs']:.2f}, "
         f"pixels^{exponents['pixels']:.2f} (at a fixed count).\n"
-        f"Calibration: exp {units['exp'] * 1e9:.2f} ns an element, dense oracle (400 Gaussians, 48x64) "
+        f"Calibration: exp {units['exp'] * 1e9:.2f} ns per element, dense oracle (400 Gaussians, 48x64) "
         f"{units['dense'] * 1e3:.0f} ms.\n"
     )
 
 
-def _cell(times: Times, target: float | None) -> str:
-    text = f"{times.wall * 1e3:.0f} ({times.best * 1e3:.0f} to {times.worst * 1e3:.0f}) ms"
-    return text if target is None else f"{text}; {target * 1e3:.0f}"
+def _cell(row: Row) -> str:
+    wall, best, worst = (1e3 * row[f"{name}_s"] for name in ("wall", "best", "worst"))
+    held = "" if row["target_s"] is None else f"; {row['target_s'] * 1e3:.0f}"
+    return f"{wall:.0f} ({best:.0f} to {worst:.0f}) ms{held}"
 
 
-def _plot(path: Path, rows: list[Row]) -> None:
+def _plot(path: Path, points: dict[str, np.ndarray]) -> None:
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter
 
-    fewest = min(row.count for row in rows if row.size != SIZE)
-    panels: dict[str, list[tuple[float, float]]] = {
-        "Gaussians": [(row.count, row.times.wall) for row in rows if row.size == SIZE],
-        f"pixels, {fewest} Gaussians": [(math.prod(row.size), row.times.wall) for row in rows if row.count == fewest],
-        "evaluated pairs [million]": [(row.pairs, row.times.wall) for row in rows],
-    }
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
-    for axis, (label, points) in zip(axes, panels.items(), strict=True):
-        x, y = np.array(sorted(points)).T
-        axis.loglog(x, y, "o" if label.startswith("evaluated") else "o-", markersize=4)
-        axis.set_xlabel(label)
-        axis.xaxis.set_minor_formatter(NullFormatter())
+    for axis, (name, of) in zip(axes, points.items(), strict=True):
+        axis.loglog(*of.T, "o-", markersize=4)
+        axis.set_xlabel(
+            {"pairs": "evaluated pairs [million]", "pixels": "pixels, the fewest Gaussians"}.get(name, name)
+        )
+        axis.xaxis.set_minor_formatter("")
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("forward + backward [s]")
     figure.savefig(path, dpi=120)

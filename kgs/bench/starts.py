@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -15,15 +16,15 @@ from torch import Tensor
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.fit.outputs import versions, write_json
 from kgs.fit.starts import FirstPoints, first_points
+from kgs.fit.starts.triangulate import camera_centers, project_all, unproject
+from kgs.options import alias
 
-from .output import markdown_table, write_csv
+from .output import markdown_table, mean_sd
+from .results import write_results
 from .scenes import check_scenes
-from .start_measures import CLOSE, NEAR, complete_pixels, depth_errors, front_depths, model_errors, seen_twice
-from .statistics import summarize
 
-__all__ = ["measure_starts"]
+__all__ = ["complete_pixels", "depth_errors", "model_errors", "seen_twice", "starts"]
 
 ALL_POINTS, RANDOM_POINTS = 10**6, 10_000
 QUICK, SMALL, LARGE = (126, 168), (189, 252), (378, 504)  # height, width
@@ -32,24 +33,40 @@ SYNTHETIC = [("forward", views, SMALL) for views in (3, 6, 12, 24)] + [("orbit",
 SYNTHETIC += [("forward", views, LARGE) for views in (3, 12, 24)]
 REAL = [("llff/fern", 3), ("llff/flower", 3), ("colmap/trex", 3), ("blender/lego", 8), ("nerfstudio/fox", 12)]
 REAL += [("llff/flower", views) for views in (6, 9, 24)]
-_MEASURES = ("median_error", "bias", "within_1", "within_2", "complete", "complete_twice", "seen_twice")
-_OF_MODEL = ("model_pairs", "model_error", "model_within_2")
+NEAR, CLOSE = 0.01, 0.02  # relative depth errors that are counted
+HIDDEN = 0.05  # a point so much farther than the surface before it is hidden there, not wrong
+REACH, MODEL_REACH = 2.0, 1.5  # pixels, from a point to the pixel it stands for, and to a point of COLMAP's
+EDGE = 1.05  # ratio of depths of neighbouring pixels above which nothing is interpolated between them
+# Columns of the tables: head, decimals, factor.
+_POINTS = {"points": ("points", 0, 1)}
+_ERRORS = {"median_error": ("median error", 2, 100), "bias": ("median signed", 2, 100)}
+_SHARES = {"within_1": "within 1 %", "within_2": "within 2 %", "complete": "complete"}
+_SHARES |= {"complete_twice": "of those seen twice", "seen_twice": "pixels that two views see"}
+_MEASURES = _ERRORS | {name: (head, 1, 100) for name, head in _SHARES.items()}
+_SECONDS = {"wall_seconds": ("wall s", 1, 1), "cpu_seconds": ("CPU s", 1, 1)}
+_OF_MODEL = {"model_pairs": ("pairs", 0, 1), "model_error": ("median error", 2, 100)}
+_OF_MODEL |= {"model_within_2": ("within 2 %", 1, 100)}
+Row = dict[str, Any]
 
 
-def measure_starts(out: Path, *, quick: bool = False, say: Callable[[str], None] = print) -> list[dict[str, Any]]:
-    """Measure, and write starts.csv, starts.json, starts.md and starts.png.
+def starts(*, out: Annotated[Path, alias("-o")], quick: bool = False) -> int:
+    """Depth errors, completeness and times of the first points of a fit.
 
     The synthetic scene has exact depths. Real scenes, in the folder of the environment variable KGS_DATA, have counts
     and times; three views are also compared with the points of a COLMAP model where there is one, which were refined
     with the test views too and are not exact. (Most of many views that such a point projects into do not observe it.)
+    Writes starts.csv, starts.json and starts.md. Examples:
+
+    KGS_DATA=SCENES kgs bench starts -o starts   twenty minutes
+
+    kgs bench starts -o starts --quick           ten seconds
 
     Args:
         out: folder for the results, made if it is not there.
-        quick: one small scene of three views with one seed: some ten seconds instead of twenty minutes.
-        say: where lines for the user go.
+        quick: one small synthetic scene of three views with one seed.
 
     Returns:
-        One row a scene, count of views, size, seed and kind of points; what was not measured is None.
+        The exit code, 0.
 
     Raises:
         DataError: KGS_DATA is set and one of the scenes is not there.
@@ -58,25 +75,21 @@ def measure_starts(out: Path, *, quick: bool = False, say: Callable[[str], None]
     if data is not None:
         check_scenes(Path(data), [name for name, _ in REAL])
     else:
-        say("the synthetic scene alone" + ("" if quick else ": KGS_DATA is not set"))
+        print("the synthetic scene alone" + ("" if quick else ": KGS_DATA is not set"))
     out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for kind, count, size in [("forward", 3, QUICK)] if quick else SYNTHETIC:
         for seed in range(1 if quick or count > FEW or size == LARGE else SEEDS):
-            say(f"{kind}, {count} views of {size[1]}x{size[0]}, seed {seed} ...")
-            rows += _synthetic_rows(kind, count, size, seed, None if rows else out / "starts.png")
+            print(f"{kind}, {count} views of {size[1]}x{size[0]}, seed {seed} ...")
+            rows += _synthetic_rows(kind, count, size, seed)
     for name, count in REAL if data is not None else ():
-        say(f"{name}, {count} views ...")
+        print(f"{name}, {count} views ...")
         rows += _real_rows(Path(data or ""), name, count)
-    threads = torch.get_num_threads()
-    write_csv(out / "starts.csv", rows)
-    write_json(out / "starts.json", {"rows": rows, "threads": threads, "versions": versions()})
-    (out / "starts.md").write_text(table := _markdown(rows, threads), encoding="utf-8")
-    say(table)
-    return rows
+    write_results(out / "starts", rows, _markdown(rows))
+    return 0
 
 
-def _find(views: Views, asked: str, seed: int) -> tuple[FirstPoints, dict[str, Any]]:
+def _find(views: Views, asked: str, seed: int) -> tuple[FirstPoints, Row]:
     """The points, all that there are (10 000 if random), and the columns about how they came."""
     count = ALL_POINTS if asked == "dense" else RANDOM_POINTS
     with warnings.catch_warnings(record=True) as caught:
@@ -91,9 +104,7 @@ def _find(views: Views, asked: str, seed: int) -> tuple[FirstPoints, dict[str, A
     return found, {"asked": asked, "came": found.kind, "fallback": fallback, "points": len(found.points), **seconds}
 
 
-def _synthetic_rows(
-    kind: str, count: int, size: tuple[int, int], seed: int, picture: Path | None
-) -> list[dict[str, Any]]:
+def _synthetic_rows(kind: str, count: int, size: tuple[int, int], seed: int) -> list[Row]:
     views = synthetic_scene(kind, count, 0, size, seed).train
     truth = synthetic_depths(views.cameras, kind, seed)[:, 0]
     surface, twice = truth > 0, seen_twice(views, truth)
@@ -105,12 +116,10 @@ def _synthetic_rows(
         values = [errors.abs().median(), errors.median(), *(share.double().mean() for share in shares)]
         row |= dict(zip(_MEASURES, map(float, values), strict=True)) | dict.fromkeys(_OF_MODEL)
         rows.append({"scene": kind, "views": count, "width": size[1], "height": size[0], "seed": seed, **row})
-        if picture is not None and asked == "dense":
-            _plot(picture, views, truth, found.points)
     return rows
 
 
-def _real_rows(data: Path, name: str, count: int) -> list[dict[str, Any]]:
+def _real_rows(data: Path, name: str, count: int) -> list[Row]:
     has_model = count <= 3 and name.startswith(("llff", "colmap"))
     scene = load_scene(data / name, count, points="model-points" if has_model else "none")
     height, width = scene.train.images.shape[-2:]
@@ -118,84 +127,166 @@ def _real_rows(data: Path, name: str, count: int) -> list[dict[str, Any]]:
     for asked in ("dense", "sift"):
         found, row = _find(scene.train, asked, 0)
         row |= dict.fromkeys((*_MEASURES, *_OF_MODEL))
-        if has_model:
-            errors = model_errors(found.points, scene.points, scene.train).abs()
-            row["model_pairs"] = len(errors)
-            if len(errors):
-                row |= {
-                    "model_error": float(errors.median()),
-                    "model_within_2": float((errors <= CLOSE).double().mean()),
-                }
+        if has_model and len(errors := model_errors(found.points, scene.points, scene.train).abs()):
+            share = float((errors <= CLOSE).double().mean())
+            row |= {"model_pairs": len(errors), "model_error": float(errors.median()), "model_within_2": share}
         rows.append({"scene": name, "views": count, "width": width, "height": height, "seed": 0, **row})
     return rows
 
 
-def _markdown(rows: list[dict[str, Any]], threads: int) -> str:
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+def _markdown(rows: list[Row]) -> str:
+    groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["scene"], row["views"], f"{row['width']}x{row['height']}", row["asked"]), []).append(row)
 
-    def lines(with_: str, columns: dict[str, int]) -> list[list[object]]:
-        """One line a group that has a measure; shares and errors in percent."""
-        table: list[list[object]] = []
-        for (scene, views, size, asked), of in groups.items():
-            if of[0][with_] is None:
-                continue
-            came = ", ".join(dict.fromkeys(row["came"] for row in of))
-            line: list[object] = [scene, views, size, asked if came == asked else f"{asked}: {came}", len(of)]
-            for name, decimals in columns.items():
-                factor = 100 if name in _MEASURES or name in _OF_MODEL[1:] else 1
-                summary = summarize(factor * row[name] for row in of)
-                line.append("" if summary is None else summary.text(decimals))
-            table.append(line)
-        return table
+    def table(title: str, columns: dict[str, tuple[str, int, int]]) -> str:
+        """One line per group that has these measures."""
+        columns, lines = _POINTS | columns, []
+        for (*about, asked), of in groups.items():
+            if None not in (of[0][name] for name in columns):
+                came = ", ".join(dict.fromkeys(row["came"] for row in of))
+                values = (mean_sd((f * row[name] for row in of), d) for name, (_, d, f) in columns.items())
+                lines.append([*about, asked if came == asked else f"{asked}: {came}", len(of), *values])
+        heads = ("views", "size", "start", "n", *(head for head, _, _ in columns.values()))
+        return markdown_table(title, heads, lines, first="scene") if lines else ""
 
-    head = ("views", "size", "start", "n", "points")
-    errors, shares, seconds = dict.fromkeys(_MEASURES[:2], 2), dict.fromkeys(_MEASURES[2:], 1), ("wall s", "CPU s")
-    titles = ("median error", "median signed", "within 1 %", "within 2 %", "complete", "of those seen twice")
-    text = markdown_table(
-        "Points, at most a million, against exact depths, in percent: relative depth errors, and the share of the "
-        "pixels with a surface that have a point within 2 pixels and 2 % of the depth; mean (standard deviation over n "
-        "seeds)",
-        (*head, *titles, "pixels that two views see"),
-        lines("complete", {"points": 0, **errors, **shares}),
-        first="scene",
-    )
-    text += markdown_table(
-        f"Seconds that the points take, threads of torch: {threads}; mean (standard deviation over n seeds)",
-        (*head, *seconds),
-        lines("points", {"points": 0, "wall_seconds": 1, "cpu_seconds": 1}),
-        first="scene",
-    )
-    of_model = lines("model_error", {"points": 0, "model_pairs": 0, "model_error": 2, "model_within_2": 1})
-    if of_model:
-        text += markdown_table(
-            "Points against those of the COLMAP model, in percent: relative depth errors where a view has both within "
-            "1.5 pixels",
-            (*head, "pairs", "median error", "within 2 %"),
-            of_model,
-            first="scene",
+    errors, spread = "in percent: relative depth errors", "mean (standard deviation over n seeds)"
+    shares = "and the share of the pixels with a surface that have a point within 2 pixels and 2 % of the depth"
+    return (
+        table(f"Points, at most a million, against exact depths, {errors}, {shares}; {spread}", _MEASURES)
+        + table(f"Seconds that the points take, threads of torch: {torch.get_num_threads()}; {spread}", _SECONDS)
+        + table(
+            f"Points against those of the COLMAP model, {errors} where a view has both within 1.5 pixels", _OF_MODEL
         )
-    return text
+    )
 
 
-def _plot(path: Path, views: Views, truth: Tensor, points: Tensor) -> None:
-    """The middle view: photo, exact depth, depth of the dense points, and their relative error; white has none."""
-    from matplotlib.figure import Figure
+def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
+    """The relative error of each point's depth, in the nearest view that it is not hidden in.
 
-    view = len(views) // 2
-    exact = torch.where(truth[view] > 0, truth[view], torch.nan)
-    depths = front_depths(points, views, view)
-    depths = torch.where(depths.isfinite(), depths, torch.nan)
-    figure = Figure(figsize=(9, 5.6), layout="constrained")
-    (photo, first), (second, third) = figure.subplots(2, 2)
-    photo.imshow(views.images[view].permute(1, 2, 0).numpy())
-    limits = {"vmin": float(exact.nan_to_num(torch.inf).min()), "vmax": float(exact.nan_to_num(0.0).max())}
-    errors = 100 * (depths / exact - 1)
-    figure.colorbar(first.imshow(exact.numpy(), cmap="turbo_r", **limits), ax=first)
-    figure.colorbar(second.imshow(depths.numpy(), cmap="turbo_r", **limits), ax=second)
-    figure.colorbar(third.imshow(errors.numpy(), cmap="RdBu", vmin=-5, vmax=5), ax=third, extend="both")
-    titles = ("photo", "exact depth", "depth of the dense points, the first in each pixel", "its relative error [%]")
-    for axis, title in zip((photo, first, second, third), titles, strict=True):
-        axis.set(title=title, xticks=[], yticks=[])
-    figure.savefig(path, dpi=100)
+    The depth of the surface is interpolated between pixels, as the inverse depth, which is linear on a plane; at an
+    edge (neighbours more than 5 % apart) it is that of the pixel the point falls into. A point more than 5 % behind
+    the surface counts as hidden in that view; one that is hidden in all views is judged in the nearest of them.
+
+    Convention:
+        Depth is z in the camera's frame (OpenCV axes); pixels have integer centres.
+
+    Args:
+        points: `(P, 3)` in the frame of the views.
+        views: V of them; the nearest is that whose camera is nearest to the point, of those it projects into.
+        truth: exact depths, `(V, H, W)` float64; 0 where there is no surface.
+
+    Returns:
+        Depth over the surface's depth less 1, `(P,)` float64: negative before the surface, -1 before none; infinite
+        where no view has the point in its image.
+    """
+    errors = torch.stack([_view_errors(points, views, truth, view) for view in range(len(views))], 1)
+    inside = ~errors.isnan()
+    seen = inside & (errors <= HIDDEN)
+    usable = torch.where(seen.any(1, keepdim=True), seen, inside)
+    distances = torch.cdist(points.double(), camera_centers(views.cameras)).masked_fill(~usable, torch.inf)
+    nearest = errors.gather(1, distances.argmin(1, keepdim=True))[:, 0]
+    return torch.where(inside.any(1), nearest, torch.inf)
+
+
+def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
+    """Which pixels have a point within 2 pixels whose depth is within 2 % of the pixel's exact depth, `(V, H, W)`.
+
+    Args:
+        points: `(P, 3)` in the frame of the views.
+        views: V of them.
+        truth: exact depths, `(V, H, W)` float64; 0 where there is no surface, which is never complete.
+    """
+    found = torch.zeros_like(truth, dtype=torch.bool)
+    for view, exact in enumerate(truth):
+        pixels, depths = _in_image(points, views, view)
+        for inside, x, y, _ in _around(pixels, truth.shape[-2:], REACH):
+            close = (depths[inside] / exact[y, x] - 1).abs() <= CLOSE
+            found[view, y[close], x[close]] = True
+    return found
+
+
+def seen_twice(views: Views, truth: Tensor) -> Tensor:
+    """Which pixels show a surface that another view shows too, to 1 % of its depth there, `(V, H, W)`."""
+    found = torch.zeros_like(truth, dtype=torch.bool)
+    for view, exact in enumerate(truth):
+        rows, columns = (exact > 0).nonzero().unbind(1)
+        pixels = torch.stack([columns, rows], 1)
+        points = unproject(pixels, exact[rows, columns], torch.full_like(rows, view), views.cameras)
+        for other in range(len(views)):
+            if other != view:
+                found[view, rows, columns] |= _view_errors(points, views, truth, other).abs() <= NEAR
+    return found
+
+
+def model_errors(points: Tensor, model: Tensor, views: Views) -> Tensor:
+    """Relative errors of the points' depths where a view has them within 1.5 pixels of a point of a COLMAP model.
+
+    A pixel's depth is that of the first of the points in it, and a model's point is compared with the nearest pixel
+    that has any. All views that a model's point projects into count, also those where something hides it.
+
+    Args:
+        points: `(P, 3)` in the frame of the views.
+        model: `(M, 3)`, taken as the truth.
+        views: of the pictures.
+
+    Returns:
+        Depth over the model's depth less 1, one number per pair of a model's point and a view, float64.
+    """
+    errors = [torch.zeros(0, dtype=torch.float64)]
+    for view in range(len(views)):
+        front = _front_depths(points, views, view)
+        pixels, depths = _in_image(model, views, view)
+        nearest, found = torch.full_like(depths, torch.inf), torch.full_like(depths, torch.inf)
+        for inside, x, y, distances in _around(pixels, front.shape, MODEL_REACH):
+            better = front[y, x].isfinite() & (distances < nearest[inside])
+            found[inside[better]] = front[y, x][better]
+            nearest[inside[better]] = distances[better]
+        errors.append((found / depths - 1)[found.isfinite()])
+    return torch.cat(errors)
+
+
+def _front_depths(points: Tensor, views: Views, view: int) -> Tensor:
+    """The least depth of the points in each pixel of one view, `(H, W)`; infinite where there is none."""
+    height, width = views.images.shape[-2:]
+    pixels, depths = _in_image(points, views, view)
+    x, y = pixels.round().long().unbind(1)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    empty = torch.full((height * width,), torch.inf, dtype=torch.float64)
+    return empty.scatter_reduce(0, (y * width + x)[inside], depths[inside], "amin").reshape(height, width)
+
+
+def _view_errors(points: Tensor, views: Views, truth: Tensor, view: int) -> Tensor:
+    """Depth over the surface's depth less 1 in one view, `(P,)`; NaN where the point is not in its image."""
+    pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
+    inverse = torch.where(truth[view] > 0, 1 / truth[view], 0.0)
+    height, width = inverse.shape
+    limits = torch.tensor([width, height]) - 0.5
+    inside = (depths > 0) & ((pixels > -0.5) & (pixels < limits)).all(1)
+    x, y = torch.where(inside[:, None], pixels, 0.0).clamp(torch.zeros(2), limits - 0.5).unbind(1)
+    left, top = x.floor().long().clamp(max=width - 2), y.floor().long().clamp(max=height - 2)
+    right, below = x - left, y - top
+    corners = torch.stack([inverse[top + i, left + j] for i in (0, 1) for j in (0, 1)])
+    weights = torch.stack([a * b for a in (1 - below, below) for b in (1 - right, right)])
+    own = corners.gather(0, weights.argmax(0, keepdim=True))[0]
+    smooth = corners.amax(0) <= EDGE * corners.amin(0)
+    return torch.where(inside, depths * torch.where(smooth, (weights * corners).sum(0), own) - 1, torch.nan)
+
+
+def _in_image(points: Tensor, views: Views, view: int) -> tuple[Tensor, Tensor]:
+    """Pixels `(Q, 2)` and depths `(Q,)` of the points that are in the image of one view, or at most 2 pixels out."""
+    pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
+    height, width = views.images.shape[-2:]
+    limits = torch.tensor([width - 1, height - 1])
+    inside = (depths > 0) & ((pixels >= -REACH) & (pixels <= limits + REACH)).all(1)
+    return pixels[inside], depths[inside]
+
+
+def _around(pixels: Tensor, size: torch.Size, reach: float) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """For each place of a disc: which of the pixels `(Q, 2)` it is in the image for, its x and y, and how far it is."""
+    for offset in product((-2, -1, 0, 1, 2), repeat=2):
+        places = pixels.round() + torch.tensor(offset)
+        distances = (places - pixels).norm(dim=1)
+        inside = ((places >= 0) & (places < torch.tensor([size[1], size[0]]))).all(1) & (distances <= reach)
+        x, y = places[inside].long().unbind(1)
+        yield inside.nonzero()[:, 0], x, y, distances[inside]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import torch
 
@@ -14,28 +14,18 @@ from kgs.camera import move_camera
 
 from .scenes import layered_scene
 
-__all__ = ["Times", "calibrations", "take_turns"]
+__all__ = ["Times", "calibrations", "take_turns", "time_parts"]
 
 _EXP_ELEMENTS = 2**18
 
 
-@dataclass(frozen=True)
-class Times:
-    """Seconds of one case over its repetitions.
-
-    Args:
-        wall: the median.
-        best: the least.
-        worst: the largest.
-        cpu: median of the processor time of all threads.
-        repeats: how many there were.
-    """
+class Times(NamedTuple):
+    """Seconds of one case over its repetitions: median, least and largest; and the median of all threads' CPU time."""
 
     wall: float
     best: float
     worst: float
     cpu: float
-    repeats: int
 
 
 def take_turns(
@@ -48,21 +38,30 @@ def take_turns(
         repeats: rounds, >= 1.
         device: where they run; a GPU is waited for.
     """
-    wait = torch.cuda.synchronize if device is not None and device.type == "cuda" else lambda: None
-    walls: dict[str, list[float]] = {name: [] for name in cases}
-    cpus: dict[str, list[float]] = {name: [] for name in cases}
-    for round_ in range(repeats + 1):
+
+    def one_round() -> Iterator[str]:
         for name, case in cases.items():
-            wall, cpu = time.perf_counter(), time.process_time()
             case()
+            yield name
+
+    return time_parts(one_round, repeats, device)
+
+
+def time_parts(
+    run: Callable[[], Iterator[str]], repeats: int = 5, device: torch.device | None = None
+) -> dict[str, Times]:
+    """Time the parts of something that says the name of each part when it has done it; otherwise as `take_turns`."""
+    wait = torch.cuda.synchronize if device is not None and device.type == "cuda" else lambda: None
+    found: dict[str, list[tuple[float, float]]] = {}
+    for round_ in range(repeats + 1):
+        wall, cpu = time.perf_counter(), time.process_time()
+        for name in run():
             wait()
             if round_ > 0:
-                walls[name].append(time.perf_counter() - wall)
-                cpus[name].append(time.process_time() - cpu)
-    return {
-        name: Times(statistics.median(w), min(w), max(w), statistics.median(cpus[name]), repeats)
-        for name, w in walls.items()
-    }
+                found.setdefault(name, []).append((time.perf_counter() - wall, time.process_time() - cpu))
+            wall, cpu = time.perf_counter(), time.process_time()
+    times = {name: tuple(zip(*pairs, strict=True)) for name, pairs in found.items()}
+    return {n: Times(statistics.median(w), min(w), max(w), statistics.median(c)) for n, (w, c) in times.items()}
 
 
 def calibrations(device: torch.device) -> dict[str, float]:
@@ -80,8 +79,7 @@ def calibrations(device: torch.device) -> dict[str, float]:
             torch.exp(values, out=results)
 
     model, camera = layered_scene(400, (48, 64))
-    gaussians = model.to(device)()
-    camera = move_camera(camera, device)
+    gaussians, camera = model.to(device)(), move_camera(camera, device)
 
     def dense() -> None:
         kgs.reference.render(gaussians, camera).sum().backward(retain_graph=True)

@@ -39,7 +39,7 @@ def record(record_property: Callable[[str, object], None]) -> Callable[..., None
 
     def note(fault: str, trials: int, lost: int, found: str, met: bool) -> None:
         verdict = "met" if met else "FAILED"
-        row = {"fault": fault, "trials": trials, "lost": lost, "found": found, "verdict": verdict}
+        row = {"name": fault, "trials": trials, "lost": lost, "found": found, "verdict": verdict}
         record_property("faults", row)
         assert met, found
 
@@ -119,6 +119,6 @@ def test_memory_over_many_steps(tmp_path: Path, record_property: Callable[[str, 
     most = f"at most {peak / 2**20:.0f} MiB over the start, {ceiling / 2**20:.0f} MiB foretold"
     rows = [("memory", growth, slope < 1.0), ("memory ceiling", most, peak <= ceiling)]
     for fault, found, met in rows:
-        row = {"fault": f"{fault}, {steps} steps", "trials": 1, "lost": 0, "found": found}
+        row = {"name": f"{fault}, {steps} steps", "trials": 1, "lost": 0, "found": found}
         record_property("faults", {**row, "verdict": "met" if met else "FAILED"})
     assert [found for _, found, met in rows if not met] == []

@@ -110,6 +110,6 @@ def test_a_row_counts_what_was_tried(tmp_path: Path) -> None:
     reader = Reader("careless", _write, careless, (overwrite(200), overwrite(3)))
     outcomes = try_reader(reader, range(100))
     row = table_row(reader, outcomes)
-    assert row["tried"] == row["other"] + row["sound"] == 100
+    assert row["trials"] == row["other"] + row["sound"] == 100
     assert row["other"] > 10
     assert "KeyError" in next(outcome.what for outcome in outcomes if outcome.kind == "other")

@@ -77,8 +77,8 @@ def table_row(reader: Reader, outcomes: list[Outcome]) -> dict[str, Any]:
     kinds = [outcome.kind for outcome in outcomes]
     memory = [outcome.memory for outcome in outcomes if outcome.memory is not None]
     return {
-        "reader": reader.name,
-        "tried": len(outcomes),
+        "name": reader.name,
+        "trials": len(outcomes),
         "sound": kinds.count("sound"),
         "DataError": kinds.count("refused"),
         "other": kinds.count("other"),
