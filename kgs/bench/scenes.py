@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,8 +60,8 @@ def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0)
         "sh_dc": ((np.clip(colors, 0.02, 0.98) - 0.5) / SH_C0)[:, None],
         "sh_rest": rng.normal(0, 0.06, (count, 15, 3)),
     }
-    model = GaussianModel(**{name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()})
-    return model, cast_camera(centred_camera(size, focal), torch.float32)
+    tensors: dict[str, Any] = {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
+    return GaussianModel(**tensors), cast_camera(centred_camera(size, focal), torch.float32)
 
 
 def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:

@@ -137,12 +137,12 @@ class Cases:
     def stages(self) -> Iterator[str]:
         """A training step in its parts; says the name of each when it is done."""
         projected = project(self.model(), self.camera)
-        outputs = [projected.means2d, projected.factors, projected.opacities, projected.colors]
-        inputs = [x.detach().requires_grad_() for x in outputs]
+        names = ("means2d", "factors", "opacities", "colors")
+        outputs = [getattr(projected, name) for name in names]
+        inputs: Any = [x.detach().requires_grad_() for x in outputs]
         yield "projection, harmonics"
         bin_to_tiles(projected)
         yield "binning"
-        names = ("means2d", "factors", "opacities", "colors")
         composited = composite(replace(projected, **dict(zip(names, inputs, strict=True))), inputs[3]).features
         yield "compositing, binning included"
         image = composited.detach().requires_grad_()
@@ -211,7 +211,8 @@ def _scaling(rows: list[Row], fewest: int) -> dict[str, np.ndarray]:
 
 def _exponent(points: np.ndarray) -> float:
     """Slope of the line through the logarithms."""
-    return float(np.polyfit(*np.log(points).T, 1)[0])
+    x, y = np.log(points).T
+    return float(np.polyfit(x, y, 1)[0])
 
 
 def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float], exponents: dict[str, float]) -> str:
