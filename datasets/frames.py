@@ -73,7 +73,7 @@ class PointCloud:
     kind: str
 
 
-NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), "none")
+NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64, device="cpu"), torch.zeros(0, 3, device="cpu"), "none")
 
 
 @dataclass(frozen=True)

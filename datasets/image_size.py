@@ -58,10 +58,8 @@ def _most_pixels(size: int) -> int:
 def plain_jpeg(data: bytes) -> bytes:
     """A JPEG up to the end of its first image: some phones put a video or a second picture behind it.
 
-    Scan parameters that only progressive images need are set right in others: some phones leave them 0.
-
-    Raises:
-        ValueError: the file ends before its image does.
+    Scan parameters that only progressive images need are set right in others: some phones leave them 0. A file that
+    ends before its image does is a ValueError.
     """
     parts, sequential = bytearray(data), False
     for marker, at in _markers(data):
@@ -79,10 +77,7 @@ def plain_tiff(data: bytes) -> tuple[bytes, bool]:
     """A TIFF whose pixels decoders give as they are stored, and whether these are multiplied by their alpha.
 
     Decoders turn an image as its orientation tag says, and multiply 8 bit colours by an alpha that is not multiplied
-    in. Both tags are overwritten.
-
-    Raises:
-        ValueError: it is grey with an alpha channel, which decoders leave out.
+    in. Both tags are overwritten. A grey TIFF with an alpha channel, which decoders leave out, is a ValueError.
     """
     tags, order = _tags(data), "<" if data[:1] == b"I" else ">"
     parts = bytearray(data)

@@ -68,8 +68,7 @@ def load_scene(
         >>> scene = load_scene("fern", train_views=3, downscale=2)  # doctest: +SKIP
         >>> scene.train.images.shape  # doctest: +SKIP
         torch.Size([3, 3, 189, 252])
-        >>> for view in scene.train:  # doctest: +SKIP
-        ...     print(view["name"], view["image"].shape, view["extrinsics"].shape)
+        >>> images = [view["image"] for view in scene.train]  # doctest: +SKIP
         >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
     for name, value, known in (("background", background, _BACKGROUNDS), ("points", points, ("none", "model-points"))):
@@ -78,34 +77,35 @@ def load_scene(
     if downscale is not None and not (isinstance(downscale, (int, float)) and 1 <= downscale < math.inf):
         raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
     root = Path(path)
-    found = find_layout(root)
-    train, test = _split(root, found, train_views)
-    cloud = found.points
-    if points == "model-points":
-        if found.model_points is None:
-            raise DataError(root, "points", "model-points are not available: there is no COLMAP model in sparse/0")
-        cloud = found.model_points(train)
-    if not bool((cloud.points.abs() <= LARGEST).all()):
-        raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
-    _check_present(root, [frame.path for frame in (*train, *test)])
-    color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
-    offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; no test view enters it
-    height, width = size = _common_size([*train, *test], downscale)
-    fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
-    is_finer = photos and downscale is not None and fine_downscale < downscale
-    finer = _views(train, _common_size(train, fine_downscale), offset, color, photos) if is_finer else None
-    return Scene(
-        train=_views(train, size, offset, color, photos),
-        test=_views(test, size, offset, color, photos),
-        points=(cloud.points - offset).float(),
-        point_colors=cloud.colors.float(),
-        init_kind=cloud.kind,
-        offset=offset,
-        background=color,
-        root=root,
-        finer=finer,
-        notes=found.notes,
-    )
+    with torch.device("cpu"):  # whatever torch's default is
+        found = find_layout(root)
+        train, test = _split(root, found, train_views)
+        cloud = found.points
+        if points == "model-points":
+            if found.model_points is None:
+                raise DataError(root, "points", "model-points are not available: there is no COLMAP model in sparse/0")
+            cloud = found.model_points(train)
+        if not bool((cloud.points.abs() <= LARGEST).all()):
+            raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
+        _check_present(root, [frame.path for frame in (*train, *test)])
+        color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
+        offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; no test view enters it
+        height, width = size = _common_size([*train, *test], downscale)
+        fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
+        is_finer = photos and downscale is not None and fine_downscale < downscale
+        finer = _views(train, _common_size(train, fine_downscale), offset, color, photos) if is_finer else None
+        return Scene(
+            train=_views(train, size, offset, color, photos),
+            test=_views(test, size, offset, color, photos),
+            points=(cloud.points - offset).float(),
+            point_colors=cloud.colors.float(),
+            init_kind=cloud.kind,
+            offset=offset,
+            background=color,
+            root=root,
+            finer=finer,
+            notes=found.notes,
+        )
 
 
 def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:

@@ -100,7 +100,7 @@ class Views:
 
         Positions that are no integers are a TypeError, views that are not there an IndexError.
         """
-        rows = torch.as_tensor(index)
+        rows = torch.as_tensor(index, device=self.cameras.extrinsics.device)
         if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
             raise TypeError(f"index: expected integers, got {rows.dtype}")
         cameras, rows = self.cameras, rows.reshape(-1).long()
@@ -110,7 +110,7 @@ class Views:
 
     def select(self, indices: Sequence[int]) -> Views:
         """The views at the given positions, in that order."""
-        rows = torch.tensor(indices, dtype=torch.int64)
+        rows = torch.tensor(indices, dtype=torch.int64, device=self.images.device)
         masks = None if self.masks is None else self.masks[rows]
         return Views(self.camera(rows), self.images[rows], tuple(self.names[i] for i in indices), masks)
 

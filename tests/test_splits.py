@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from kgs.datasets.splits import BLENDER_TRAIN_FRAMES, select_evenly, split_by_name
@@ -108,3 +109,4 @@ def test_a_wrong_number_of_views_is_answered_with_the_range(views: object) -> No
 def test_one_view_and_all_views() -> None:
     assert select_evenly(17, 1) == [0]
     assert select_evenly(17, 17) == list(range(17))
+    assert select_evenly(17, np.int64(2)) == [0, 16]  # type: ignore[arg-type]  # numpy's integers are none for mypy

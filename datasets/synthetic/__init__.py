@@ -64,9 +64,10 @@ def synthetic_scene(
     rng = np.random.default_rng([seed, 1])
     place = _patch_eyes if kind == "forward" else _orbit_eyes
     train_eyes, test_eyes = place(train_views, test_views, rng)
-    train, test = (_views(world, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
-    none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
-    return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
+    with torch.device("cpu"):  # whatever torch's default is
+        train, test = (_views(world, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
+        none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
+        return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
 
 
 def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 0) -> Tensor:
