@@ -1,14 +1,19 @@
 """The layer and the loss in pipelines that are not ours: checkpointing, replicas, compilers, a plain splatting loop."""
 
+import copy
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 from factories import drop_layer as at
+from factories import pinhole, random_model
 from factories import random_opacities as draw
+from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from kgs import DropGaussian
+from kgs import DropGaussian, GaussianRenderer
+from kgs.losses import photometric_loss, target_moments
 
 
 def test_activation_checkpointing_recomputes_the_same_mask():
@@ -66,3 +71,146 @@ def test_torch_compile_with_inductor_follows_the_progress():
     except Exception as error:
         pytest.skip(f"no compiler works here: {type(error).__name__}")
     _check_compiled("inductor")
+
+
+# -- a trainer of one's own ----------------------------------------------------------------------------------------
+
+
+class Blobs(nn.Module):
+    """Somebody else's splatting: round blobs in the plane, front to back, in plain torch; one line is ours."""
+
+    def __init__(self, drop, count=40, size=24, seed=0):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.places = nn.Parameter(size * torch.rand(count, 2, generator=generator))
+        self.colors = nn.Parameter(torch.rand(count, 3, generator=generator))
+        self.logits = nn.Parameter(torch.zeros(count))
+        self.drop, self.size = drop, size
+
+    def forward(self, offset=0.0):
+        opacities = self.drop(self.logits.sigmoid())
+        y, x = torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij")
+        pixels = torch.stack([x, y], dim=-1).reshape(-1, 1, 2)
+        alphas = opacities * torch.exp(-(pixels - self.places - offset).square().sum(-1) / 18)
+        alphas = alphas.clamp(max=0.99)
+        light = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], dim=1), dim=1)[:, :-1]
+        return ((light * alphas) @ self.colors).T.reshape(1, 3, self.size, self.size)
+
+
+def photo():
+    return Blobs(nn.Identity(), seed=5)().detach()
+
+
+def fit(network, step=None, steps=30):
+    """A plain training loop; returns the losses."""
+    target = photo()
+    adam = torch.optim.Adam(network.parameters(), lr=0.05)
+
+    def plain(network):
+        return photometric_loss(network(), target, moments=target_moments(target))
+
+    losses = []
+    for i in range(steps):
+        network.drop.progress = (i + 1) / steps
+        loss = (step or plain)(network)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        losses.append(loss.item())
+    return losses
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_a_foreign_trainer_needs_one_line(seed):
+    network = Blobs(DropGaussian(p=0.2, seed=seed))
+    before = photometric_loss(network.eval()(), photo()).item()
+    losses = fit(network.train())
+    assert losses != fit(Blobs(nn.Identity()).requires_grad_(), lambda n: photometric_loss(n(), photo()))
+    assert photometric_loss(network.eval()(), photo()).item() < 0.6 * before
+    with torch.inference_mode():
+        assert torch.equal(network(), network())
+
+
+@pytest.mark.parametrize("seed", [pytest.param(None, marks=pytest.mark.slow), 3])
+def test_a_compiled_step_is_the_step(seed):
+    def run(compiled):
+        torch._dynamo.reset()
+        torch.manual_seed(0)
+        network, target = Blobs(DropGaussian(p=0.3, seed=seed)), photo()
+
+        def step(network):
+            return photometric_loss(network(), target)
+
+        return fit(network, torch.compile(step, backend="aot_eager") if compiled else step, 3), network
+
+    (losses, network), (expected, eager) = run(True), run(False)
+    assert losses == pytest.approx(expected, abs=1e-6)
+    for one, two in zip(network.parameters(), eager.parameters(), strict=True):
+        torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
+
+
+# -- replicas, as nn.DataParallel makes them in each step ----------------------------------------------------------
+
+
+def replicate(network, count):
+    """What `torch.nn.parallel.replicate` does, on one device: shallow copies of all modules, wired anew."""
+    modules = list(network.modules())
+    copies = [{m: m._replicate_for_data_parallel() for m in modules} for _ in range(count)]
+    for replicas in copies:
+        for module, replica in replicas.items():
+            for name, child in module._modules.items():
+                setattr(replica, name, replicas[child])
+            for name, parameter in module._parameters.items():
+                setattr(replica, name, parameter)
+    return [replicas[network] for replicas in copies]
+
+
+class Scaled(nn.Module):
+    def __init__(self, seed):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(1000))
+        self.drop = DropGaussian(p=0.5, schedule="constant", seed=seed)
+
+    def forward(self, x):
+        return self.drop(x * self.weight)
+
+
+def test_replicas_in_threads_draw_new_masks_each_step_each_its_own_and_the_same_in_each_run():
+    def run():
+        network, masks = Scaled(seed=3), []
+        for _ in range(3):
+            with ThreadPoolExecutor(2) as pool:
+                masks += pool.map(lambda replica: replica(torch.full((1000,), 0.5)), replicate(network, 2))
+        sum(mask.sum() for mask in masks).backward()
+        assert set(network.weight.grad.tolist()) <= {float(k) for k in range(7)}
+        return [tuple(mask.tolist()) for mask in masks]
+
+    masks = run()
+    assert len(set(masks)) == 6
+    assert masks == run()
+
+
+def test_data_parallel_without_devices_is_the_layer():
+    network, alone = nn.DataParallel(Scaled(seed=3), device_ids=[]), Scaled(seed=3)
+    x = torch.full((1000,), 0.5)
+    for _ in range(2):
+        assert torch.equal(network(x), alone(x))
+
+
+# -- other contexts ------------------------------------------------------------------------------------------------
+
+
+def test_a_model_in_inference_mode_renders_and_the_training_goes_on():
+    model, renderer = random_model(30), GaussianRenderer(at(0.5, seed=0))
+    camera = pinhole(24, 32, 30.0, dtype=torch.float32)
+    with torch.inference_mode():
+        expected = renderer.eval()(model(), camera).image
+    loss = photometric_loss(renderer.train()(model(), camera).image, expected.clone())
+    loss.backward()
+    assert torch.equal(renderer.eval()(model(), camera).image, expected)
+
+
+def test_a_whole_network_survives_deepcopy_and_shared_memory():
+    network = Blobs(at(0.5, p=0.2, seed=3))
+    twin = copy.deepcopy(network).share_memory()
+    assert torch.equal(twin(), network())
