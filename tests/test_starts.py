@@ -25,7 +25,7 @@ from start_scenes import (
 )
 
 from kgs.datasets.scene import Views
-from kgs.fit.progress import progress
+from kgs.fit.progress import each
 from kgs.fit.starts import FirstPoints, first_points, typical_depths
 
 
@@ -159,7 +159,7 @@ def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixt
     small = planes.halved()
     first_points(small, "dense")
     assert capsys.readouterr() == ("", "")  # nothing unless asked for
-    first_points(small, "dense", stage=progress)
+    first_points(small, "dense", stage=each)
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         *(f"keypoints: {k} of 3 views" for k in (1, 2, 3)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from kgs.ply import save_ply
 from .config import FitConfig, Recipe
 from .figures import side_by_side, write_curve
 from .outputs import check_folder, write_json, write_png
+from .progress import say
 from .run import choose_points, measure, train
 from .trainer import Trainer
 
@@ -31,9 +33,7 @@ DEMO = FitConfig(
 )
 
 
-def run_demo(
-    scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable[[str], None] = print
-) -> dict[str, Any]:
+def run_demo(scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable[[str], None] = say) -> dict[str, Any]:
     """Fit the same scene twice and compare on views that neither fit has seen.
 
     Args:
@@ -43,27 +43,28 @@ def run_demo(
             order of views included.
         say: where lines for the user go.
 
+    Raises:
+        SystemExit: a signal ended a fit; its code is 128 + the number of the signal.
+
     Returns:
         What metrics.json holds: `{"without": run, "with": run}`.
     """
     check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
     points = choose_points(scene, config)
-    say(
-        f"{len(scene.train)} training and {len(scene.test)} test views of "
-        f"{scene.train.images.shape[-1]}x{scene.train.images.shape[-2]}"
-    )
+    height, width = scene.train.images.shape[-2:]
+    say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
     say(f"first points: {len(points.points)} ({points.kind})")
     runs, renders, curves = {}, {}, {}
     for name, fit in (("without", replace(config, drop=0.0)), ("with", config)):
-        trainer = Trainer(scene, fit, points)
-        if train(trainer, None, title=f"{name:>7} DropGaussian"):
-            raise KeyboardInterrupt
-        runs[name] = measure(trainer)
-        renders[f"{name} DropGaussian"] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
-        curves[f"{name} DropGaussian"] = trainer.curve
-    save_ply(out / "splat.ply", trainer.model)
+        trainer, title = Trainer(scene, fit, points), f"{name} DropGaussian"
+        if signal := train(trainer, None, title=title):
+            raise SystemExit(128 + signal)
+        runs[name], curves[title] = measure(trainer), trainer.curve
+        renders[title] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
+    save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
     write_json(out / "metrics.json", runs)
     write_curve(out / "curve.png", curves)
-    worst = sorted(range(len(scene.test)), key=lambda i: runs["without"]["test"]["views"][i]["psnr"])[:2]
+    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs["without"]["test"]["views"]]
+    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
     write_png(out / "demo.png", side_by_side(scene.test, renders, sorted(worst)))
     return runs

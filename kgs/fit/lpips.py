@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 import zipfile
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from kgs.errors import DataError
@@ -30,9 +30,18 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 NORM_EPS = 1e-10
 
+# Convolutions (width, size, stride, padding), each with a ReLU, and poolings (size, stride).
+PLANS = {
+    "alexnet": ((64, 11, 4, 2), (3, 2), (192, 5, 1, 2), (3, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+    "vgg16": (
+        *(*[(64, 3, 1, 1)] * 2, (2, 2), *[(128, 3, 1, 1)] * 2, (2, 2), *[(256, 3, 1, 1)] * 3, (2, 2)),
+        *(*[(512, 3, 1, 1)] * 3, (2, 2), *[(512, 3, 1, 1)] * 3),
+    ),
+}
 # Positions, in torchvision's `features`, of the ReLUs whose outputs are compared; and the smallest image they take.
 TAPS = {"alexnet": (1, 4, 7, 9, 11), "vgg16": (3, 8, 15, 22, 29)}
 MIN_SIZE = {"alexnet": 31, "vgg16": 16}
+MOST_HEADER = 10_000  # bytes of an array's
 
 
 class Lpips(nn.Module):
@@ -53,7 +62,7 @@ class Lpips(nn.Module):
         if net not in TAPS:
             raise ValueError(f"net: expected one of {sorted(TAPS)}, got {net!r}")
         self.net = net
-        self.features: nn.Sequential = _vgg16_features() if net == "vgg16" else _alexnet_features()
+        self.features = _features(net)
         channels = 0
         for index, layer in enumerate(self.features):
             if isinstance(layer, nn.Conv2d):
@@ -130,75 +139,43 @@ def _unit(features: Tensor) -> Tensor:
     return features / (norm + NORM_EPS)
 
 
-def _vgg16_features() -> nn.Sequential:
+def _features(net: str) -> nn.Sequential:
+    """The convolutions of a network, in torchvision's order."""
     layers: list[nn.Module] = []
     channels = 3
-    for block, (width, count) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
-        if block > 0:
-            layers.append(nn.MaxPool2d(2))
-        for _ in range(count):
-            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+    for part in PLANS[net]:
+        if len(part) == 4:
+            width, size, stride, padding = part
+            layers += [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU()]
             channels = width
+        else:
+            layers.append(nn.MaxPool2d(*part))
     return nn.Sequential(*layers)
 
 
-def _alexnet_features() -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(),
-    )
-
-
 def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """The named arrays of an npz file as float32 tensors."""
+    """The named arrays of an npz file as float32 tensors, each measured before its numbers are unpacked."""
     if not path.is_file():
         raise DataError(path, "", "expected an npz file of LPIPS weights, got none")
     if not zipfile.is_zipfile(path):
         raise DataError(path, "", "expected an npz file, got another format or a part of one")
-    field = ""
-    weights = {}
+    field, weights = "", dict[str, Tensor]()
     try:
         with zipfile.ZipFile(path) as archive:
             for field, shape in shapes.items():
-                weights[field] = torch.from_numpy(_read_array(path, archive, field, shape))
+                if f"{field}.npy" not in archive.namelist():
+                    raise DataError(path, field, f"expected an array of shape {shape}, got none")
+                with archive.open(f"{field}.npy") as file:
+                    content = BytesIO(file.read(MOST_HEADER + 8 * math.prod(shape)))
+                array = np.lib.format.read_array(content, allow_pickle=False, max_header_size=MOST_HEADER)
+                if array.shape != shape or array.dtype.kind != "f" or content.read(1):
+                    raise DataError(path, field, f"expected floats of shape {shape}, got {array.dtype} {array.shape}")
+                with np.errstate(over="ignore"):
+                    weights[field] = torch.from_numpy(np.array(array, np.float32, order="C"))
+                if not weights[field].isfinite().all():
+                    raise DataError(path, field, "expected finite numbers in the range of float32, got others")
     except DataError:
         raise
     except Exception as error:  # damaged bytes raise whatever zipfile, its codecs and numpy's parser of headers raise
-        raise DataError(path, field, f"expected a readable npz file, got {error!r}") from error
+        raise DataError(path, field, f"expected floats in a readable npz file, got {error!r}") from error
     return weights
-
-
-def _read_array(path: Path, archive: zipfile.ZipFile, field: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """One array, its header and its size checked before its numbers are unpacked."""
-    if f"{field}.npy" not in archive.namelist():
-        raise DataError(path, field, f"expected an array of shape {shape}, got none")
-    with archive.open(f"{field}.npy") as file:
-        version = np.lib.format.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise DataError(path, field, f"expected an npy file of version 1 or 2, got {version}")
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        got, is_fortran, dtype = read_header(file)
-        if got != shape or dtype.kind != "f":
-            raise DataError(path, field, f"expected floats of shape {shape}, got {dtype} {got}")
-        size = math.prod(shape) * dtype.itemsize
-        data = file.read(size + 1)
-    if len(data) != size:
-        raise DataError(
-            path, field, f"expected {size} bytes of numbers, got {'more' if len(data) > size else len(data)}"
-        )
-    array = np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C")
-    with np.errstate(over="ignore"):
-        numbers = np.array(array, np.float32, order="C")
-    if not np.isfinite(numbers).all():
-        raise DataError(path, field, "expected finite numbers in the range of float32, got others")
-    return numbers

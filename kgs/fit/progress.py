@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
-__all__ = ["Stage", "progress", "say", "silent"]
+__all__ = ["Stage", "each", "progress", "say", "silent"]
 
-Stage = Callable[[int, str, int, str], AbstractContextManager[Callable[..., None]]]  # what `progress` and `silent` are
+Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
 _LINES = 10  # per stage, where there is no terminal
 
@@ -63,10 +63,17 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
                 bar.close()
 
 
-@contextmanager
-def silent(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """Like :func:`progress`, and shows nothing."""
-    yield lambda note="": None
+def each(items: Sequence[Any], title: str, unit: str) -> Iterator[Any]:
+    """The items, with :func:`progress` behind each that is done."""
+    with progress(len(items), title, unit=unit) as advance:
+        for item in items:
+            yield item
+            advance()
+
+
+def silent(items: Sequence[Any], title: str, unit: str) -> Iterable[Any]:
+    """Like :func:`each`, and shows nothing."""
+    return items
 
 
 def _bar(total: int, title: str, done: int, unit: str) -> Any:

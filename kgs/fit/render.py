@@ -13,7 +13,7 @@ from kgs.renderer import GaussianRenderer
 
 from .config import Recipe
 from .outputs import check_folder, png_names, write_png
-from .progress import progress
+from .progress import each
 from .starts import typical_depths
 
 __all__ = ["render_views"]
@@ -33,10 +33,9 @@ def render_views(ply: Path, scene: Scene, out: Path, device: str = "cpu") -> int
     check_folder(out, names.values(), scene.root)
     renderer = GaussianRenderer(near_plane=near_plane).eval()
     model, background = model.to(device), scene.background.to(device)
-    with progress(len(names), "pictures", unit="view") as advance, torch.no_grad():
-        for views in (scene.train, scene.test):
-            for i, name in enumerate(views.names):
-                camera = move_camera(views.camera(i), torch.device(device))
-                write_png(out / names[name], renderer(model(), camera, background).image[0])
-                advance()
+    cameras = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
+    for name, camera in each(cameras, "pictures", "view"):
+        with torch.no_grad():
+            image = renderer(model(), move_camera(camera, torch.device(device)), background).image[0]
+        write_png(out / names[name], image)
     return len(names)

@@ -69,7 +69,7 @@ def first_points(
         count: how many points "random" gives, and "dense" at most; >= 1.
         file: the file of the kind "file", not compressed; a splat gives the colours of its harmonics of degree 0.
         origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
-        stage: shows how far the work is: :func:`kgs.fit.progress.progress`, or nothing.
+        stage: shows how far the work is: :func:`kgs.fit.progress.each`, or nothing.
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.

@@ -71,17 +71,14 @@ def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES, st
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
     depth = 1 / float(inverse.mean())
     maps = []
-    with stage(len(views), "depth maps", 0, "view") as advance:
-        for view, image in enumerate(grey[:, 0]):
-            scores = _combine(
-                _scores(grey, views.cameras, view, other, inverse) for other in _neighbours(views, view, depth)
-            )
-            if scores is None:
-                unknown = torch.full_like(image, -1.0)
-                maps.append(DepthMap(torch.full_like(image, far), unknown, unknown > 0))
-            else:
-                maps.append(_refine(_semi_global(1.0 - scores, image), scores, inverse))
-            advance()
+    for view in stage(range(len(views)), "depth maps", "view"):
+        image, others = grey[view, 0], _neighbours(views, view, depth)
+        if others:
+            scores = _combine(_scores(grey, views.cameras, view, other, inverse) for other in others)
+            maps.append(_refine(_semi_global(1.0 - scores, image), scores, inverse))
+        else:
+            unknown = torch.full_like(image, -1.0)
+            maps.append(DepthMap(torch.full_like(image, far), unknown, unknown > 0))
     return maps
 
 
@@ -129,8 +126,7 @@ def _warp(image: Tensor, homography: Tensor) -> Tensor:
     if bool((corners @ homography[2] > 0).all()):
         return warped
     x, y, one = homography[2]
-    depths = x * torch.arange(width) + (y * torch.arange(height))[:, None] + one
-    return torch.where(depths > 0, warped, 0.0)
+    return torch.where(x * torch.arange(width) + (y * torch.arange(height))[:, None] + one > 0, warped, 0.0)
 
 
 def _box(image: Tensor) -> Tensor:
@@ -143,21 +139,13 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 
 
-def _combine(scores: Iterator[Tensor]) -> Tensor | None:
-    """The best score with three quarters of the weight, the second best with one: further views may see it hidden.
-
-    None without any scores.
-    """
-    best: Tensor | None = None
-    second: Tensor | None = None
+def _combine(scores: Iterator[Tensor]) -> Tensor:
+    """Of the neighbours the best, and the second best with a quarter of the weight: the others may see it hidden."""
+    best, second = next(scores), None
     for score in scores:
-        if best is None:
-            best = score
-            continue
-        lower = torch.minimum(best, score)
-        best = torch.maximum(best, score)
+        lower, best = torch.minimum(best, score), torch.maximum(best, score)
         second = lower if second is None else torch.maximum(second, lower)
-    return best if best is None or second is None else 0.75 * best + 0.25 * second
+    return best if second is None else 0.75 * best + 0.25 * second
 
 
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:

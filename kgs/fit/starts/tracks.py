@@ -30,7 +30,7 @@ MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival m
 
 @dataclass(frozen=True)
 class Tracks:
-    """T scene points as V views see them.
+    """T scene points as V views see them, on the CPU.
 
     Convention:
         Integer pixel centres: the first pixel's centre is (0, 0).
@@ -47,35 +47,25 @@ class Tracks:
 def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
     """Find points that at least two of the views see.
 
-    A pair of keypoints matches if each is the other's nearest in RootSIFT among those near its epipolar line (under
-    the given poses), clearly nearer than the second nearest, and alike in itself. The best matches are joined first;
-    one that would give a track two places in one view is left out. No random numbers are used, and the same images
-    give the same bits for any number of threads.
+    Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
+    poses), clearly nearer than the second nearest, and alike in itself. The best matches are joined first; one that
+    would give a track two places in one view is left out. Nothing is random: the same images give the same bits.
 
     Args:
         views: posed images; where they have masks, keypoints lie where the mask is above 0.5.
         stage: shows how far the work is.
-
-    Returns:
-        The tracks, in float64 on the CPU.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
-    limit, features = min(max(48_000 // len(views), 1500), 12_000), []
-    with stage(len(views), "keypoints", 0, "view") as advance:
-        for view in range(len(views)):
-            features.append(_detect(views, view, limit))
-            advance()
+    limit = min(max(48_000 // len(views), 1500), 12_000)
+    features = [_detect(views, view, limit) for view in stage(range(len(views)), "keypoints", "view")]
     cameras = views.cameras
     projections = (cameras.intrinsics.double() @ cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
     links: list[tuple[float, int, int]] = []
-    pairs = list(combinations(range(len(views)), 2))
-    with stage(len(pairs), "matches", 0, "pair") as advance:
-        for i, j in pairs:
-            distances, found = _match(features[i], features[j], projections[i], projections[j])
-            ends = nodes[i][found[:, 0]], nodes[j][found[:, 1]]
-            links += zip(distances.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
-            advance()
+    for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
+        distances, pairs = _match(features[i], features[j], projections[i], projections[j])
+        ends = nodes[i][pairs[:, 0]], nodes[j][pairs[:, 1]]
+        links += zip(distances.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
     tracks = _join(links, owners)
     table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
     seen = torch.zeros(len(tracks), len(views), dtype=torch.bool)
@@ -150,9 +140,7 @@ def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
 
     SIFT gives a keypoint with several orientations once for each; all of them are one place.
     """
-    numbers: list[Tensor] = []
-    distinct: list[Tensor] = []
-    owners: list[int] = []
+    numbers, distinct, owners = list[Tensor](), list[Tensor](), list[int]()
     for view, all_places in enumerate(places):
         unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)
         numbers.append(inverse + len(owners))

@@ -1,0 +1,236 @@
+"""What `kgs demo`, `fit`, `render` and `eval` do; their options are the arguments here.
+
+Everything that can be known is checked before work begins, and heavy packages are imported after that.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+from kgs.errors import DataError
+
+from .config import FitConfig
+from .progress import say
+
+__all__ = ["demo", "evaluate", "fit", "render"]
+
+_VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
+_RESULTS = ("splat.ply", "config.json", "metrics.json", "curve.png")
+
+
+def demo(
+    *,
+    out: Path = Path("demo"),
+    steps: int = 1200,
+    size: tuple[int, int] = (54, 72),
+    seed: int = 0,
+    device: str = "cpu",
+) -> None:
+    """Fit three views of a built-in scene without and with DropGaussian, and compare views that were not used.
+
+    For example:
+      kgs demo -o demo
+      kgs demo -o demo1 --seed 1
+
+    Args:
+        out: folder for demo.png, curve.png, metrics.json and splat.ply.
+        steps: training steps of each of the two fits; the default takes some 3 minutes on 2 cores.
+        size: height and width of the pictures.
+        seed: the scene, the first points and both fits derive from it.
+        device: cpu, cuda, ...
+    """
+    from kgs.datasets import synthetic_scene
+
+    from .demo import DEMO, run_demo
+
+    config = replace(DEMO, seed=seed, steps=steps, device=device)
+    _prepare(device, "matplotlib")
+    runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), out, config)
+    say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
+    level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
+    for name, run in runs.items():
+        columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
+        say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
+    gain = level["with"][0] - level["without"][0]
+    say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
+    say(f"pictures: {out / 'demo.png'}, {out / 'curve.png'}")
+    _next("kgs fit SCENE -o OUT  # your own photos, with poses", _VIEWER.format(_line(out / "splat.ply")))
+
+
+def fit(
+    scene: Path,
+    /,
+    *,
+    out: Path,
+    views: int | None = None,
+    downscale: float | None = None,
+    background: Literal["black", "white"] = "black",
+    fast: bool = False,
+    resume: bool = False,
+    lpips_weights: Path | None = None,
+    config: FitConfig,
+) -> int:
+    """Turn a folder of posed photos into a splat, with test metrics.
+
+    For example:
+      kgs fit fern -o fern-3 --views 3 --downscale 2
+      kgs fit fern -o fern-3 --views 3 --downscale 2 --fast
+
+    Args:
+        scene: LLFF, COLMAP, Blender or nerfstudio folder.
+        out: folder for splat.ply, metrics.json, test/*.png, curve.png, config.json and the checkpoints.
+        views: training views, spread over the views that are not held out; all of them unless given.
+        downscale: shrink the photos by this factor.
+        background: behind photos with transparency.
+        fast: a third of the time for 0.1 to 0.5 dB less PSNR of test views: other defaults, see --fast --help.
+        resume: continue from the checkpoint in the output folder.
+        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
+        config: every number of the fit.
+    """
+    from .outputs import check_folder
+    from .run import fit_scene
+
+    if config.init_file is not None and not config.init_file.is_file():
+        raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
+    lpips = _prepare(config.device, "matplotlib", "safetensors", lpips=lpips_weights)
+    check_folder(out, _RESULTS, scene, make=False)
+    request = {
+        "scene": os.path.abspath(scene),
+        "train_views": views,
+        "downscale": downscale,
+        "background": background,
+        "points": "model-points" if config.init == "model-points" else "none",
+    }
+    loaded = _load(request)
+    height, width = loaded.train.images.shape[-2:]
+    say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    if width * height > 1e6 and config.device == "cpu":
+        megapixels, minutes = width * height / 1e6, width * height * config.steps / 1.5e9
+        say(f"{megapixels:.1f} Mpx on a CPU: expect about {minutes:.0f} minutes; see --downscale")
+    metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
+    _print_metrics(metrics)
+    splat, renders = out / "splat.ply", out / "renders"
+    say(f"{splat}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
+    if stopped_by:
+        _next("the same command with --resume goes on where it stopped")
+        return 128 + stopped_by
+    _next(
+        f"{_line('kgs', 'render', splat, '--cameras', scene, '-o', renders)}  # pictures from every camera",
+        f"{_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
+        _VIEWER.format(_line(splat)),
+    )
+    return 0
+
+
+def render(
+    ply: Path,
+    /,
+    *,
+    cameras: Path,
+    out: Path,
+    downscale: float | None = None,
+    background: Literal["black", "white"] = "black",
+    device: str = "cpu",
+) -> None:
+    """Render a splat from every camera of a scene into PNGs.
+
+    For example:
+      kgs render fern-3/splat.ply --cameras fern -o renders
+      kgs render fern-3/splat.ply --cameras fern -o small --downscale 8 --background white
+
+    Args:
+        ply: a 3DGS PLY file.
+        cameras: the scene (LLFF, COLMAP, Blender or nerfstudio folder) whose cameras to use.
+        out: folder for the PNGs, named like the scene's photos; not where these are.
+        downscale: shrink the pictures by this factor.
+        background: behind the splat.
+        device: cpu, cuda, ...
+    """
+    from kgs.datasets import load_scene
+
+    from .outputs import check_folder
+    from .render import render_views
+
+    _prepare(device)
+    check_folder(out, (), cameras, make=False)
+    scene = load_scene(cameras, None, downscale, background=background, photos=False)
+    say(f"{render_views(ply, scene, out, device)} pictures in {out}")
+    _next(_VIEWER.format(_line(ply)))
+
+
+def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "cpu") -> None:
+    """Measure a fit again and bring its metrics.json up to date; what is not measured stays as it is.
+
+    For example:
+      kgs eval fern-3
+      kgs eval fern-3 --lpips-weights weights
+
+    Args:
+        out: the output folder of `kgs fit`.
+        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is not measured.
+        device: cpu, cuda, ...
+    """
+    from kgs.json_files import read_json
+
+    from .metrics import measure_again
+    from .outputs import write_json
+    from .settings import load_fit
+
+    lpips = _prepare(device, lpips=lpips_weights)
+    saved, path = load_fit(out, device), out / "metrics.json"
+    scene = _load(saved.request)
+    metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
+    write_json(path, metrics)
+    _print_metrics(metrics)
+    say(f"{path} is up to date")
+    _next(
+        f"{_line('kgs', 'fit', saved.request['scene'], '-o', 'OUT', '--drop', '0')}  # to compare: without DropGaussian"
+    )
+
+
+def _prepare(device: str, *packages: str, lpips: Path | None = None) -> Any:
+    """Make sure before any work that device and packages are there; the perceptual metric, where it is asked for."""
+    from .machine import check_device
+
+    check_device(device)
+    for package in packages:
+        import_module(package)
+    if lpips is None:
+        return None
+    from .lpips import Lpips
+
+    return Lpips.load(lpips).to(device)
+
+
+def _load(request: dict[str, Any]) -> Any:
+    from kgs.datasets import load_scene
+
+    path, views, downscale = (request[name] for name in ("scene", "train_views", "downscale"))
+    scene = load_scene(path, views, downscale, background=request["background"], points=request["points"])
+    for note in scene.notes:
+        say(note)
+    return scene
+
+
+def _print_metrics(metrics: dict[str, Any]) -> None:
+    names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
+    for part in ("test", "train"):
+        values = metrics[part] or {}
+        shown = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
+        if shown:
+            say(f"{part:>5}: " + ", ".join(shown))
+
+
+def _line(*words: object) -> str:
+    return shlex.join(map(str, words))
+
+
+def _next(*steps: str) -> None:
+    """What a user may want to do now."""
+    say("\n  ".join(["next:", *steps]))
