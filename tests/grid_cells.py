@@ -4,21 +4,12 @@ import os
 import signal
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 
-@contextmanager
-def threads_instead(work, processes):
-    """Threads in the place of `grid.local_processes`, where it does not matter."""
-    with ThreadPoolExecutor(processes) as executor:
-        yield partial(executor.submit, work), lambda: processes
-
-
 def cells_in(log, count, kill=None, seconds=0.2):
-    """Cells that note in the folder `log`; `kill`: which of them kill their process, {x: "once" or "always"}."""
+    """Cells that note in the folder `log`; `kill`: which of them kill their process or fail, {x: "once", "always" or
+    "fail"}."""
     kill = kill or {}
     return [{"x": x, "log": str(log), "seconds": seconds, "kill": kill.get(x)} for x in range(count)]
 
@@ -27,6 +18,8 @@ def do(cell):
     log = Path(cell["log"])
     (log / f"process {os.getpid()}").touch()
     time.sleep(cell["seconds"])
+    if cell["kill"] == "fail":
+        raise ArithmeticError("three")
     killed = log / f"killed {cell['x']}"
     if cell["kill"] == "always" or (cell["kill"] == "once" and not killed.exists()):
         killed.touch()

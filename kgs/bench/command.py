@@ -11,7 +11,7 @@ __all__ = ["bench"]
 
 
 def bench(
-    what: Literal["speed", "precision", "training", "sparse", "starts", "extremes"],
+    what: Literal["speed", "precision", "training", "study", "starts", "extremes"],
     /,
     *,
     out: Annotated[Path, alias("-o")],
@@ -29,18 +29,18 @@ def bench(
             speed: time and memory of rendering and of training steps.
             precision: errors of images, gradients and footprints against time.
             training: test PSNR against time, one knob of the fit at a time (hours, goes on where it stopped).
-            sparse: DropGaussian on and off, its schedules and rivals, and the starts (goes on where it stopped).
+            study: DropGaussian on and off, its schedules and rivals, and the starts (goes on where it stopped).
             starts: depth errors, completeness and times of first points (20 minutes).
             extremes: errors, bounds and times of stiff and extreme cases; exit code 1 where a bound is missed.
-            With KGS_DATA, a folder of scenes, training, sparse and starts measure on real ones.
+            With KGS_DATA, a folder of scenes, training, study and starts measure on real ones.
         out: folder for the results.
-        quick: less of it, in about a minute; for sparse its preset of that name.
+        quick: less of it, in about a minute; for study its preset of that name.
         device: cpu, cuda, ... (speed).
-        processes: fits at a time; one a core unless given (training, sparse).
-        preset: sparse: quick, the default, takes minutes on the built-in scene; cpu hours on the five scenes of
+        processes: fits at a time; one a core unless given (training, study).
+        preset: study: quick, the default, takes minutes on the built-in scene; cpu hours on the five scenes of
             KGS_DATA; paper is the paper's 10 000 steps on every scene there in the size it has, for a large machine.
-        scheduler: sparse: address of a Dask scheduler whose workers run the cells.
-        lpips_weights: sparse: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
+        scheduler: training, study: address of a Dask scheduler whose workers run the cells.
+        lpips_weights: study: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
 
     Raises:
         ValueError: `quick` together with another preset.
@@ -54,15 +54,21 @@ def bench(
 
         precision(out=out, quick=quick)
     elif what == "training":
-        from .training import measure_training
+        from .study import training
 
-        measure_training(out, quick=quick, processes=processes)
-    elif what == "sparse":
-        from .sparse import measure_sparse
+        return training(out=out, quick=quick, processes=processes, scheduler=scheduler)
+    elif what == "study":
+        from .study import study
 
         if quick and preset not in (None, "quick"):
             raise ValueError(f"preset: expected none but quick together with --quick, got {preset!r}")
-        measure_sparse(out, preset or "quick", processes=processes, scheduler=scheduler, lpips_weights=lpips_weights)
+        return study(
+            out=out,
+            preset=preset or "quick",
+            processes=processes,
+            scheduler=scheduler,
+            lpips_weights=lpips_weights,
+        )
     elif what == "starts":
         from .starts import starts
 

@@ -2,20 +2,19 @@
 
 import json
 import math
+import re
+import subprocess
 from collections import Counter
 from dataclasses import replace
 
 import pytest
 import torch
-from grid_cells import threads_instead
 
 from kgs import DataError
-from kgs.bench import grid, sparse
-from kgs.bench import sparse_cell as sparse_cell_module
-from kgs.bench.coadaptation import coadaptation
-from kgs.bench.sparse import METHODS, SCENES, measure_sparse, sparse_cells
-from kgs.bench.sparse_cell import FULL, sparse_cell
-from kgs.bench.thresholds import BINS, count_over_threshold
+from kgs.bench.study import cells as cells_module
+from kgs.bench.study import presets, study
+from kgs.bench.study.cells import BINS, FULL, coadaptation, count_over_threshold, revision, sparse_cell
+from kgs.bench.study.presets import METHODS, SCENES, sparse_cells
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.starts import first_points
@@ -103,7 +102,9 @@ def test_a_cell_measures_and_repeats_bit_for_bit():
         assert result["init"]["kind"] == "sift"
         assert result["gaussians"] == sum(result["thresholds"]["gaussians"])
         assert len(result["test_views"]) == len(result["protocol"]["test"])
-        for key in ("wall_seconds", "cpu_seconds", "peak_rss_mb", "curve"):
+        assert result["config"]["drop"] == 0.2
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d", result["date"])
+        for key in ("wall_seconds", "cpu_seconds", "peak_rss_mb", "curve", "date", "revision"):
             result.pop(key)
         result["init"].pop("seconds")
     assert results[0] == results[1]
@@ -116,9 +117,9 @@ def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
         begun.append((config.drop, first.points))
         return Trainer(scene, config, first)
 
-    monkeypatch.setattr(sparse_cell_module, "Trainer", trainer)
+    monkeypatch.setattr(cells_module, "Trainer", trainer)
     for method, seed in (("off", 0), ("fixed 0.1", 0), ("off", 1)):
-        sparse_cell_module._start.cache_clear()  # as in another process
+        cells_module._start.cache_clear()  # as in another process
         sparse_cell(tiny_cell(method, seed, start="random"))
     (off, first), (drop, second), (_, other) = begun
     assert (off, drop) == (0.0, 0.1)
@@ -146,9 +147,9 @@ def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
         assert points == "model-points"
         return replace(loaded, points=(cloud - loaded.offset).float(), point_colors=torch.zeros(len(cloud), 3))
 
-    monkeypatch.setattr(sparse_cell_module, "load_scene", with_points)
-    few, first, _ = sparse_cell_module._start(str(folder.parent), folder.name, 2, None, FULL, 0)
-    _, other, _ = sparse_cell_module._start(str(folder.parent), folder.name, 2, None, FULL, 1)
+    monkeypatch.setattr(cells_module, "load_scene", with_points)
+    few, first, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 0)
+    _, other, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 1)
     assert len(first.points) == 10_000
     assert not torch.equal(first.points, other.points)
     nearest = torch.cdist(first.points[:100].double() + few.offset, cloud).amin(1)
@@ -174,43 +175,58 @@ def test_a_real_scene_needs_a_folder():
 # -- goes on -------------------------------------------------------------------------------------------------------
 
 
-def test_it_goes_on_and_reports(tmp_path, monkeypatch):
+def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
     cells = [tiny_cell("off"), tiny_cell("progressive 0.2"), tiny_cell("off", seed=1)]
-    monkeypatch.setattr(grid, "local_processes", threads_instead)
-    monkeypatch.setattr(sparse, "_quick_cells", lambda: cells[:2])
-    measure_sparse(tmp_path, processes=1, say=lambda line: None)
+    monkeypatch.setattr(presets, "_quick_cells", lambda: cells[:2])
+    study(out=tmp_path, scheduler=threads)
     before = (tmp_path / "sparse.jsonl").read_bytes()
-    monkeypatch.setattr(sparse, "_quick_cells", lambda: cells)
-    said = []
-    rows = measure_sparse(tmp_path, processes=1, say=said.append)
-    assert said[0].startswith("2 of 3 cells are there")
-    assert (tmp_path / "sparse.jsonl").read_bytes().startswith(before)
-    assert [row["cell"] for row in rows] == cells
+    monkeypatch.setattr(presets, "_quick_cells", lambda: cells)
+    capsys.readouterr()
+    study(out=tmp_path, scheduler=threads)
+    assert capsys.readouterr().out.startswith("2 of 3 cells are there")
+    content = (tmp_path / "sparse.jsonl").read_bytes()
+    assert content.startswith(before)
+    assert [json.loads(line)["cell"] for line in content.splitlines()] == cells
     report = (tmp_path / "sparse.md").read_text(encoding="utf-8")
-    assert "off" in report
-    assert "kgs bench sparse --preset quick -o OUT" in report
+    assert "kgs bench study --preset quick -o OUT" in report
+    assert "3 of 3 cells" in report
     assert (tmp_path / "index.html").exists()
 
 
-def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch):
-    monkeypatch.setattr(grid, "local_processes", threads_instead)
-    monkeypatch.setattr(sparse, "_quick_cells", lambda: [tiny_cell()])
-    measure_sparse(tmp_path, processes=1, say=lambda line: None)
+def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, threads):
+    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell()])
+    study(out=tmp_path, scheduler=threads)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    monkeypatch.setattr(sparse, "_quick_cells", lambda: [tiny_cell("fixed 0.1")])
-    with pytest.raises(DataError, match="expected cells of the preset 'quick'"):
-        measure_sparse(tmp_path, processes=1, say=lambda line: None)
+    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell("fixed 0.1")])
+    with pytest.raises(DataError, match="expected cells of --preset quick"):
+        study(out=tmp_path, scheduler=threads)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(sparse, "_quick_cells", lambda: [tiny_cell()])
-    monkeypatch.setattr(grid, "local_processes", threads_instead)
-    (row,) = measure_sparse(tmp_path, processes=1, say=lambda line: None)
-    with (tmp_path / "sparse.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
-    assert measure_sparse(tmp_path, processes=1, say=lambda line: None) == [row]
-    assert "cells: 1 of 1" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
+def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch, threads):
+    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell()])
+    study(out=tmp_path, scheduler=threads)
+    path = tmp_path / "sparse.jsonl"
+    path.write_bytes(2 * path.read_bytes())
+    study(out=tmp_path, scheduler=threads)
+    assert "1 of 1 cells" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
+
+
+def test_the_commit_of_a_file(tmp_path):
+    def git(*arguments):
+        name = ("-c", "user.name=a", "-c", "user.email=a@b.example")
+        subprocess.run(["git", "-C", tmp_path, *name, *arguments], check=True, capture_output=True)
+
+    path = tmp_path / "sparse.jsonl"
+    path.write_text("{}\n")
+    assert revision(path) is None
+    git("init")
+    assert revision(path) is None
+    git("add", ".")
+    git("commit", "-m", "a", "--date", "2026-01-02T03:04:05Z")
+    assert re.fullmatch(r"[0-9a-f]{7,} of \d{4}-\d\d-\d\d", revision(path))
+    path.write_text("{}\n{}\n")
+    assert revision(path).endswith(" and later changes")
 
 
 # -- the probe of co-adaptation ------------------------------------------------------------------------------------

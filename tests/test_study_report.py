@@ -3,75 +3,26 @@
 import base64
 import csv
 import math
-import random
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from study_rows import ABLATIONS, MAIN, full, made_up, psnrs, student
 
-from kgs.bench.output import html_table, latex_escape, latex_table
-from kgs.bench.sparse import METHODS
-from kgs.bench.sparse_groups import EQUAL_MEAN_RATE, FAMILIES
-from kgs.bench.sparse_plots import STYLES
-from kgs.bench.sparse_report import write_report
-from kgs.bench.statistics import student_quantile
+pytest.importorskip("pandas")
+
+from kgs import __version__
+from kgs.bench.study.plots import STYLES
+from kgs.bench.study.presets import EQUAL_MEAN_RATE, FAMILIES, METHODS
+from kgs.bench.study.report import _escape, write_report
 
 TEXTS = ("sparse.csv", "summary.csv", "sparse.md", "sparse.tex", "index.html")
 PLOTS = ("forest.png", "curves.png", "gap.png", "cost.png", "coadaptation.png", "thresholds.png")
-MAIN = ("off", "progressive 0.2", "fixed 0.1")
-ABLATIONS = ("progressive 0.3", "fixed 0.15", "fixed 0.3", "near", "far", "L1 gradient 0.01")
-
-
-def made_up(scene, views, start, method, seed, lpips=True):
-    cell = {"scene": scene, "views": views, "start": start, "method": method, "seed": seed, "downscale": 2.0}
-    draw = random.Random(repr(cell))
-    psnr = draw.uniform(20, 25)
-
-    def quality(value):
-        parts = {"ssim": 30, "ssim_zero_padded": 31, "lpips_vgg": 100, "lpips_vgg_unscaled": 110}
-        return {"psnr": value} | {k: value / d if lpips or "ssim" in k else None for k, d in parts.items()}
-
-    counts = [0, *(draw.randint(50, 100) for _ in range(5))]  # nothing in the nearest bin
-    curve = [{"step": k, "seconds": k / 10, "test_psnr": psnr - 1 / k, "train_psnr": psnr} for k in (500, 1000, 2000)]
-    return {
-        "cell": cell | {"fit": {"steps": 2000, "drop": 0.2}},
-        "result": {
-            "test": quality(psnr),
-            "train": quality(psnr + draw.uniform(4, 8)),
-            "test_views": {"a_b.png": psnr},
-            "curve": curve,
-            "init": {"kind": "random" if start == "scene" else start, "points": 10_000, "seconds": 17.2},
-            "gaussians": 20_000,
-            "wall_seconds": draw.uniform(100, 200),
-            "cpu_seconds": draw.uniform(200, 300),
-            "peak_rss_mb": 600,
-            "coadaptation": draw.uniform(1e-3, 2e-3),
-            "thresholds": {"distance": [*range(7)], "gaussians": counts, "over": [count // 3 for count in counts]},
-            "protocol": {"train": ["a"] * views, "test": ["b", "c"], "image_size": [189, 252]},
-            "versions": {"kgs": "0.1.0", "machine": "x86_64, 2 cores"},
-        },
-    }
-
-
-def full(**options):
-    """Every table and plot has something to show."""
-    settings = (("llff/fern", 3, "dense"), ("llff/flower", 3, "dense"), ("blender/lego", 8, "dense"))
-    cells = [(*setting, method, seed) for setting in settings for method in MAIN for seed in range(3)]
-    cells += [("llff/fern", 3, "dense", method, seed) for method in reversed(ABLATIONS) for seed in (0, 1)]
-    cells += [("llff/fern", 3, start, "progressive 0.2", seed) for start in ("sift", "model-points") for seed in (0, 1)]
-    cells += [("blender/lego", 8, "scene", method, seed) for method in MAIN for seed in range(3)]
-    cells += [(scene, 6, "dense", method, 0) for scene in ("llff/fern", "llff/flower") for method in MAIN[:2]]
-    return [made_up(*cell, **options) for cell in cells]
-
-
-def psnrs(rows, scene, method, views=3):
-    wanted = [scene, views, "dense", method]
-    return [row["result"]["test"]["psnr"] for row in rows if list(row["cell"].values())[:4] == wanted]
 
 
 def interval(differences, decimals=2):
-    half = student_quantile(len(differences) - 1) * np.std(differences, ddof=1) / math.sqrt(len(differences))
+    half = student(len(differences) - 1) * np.std(differences, ddof=1) / math.sqrt(len(differences))
     mean = np.mean(differences)
     return f"{mean:+.{decimals}f} [{mean - half:+.{decimals}f}, {mean + half:+.{decimals}f}]"
 
@@ -104,11 +55,12 @@ class Balanced(HTMLParser):
 
 
 def assert_latex_is_sound(text):
+    text = re.sub("^%.*\n", "", text, flags=re.MULTILINE)
     bare = re.sub(r"\\[\\{}&%$#_]", "", text)
     assert bare.count("{") == bare.count("}")
     assert bare.count("$") % 2 == 0
     assert not re.search(r"[#%_^~]", bare)
-    for environment in ("table", "tabular", "itemize"):
+    for environment in ("table", "tabular"):
         assert text.count(rf"\begin{{{environment}}}") == text.count(rf"\end{{{environment}}}")
     for columns, body in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", text, re.DOTALL):
         for line in re.findall(r"(.*?) \\\\", body):
@@ -135,9 +87,9 @@ def reports(tmp_path_factory):
     """The report on each case: its folder, and what was returned."""
     folder = tmp_path_factory.mktemp("reports") / "new"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.sparse_plots.DPI", 40)  # time
+        patch.setattr("kgs.bench.study.plots.DPI", 40)  # time
         return {
-            name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench sparse --preset cpu", 99))
+            name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench study --preset cpu", 99))
             for k, (name, rows) in enumerate(CASES.items())
         }
 
@@ -167,7 +119,7 @@ def test_every_part_of_the_study_gives_sound_files(case, reports):
     assert len(page.images) == len(drawn)
     pictures = {(out / name).read_bytes() for name in drawn}
     assert pictures == {base64.b64decode(image.removeprefix("data:image/png;base64,")) for image in page.images}
-    assert not re.search(r"https?://|<script|<link", (out / "index.html").read_text())
+    assert not re.search(r"<script|<link|@import|src=\"(?!data:)", (out / "index.html").read_text())
     tables = [line for line in text.splitlines() if line.startswith("|")]
     assert page.rows == len(tables) - sum(line.startswith("| ---") for line in tables)
 
@@ -194,8 +146,8 @@ def test_plots_without_data_are_left_out(reports, tmp_path):
 
 
 def test_the_same_rows_give_the_same_bytes(reports, tmp_path, monkeypatch):
-    monkeypatch.setattr("kgs.bench.sparse_plots.DPI", 40)
-    write_report(CASES["one cell"], tmp_path, "kgs bench sparse --preset cpu", 99)
+    monkeypatch.setattr("kgs.bench.study.plots.DPI", 40)
+    write_report(CASES["one cell"], tmp_path, "kgs bench study --preset cpu", 99)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (reports["one cell"][0] / path.name).read_bytes()
 
@@ -226,13 +178,16 @@ def test_means_over_scenes(markdown):
     assert row[3] == f"{paper.mean():.2f} ({paper.mean(0).std(ddof=1):.2f})"
     assert row[4] == f"{paper.mean(0).max():.2f}"
     differences = paper - off
-    half = student_quantile(6) * math.sqrt(differences.var(1, ddof=1).mean() / 9)
+    half = student(6) * math.sqrt(differences.var(1, ddof=1).mean() / 9)
     mean = differences.mean()
     assert row[5] == f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] (9)"
     assert row[9:] == ["-", "-"]  # the paper has no such mean
     (llff,) = lines(markdown, "Test views", "mean of 2 LLFF scenes (fern, flower)", "progressive 0.2")
     assert llff[9:] == ["20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207", "+1.54 or +1.34"]
-    assert f"progressive 0.2 over off: {row[5].removesuffix(' (9)')} dB" in markdown
+    sentence = next(line for line in markdown.splitlines() if line.startswith("- The paper's rule (progressive 0.2) over"))
+    assert f"no dropping (off): {row[5].removesuffix(' (9)')} dB" in sentence
+    assert f"standard deviation of a pair: {math.sqrt(differences.var(1, ddof=1).mean()):.2f} dB" in sentence
+    assert f"fern {interval(differences[0])}; flower" in sentence
 
 
 def test_other_tables(markdown):
@@ -265,7 +220,7 @@ def test_other_tables(markdown):
     squares = sum(np.var(values) * len(values) for values in groups.values())
     (noise,) = lines(markdown, "Noise between seeds", "all cells", "PSNR [dB]")
     sd = math.sqrt(squares / freedom)
-    assert noise[3:6] == [str(freedom), f"{sd:.3f}", f"{student_quantile(freedom) * math.sqrt(2) * sd:.3f}"]
+    assert noise[3:6] == [str(freedom), f"{sd:.3f}", f"{student(freedom) * math.sqrt(2) * sd:.3f}"]
     fern = [r["result"] for r in rows if list(r["cell"].values())[:4] == ["llff/fern", 3, "dense", "off"]]
     (cost,) = lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense", "off")
     methods = [row[1] for row in lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense")]
@@ -302,12 +257,28 @@ def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
         write_report([*rows, longer], tmp_path, "command", 2)
 
 
-def test_text_is_escaped():
-    assert latex_escape("a_b & 5 % {x} #1 \\ $ ~ ^") == (
-        r"a\_b \& 5 \% \{x\} \#1 \textbackslash{} \$ \textasciitilde{} \textasciicircum{}"
-    )
-    assert latex_escape("-0.5 [-1, 2] fixed-0 --preset <3") == r"$-$0.5 {[}$-$1, 2] fixed-0 -{}-preset $<$3"
-    table = latex_table("100 %", ["b_c"], [["[x]", "-1"]], first="a")
-    assert_latex_is_sound(table)
-    assert r"{[}x] & $-$1 \\" in table
-    assert '<th scope="row">a &lt;b&gt;</th><td>&amp;</td>' in html_table("t", ["c"], [["a <b>", "&"]])
+def test_text_is_escaped(tmp_path):
+    assert _escape("a_b & 5 % {x} #1 $ ~ ^") == r"a\_b \& 5 \% \{x\} \#1 \$ \textasciitilde{} \textasciicircum{}"
+    assert _escape("-0.5 [-1, 2] fixed-0 <3") == r"$-$0.5 {[}$-$1, 2] fixed-0 $<$3"
+    write_report(CASES["unknown method, no LPIPS"], tmp_path, "kgs <b>", 2)
+    assert "<b>" not in (tmp_path / "index.html").read_text()
+
+
+def test_the_page_can_be_cited(reports):
+    page = (reports["full"][0] / "index.html").read_text()
+    assert "@software{kgs," in page
+    assert "@inproceedings{park2025dropgaussian," in page
+    assert f"version = {{{__version__}}}" in page
+    for link in ("arxiv.org/abs/2504.00773", "LICENSE-2.0", "bmild.github.io/llff", "NVlabs/instant-ngp"):
+        assert f"{link}" in page
+    assert page.index("over no dropping (off): ") < page.index("<table")
+
+
+def test_commits_and_dates_of_the_cells_are_named(tmp_path):
+    rows = [made_up("llff/fern", 3, "dense", "off", seed) for seed in range(3)]
+    for row, day in zip(rows[:2], (3, 1), strict=True):
+        row["result"] |= {"date": f"2026-12-0{day}", "revision": "1a2b3c4 of 2026-11-30"}
+    text = write_report(rows, tmp_path, "command", 5)
+    assert "Figures: 3 of 5 cells; " in text
+    assert "2026-12-01 to 2026-12-03" in text
+    assert "1a2b3c4 of 2026-11-30" in text

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -10,10 +11,10 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from grid_cells import cells_in, do, processes_left, threads_instead, times_done
+from grid_cells import cells_in, do, processes_left, times_done
 
-from kgs.bench import grid, workers
-from kgs.bench.grid import read_rows, run_grid
+from kgs.bench.study import grid
+from kgs.bench.study.grid import read_rows, run_grid
 
 CELLS = [{"x": x, "name": "a"} for x in range(6)]
 
@@ -22,30 +23,17 @@ def square(cell):
     return {"y": cell["x"] ** 2}
 
 
-def fails_on_three(cell):
-    if cell["x"] == 3:
-        raise ArithmeticError("three")
-    return square(cell)
-
-
 def quiet(_):
     pass
 
 
-@pytest.fixture
-def threads(monkeypatch):
-    """Threads in the place of local processes, where it does not matter."""
-    monkeypatch.setattr(grid, "local_processes", threads_instead)
-
-
 @pytest.fixture(scope="module")
 def cluster():
-    """A Dask cluster of two worker processes, which gives a cell up when its second worker dies."""
-    dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
+    """A Dask cluster of two worker processes."""
+    distributed = pytest.importorskip("distributed")
     with (
         mock.patch.dict(os.environ),  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
-        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
-        distributed.LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        distributed.LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster,
     ):
         yield cluster
 
@@ -58,48 +46,36 @@ def where(request):
     return {"scheduler": request.getfixturevalue("cluster").scheduler_address}
 
 
-@pytest.mark.usefixtures("threads")
-def test_rows_come_in_the_order_of_the_cells(tmp_path):
-    def slow_first(cell):
-        time.sleep(0.05 if cell["x"] == 0 else 0.0)
-        return square(cell)
-
-    rows = run_grid(CELLS, slow_first, tmp_path / "g.jsonl", say=quiet)
-    assert [row["result"]["y"] for row in rows] == [x**2 for x in range(6)]
-    assert len(read_rows(tmp_path / "g.jsonl")) == 6
+def test_rows_come_in_the_order_of_the_cells(tmp_path, threads):
+    cells = [{"x": x, "log": str(tmp_path), "seconds": 0.3 * (x == 0), "kill": None} for x in range(4)]
+    rows = run_grid(cells, do, tmp_path / "g.jsonl", scheduler=threads, say=quiet)
+    assert [row["result"]["y"] for row in rows] == [0, 1, 4, 9]
+    assert [row["cell"]["x"] for row in read_rows(tmp_path / "g.jsonl")][-1] == 0
 
 
-@pytest.mark.usefixtures("threads")
-def test_finished_cells_are_not_repeated(tmp_path):
-    path, calls = tmp_path / "results" / "g.jsonl", []
-
-    def noted(cell):
-        calls.append(cell["x"])
-        return square(cell)
-
-    run_grid(CELLS[:4], noted, path, say=quiet)
-    rows = run_grid([dict(reversed(cell.items())) for cell in CELLS], noted, path, say=quiet)
-    assert sorted(calls) == list(range(6))
+def test_finished_cells_are_not_repeated(tmp_path, threads):
+    path, cells = tmp_path / "results" / "g.jsonl", cells_in(tmp_path, 6, seconds=0)
+    run_grid(cells[:4], do, path, scheduler=threads, say=quiet)
+    rows = run_grid([dict(reversed(cell.items())) for cell in cells], do, path, scheduler=threads, say=quiet)
+    assert times_done(tmp_path) == dict.fromkeys(range(6), 1)
     assert [row["cell"]["x"] for row in rows] == list(range(6))
 
 
-@pytest.mark.usefixtures("threads")
-def test_a_line_cut_short_is_done_again(tmp_path):
+def test_a_line_cut_short_is_done_again(tmp_path, threads):
     path = tmp_path / "g.jsonl"
-    run_grid(CELLS, square, path, say=quiet)
+    run_grid(CELLS, square, path, scheduler=threads, say=quiet)
     content = path.read_text()
     path.write_text(content[:-9])
     assert len(read_rows(path)) == 5
-    rows = run_grid(CELLS, square, path, say=quiet)
+    rows = run_grid(CELLS, square, path, scheduler=threads, say=quiet)
     assert [row["result"]["y"] for row in rows] == [x**2 for x in range(6)]
     assert sorted(path.read_text().splitlines()) == sorted(content.splitlines())
 
 
-@pytest.mark.usefixtures("threads")
-def test_a_whole_last_line_without_its_end_is_kept(tmp_path):
+def test_a_whole_last_line_without_its_end_is_kept(tmp_path, threads):
     path = tmp_path / "g.jsonl"
     path.write_text(json.dumps({"cell": CELLS[0], "result": {"y": 7}}))
-    rows = run_grid(CELLS[:2], square, path, say=quiet)
+    rows = run_grid(CELLS[:2], square, path, scheduler=threads, say=quiet)
     assert [row["result"]["y"] for row in rows] == [7, 1]
     assert len(path.read_text().splitlines()) == 2
 
@@ -111,34 +87,32 @@ def test_a_damaged_line_before_the_last_is_an_error(tmp_path):
         read_rows(path)
 
 
-@pytest.mark.usefixtures("threads")
-@pytest.mark.usefixtures("threads")
-def test_a_file_belongs_to_one_run_at_a_time(tmp_path):
-    pytest.importorskip("fcntl")
-    path = tmp_path / "rows.jsonl"
+def test_a_file_belongs_to_one_run_at_a_time(tmp_path, threads):
+    path, refused = tmp_path / "rows.jsonl", []
 
-    def second(cell):
-        with pytest.raises(ValueError, match=r"rows\.jsonl: expected no other run"):
-            run_grid(CELLS, square, path, say=quiet)
-        return square(cell)
+    def second(line):
+        with pytest.raises(ValueError, match=r"rows\.jsonl: expected no other run") as error:
+            run_grid(CELLS, square, path, scheduler=threads, say=quiet)
+        refused.append(error)
 
-    assert len(run_grid(CELLS, second, path, say=quiet)) == len(CELLS)
-    assert len(run_grid(CELLS, fails_on_three, path, say=quiet)) == len(CELLS)
+    assert len(run_grid(CELLS, square, path, scheduler=threads, say=second)) == len(CELLS)
+    assert len(refused) == 1 + len(CELLS)  # each time that the first run said something
+    assert len(read_rows(path)) == len(CELLS)
 
 
-def test_a_failing_cell_stops_no_other(tmp_path):
-    path = tmp_path / "g.jsonl"
+def test_a_failing_cell_stops_no_other(tmp_path, threads):
+    path, cells = tmp_path / "g.jsonl", cells_in(tmp_path, 6, kill={3: "fail"}, seconds=0)
     with pytest.raises(RuntimeError, match=r"1 of 6 cells failed.*three"):
-        run_grid(CELLS, fails_on_three, path, say=quiet)
+        run_grid(cells, do, path, scheduler=threads, say=quiet)
     assert sorted(row["cell"]["x"] for row in read_rows(path)) == [0, 1, 2, 4, 5]
-    assert len(run_grid(CELLS, square, path, say=quiet)) == 6
+    assert len(run_grid(cells, square, path, scheduler=threads, say=quiet)) == 6
 
 
 def test_a_process_that_dies_takes_no_other_cell_with_it(tmp_path, where):
     """Its cell is done again, and no other twice; a cell that always kills fails alone."""
-    killer = 5 if "scheduler" in where else 3  # two local processes die at once
+    killer = 3  # two workers die at once
     path, cells = tmp_path / "g.jsonl", cells_in(tmp_path, 7, kill={2: "once", killer: "always"})
-    error = rf'1 of 7 cells failed.*"x": {killer}\}}: (BrokenProcessPool|KilledWorker): '
+    error = rf'1 of 7 cells failed.*"x": {killer}\}}: RuntimeError: the worker died'
     with pytest.raises(RuntimeError, match=error):
         run_grid(cells, do, path, say=quiet, **where)
     others = set(range(7)) - {killer}
@@ -165,12 +139,12 @@ def test_an_interrupt_leaves_nothing_at_the_scheduler(tmp_path, cluster):
 @pytest.mark.parametrize(
     "number", [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGINT))]
 )
-def test_a_killed_grid_leaves_no_process_and_goes_on(tmp_path, monkeypatch, number):
+def test_a_killed_grid_leaves_no_process_and_goes_on(tmp_path, monkeypatch, threads, number):
     path, cells = tmp_path / "g.jsonl", cells_in(tmp_path, 5, seconds=0.5)
     script = f"""
 from pathlib import Path
 from grid_cells import do
-from kgs.bench.grid import run_grid
+from kgs.bench.study.grid import run_grid
 run_grid({cells!r}, do, Path({str(path)!r}))
 """
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
@@ -184,18 +158,19 @@ run_grid({cells!r}, do, Path({str(path)!r}))
     assert not processes_left(tmp_path)
     kept = {row["cell"]["x"] for row in read_rows(path)}
     assert len(kept) < 5
-    monkeypatch.setattr(grid, "local_processes", threads_instead)
-    run_grid(cells, do, path, say=quiet)
+    run_grid(cells, do, path, scheduler=threads, say=quiet)
     assert times_done(tmp_path).keys() == set(range(5))
     assert {times_done(tmp_path)[x] for x in kept} == {1}
 
 
 def test_an_address_where_no_scheduler_answers(tmp_path, monkeypatch, cluster):
-    monkeypatch.setattr(workers, "_PATIENCE", 0.5)
+    monkeypatch.setattr(grid, "PATIENCE", 0.5)
     worker = cluster.workers[0].worker_address
-    for address in ("tcp://127.0.0.1:1", "127.0.0.1", "nonsense", worker):
-        with pytest.raises(ValueError, match=f"^scheduler: expected .* Dask scheduler.*, got '{address}'"):
-            run_grid(CELLS, square, tmp_path / "g.jsonl", scheduler=address, say=quiet)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # takes connections and says nothing, as a web server does
+        mute = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        for address in ("tcp://127.0.0.1:1", "127.0.0.1", "nonsense", worker, mute):
+            with pytest.raises(ValueError, match=f"^scheduler: expected .* Dask scheduler.*, got '{address}'"):
+                run_grid(CELLS, square, tmp_path / "g.jsonl", scheduler=address, say=quiet)
 
 
 def test_wrong_arguments(tmp_path):

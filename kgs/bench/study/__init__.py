@@ -1,0 +1,87 @@
+"""The study of sparse views, and of the fit's own knobs: grids of fits whose finished cells are kept."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from kgs.errors import DataError
+from kgs.options import alias
+
+__all__ = ["study", "training"]
+
+
+def study(
+    *,
+    out: Annotated[Path, alias("-o")],
+    preset: Literal["quick", "cpu", "paper"] = "quick",
+    processes: int | None = None,
+    scheduler: str | None = None,
+    lpips_weights: Path | None = None,
+) -> int:
+    """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
+
+    Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. The scenes lie in the
+    folder of the environment variable KGS_DATA. For many machines: `dask scheduler` on one,
+    `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
+
+    Args:
+        out: folder for the results; cells that its sparse.jsonl has are not repeated.
+        preset: quick takes minutes on the built-in scene; cpu hours on the five scenes of KGS_DATA; paper is the
+            paper's 10 000 steps on every scene there in the size it has, for a large machine.
+        processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
+        scheduler: address of a Dask scheduler whose workers run the cells instead; they find scenes and weights under
+            the same paths.
+        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out, for good: a cell that
+            is there is not measured again.
+
+    Raises:
+        DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
+    """
+    from .cells import sparse_cell
+    from .grid import finished_rows, read_rows, run_grid
+    from .presets import sparse_cells
+    from .report import write_report
+
+    folder = os.environ.get("KGS_DATA")
+    cells = sparse_cells(preset, None if folder is None else Path(folder))
+    data, weights = (None if path is None else os.path.abspath(path) for path in (folder, lpips_weights))
+    path = out / "sparse.jsonl"
+    if read_rows(path) and not finished_rows(cells, path):
+        raise DataError(path, "", f"expected cells of --preset {preset}, got others; give each preset its own folder")
+    try:
+        work = partial(sparse_cell, data=data, lpips_weights=weights)
+        run_grid(cells, work, path, scheduler=scheduler, processes=processes)
+    finally:
+        if rows := finished_rows(cells, path):
+            scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
+            weighed = "" if lpips_weights is None else " --lpips-weights WEIGHTS"
+            write_report(rows, out, f"{scenes}kgs bench study --preset {preset}{weighed} -o OUT", len(cells))
+    return 0
+
+
+def training(
+    *,
+    out: Annotated[Path, alias("-o")],
+    quick: bool = False,
+    processes: int | None = None,
+    scheduler: str | None = None,
+) -> int:
+    """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
+
+    Writes training.jsonl, training.csv, training.md and training.png. With KGS_DATA, a folder of scenes, also on fern.
+
+    Args:
+        out: folder for the results; cells that its training.jsonl has are not repeated.
+        quick: two tiny cells, to see that it works.
+        processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
+        scheduler: address of a Dask scheduler whose workers run the cells instead.
+    """
+    from .grid import run_grid
+    from .knobs import fit_cell, knob_cells, write_knobs
+
+    rows = run_grid(knob_cells(quick), fit_cell, out / "training.jsonl", scheduler=scheduler, processes=processes)
+    print(write_knobs(rows, out))
+    return 0

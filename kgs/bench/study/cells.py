@@ -1,0 +1,226 @@
+"""One cell of the study: one fit, everything that the report says of it, and two probes of the fitted model.
+
+Sources: the probe of co-adaptation is that of "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian
+Splatting" (NeurIPS 2025, arXiv 2508.12720); the Gaussians over the threshold are the DropGaussian paper's own evidence.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+import warnings
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+import kgs
+from kgs.bench.scenes import SYNTHETIC
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.scene import Scene, Views
+from kgs.errors import DataError
+from kgs.fit.config import FitConfig
+from kgs.fit.lpips import Lpips
+from kgs.fit.metrics import MEASURES
+from kgs.fit.outputs import peak_rss_mb
+from kgs.fit.run import choose_points, measure
+from kgs.fit.starts import FirstPoints
+from kgs.fit.starts.triangulate import camera_centers
+from kgs.fit.trainer import Trainer
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
+
+__all__ = ["coadaptation", "count_over_threshold", "fit_and_measure", "revision", "sparse_cell"]
+
+SIZE = (72, 96)  # of the synthetic pictures
+FULL = "full-model"  # a start that no fit may have: the upper bound
+_FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
+COVERED = 0.8  # alpha from which a pixel counts, in every subset
+BINS = 6
+
+
+def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
+    """Fit once and measure.
+
+    Fits of the same scene, views, start and seed begin with the same points and see the views in the same order.
+
+    Args:
+        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
+            "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test views),
+            "method" (a name, for the report), "seed", and "fit", the fields of FitConfig that are not the default's.
+        data: the folder of the scenes, where the cell runs.
+        lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
+
+    Returns:
+        Plain values: means of the measures under "test" and "train", "test_views" (PSNR of each), "init",
+        "coadaptation", "thresholds", "protocol", and what `fit_and_measure` gives.
+
+    Raises:
+        DataError: the scene is not there or damaged.
+    """
+    scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
+    lpips = None if lpips_weights is None else _lpips(lpips_weights)
+    trainer, metrics, result = fit_and_measure(scene, _config(cell["start"], cell["seed"], **cell["fit"]), points, lpips)
+    return result | {
+        **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
+        "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
+        "init": {**trainer.init, "seconds": round(seconds, 2)},
+        "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
+        "thresholds": count_over_threshold(trainer, points.points),
+        "protocol": metrics["protocol"] | ({"init": _FULL_MODEL} if cell["start"] == FULL else {}),
+    }
+
+
+def fit_and_measure(
+    scene: Scene, config: FitConfig, points: FirstPoints, lpips: Lpips | None = None
+) -> tuple[Trainer, dict[str, Any], dict[str, Any]]:
+    """Fit once.
+
+    Returns:
+        The fit, its metrics, and what every cell stores of it: "curve", "gaussians", "wall_seconds" of the training,
+        "cpu_seconds" of the training and its curve, "peak_rss_mb", "config" (all settings of the fit), "versions",
+        "revision" (of the package) and "date" (UTC).
+    """
+    trainer = Trainer(scene, config, points)
+    start = time.process_time()
+    trainer.fit()
+    cpu_seconds = time.process_time() - start
+    metrics = measure(trainer, lpips)
+    return trainer, metrics, {
+        "curve": trainer.curve,
+        "gaussians": len(trainer.model),
+        "wall_seconds": round(trainer.seconds, 2),
+        "cpu_seconds": round(cpu_seconds, 2),
+        "peak_rss_mb": peak_rss_mb(),
+        "config": config.to_dict(),
+        "versions": metrics["versions"],
+        "revision": revision(Path(kgs.__file__).parent),
+        "date": datetime.now(UTC).date().isoformat(),
+    }  # fmt: skip
+
+
+def revision(path: Path) -> str | None:
+    """The commit that last changed a file or folder, as "1a2b3c4 of 2026-11-22"; None where git does not know it."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(path.parent), *arguments, "--", path.name]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        commit, changes = git("log", "-1", "--format=%h of %cs"), git("status", "--porcelain")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit + (" and later changes" if changes else "") if commit else None
+
+
+@lru_cache(maxsize=1)  # cells of one start follow each other
+def _start(
+    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int
+) -> tuple[Scene, FirstPoints, float]:
+    """A scene, its first points, and the processor's seconds that they took."""
+    if name == SYNTHETIC:
+        scene = synthetic_scene(train_views=views, size=SIZE)
+    elif data is None:
+        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+    else:
+        kind = "model-points" if start == "model-points" else "none"
+        scene = load_scene(Path(data) / name, views, downscale, points=kind)
+    begin = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a start that fell back says so by its kind
+        points = _full_model(scene, seed) if start == FULL else choose_points(scene, _config(start, seed))
+    return scene, points, time.process_time() - begin
+
+
+def _config(start: str, seed: int, **fit: Any) -> FitConfig:
+    return FitConfig(init="model-points" if start == FULL else start, seed=seed, **fit)
+
+
+def _full_model(scene: Scene, seed: int) -> FirstPoints:
+    """Points of the model that two photos observe, also such as lie between the fit's few views; no test views."""
+    everything = load_scene(scene.root, points="model-points")
+    chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
+    points = everything.points[chosen].double() + (everything.offset - scene.offset)
+    return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
+
+
+@lru_cache(maxsize=1)
+def _lpips(weights: str) -> Lpips:
+    return Lpips.load(weights)
+
+
+class _RandomHalf(nn.Module):
+    """Switches half of the Gaussians off, in `eval()` too, and leaves the others as they are."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def forward(self, opacities: Tensor) -> Tensor:
+        kept = torch.rand(opacities.shape, generator=self.generator) < 0.5
+        return opacities * kept.to(opacities)
+
+
+@torch.no_grad()
+def coadaptation(
+    model: GaussianModel, views: Views, *, near_plane: float = 0.01, subsets: int = 5, seed: int = 0
+) -> float | None:
+    """How much Gaussians rely on each other: the variance of renders of random halves, 0 where all halves look alike.
+
+    Args:
+        model: the Gaussians, on the CPU.
+        views: from where to look; their images are not used.
+        near_plane: of the renderer, in world units.
+        subsets: how many halves per view, at least 2. The opacities of those that stay are not raised.
+        seed: of the halves; each view has others.
+
+    Returns:
+        The variance between subsets (of clamped renders, unbiased), mean over channels and over the pixels of all views
+        that have an alpha above 0.8 in every subset; None where there are no such pixels.
+
+    Raises:
+        ValueError: fewer than two subsets.
+    """
+    if subsets < 2:
+        raise ValueError(f"subsets: expected at least 2, got {subsets}")
+    renderer = GaussianRenderer(_RandomHalf(seed), near_plane=near_plane).eval()
+    total, pixels = 0.0, 0
+    gaussians = model()
+    for view in range(len(views)):
+        halves = [renderer(gaussians, views.camera(view), outputs=("image", "alpha")) for _ in range(subsets)]
+        covered = (torch.stack([half.alpha[0, 0] for half in halves]) > COVERED).all(0)
+        images = torch.stack([half.image[0].clamp(0, 1) for half in halves]).double()
+        total += float(images.var(0).mean(0)[covered].sum())
+        pixels += int(covered.sum())
+    return total / pixels if pixels else None
+
+
+def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, Any]:
+    """Count Gaussians, and those whose mean gradient is over the densification threshold, by distance.
+
+    The distance is that to the nearest training camera, in medians of the first points' distances; the edges are
+    quantiles of these, so that fits that begin alike are counted alike. What lies beyond the outer edges counts in the
+    outer bins. Where a fit is at its limit of Gaussians, those count that it could not densify.
+
+    Args:
+        trainer: a fit, with what its densifier has seen since the last densification.
+        first_points: where it began, `(P, 3)`.
+
+    Returns:
+        "distance": edges of the bins; "gaussians" and "over": a count for each bin.
+    """
+    centers = camera_centers(trainer.scene.train.cameras)
+    first, now = (
+        torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in (first_points, trainer.model.means)
+    )
+    edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
+    bins = torch.bucketize(now, edges[1:-1])
+    over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
+    return {
+        "distance": [round(float(edge / first.median()), 4) for edge in edges],
+        "gaussians": torch.bincount(bins, minlength=BINS).tolist(),
+        "over": torch.bincount(bins[over], minlength=BINS).tolist(),
+    }

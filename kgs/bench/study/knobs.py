@@ -1,0 +1,132 @@
+"""Held-out quality against training time: one knob of the fit at a time, around the default."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from kgs.bench.output import markdown_table, mean_sd
+from kgs.bench.scenes import SYNTHETIC, check_scenes
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.fit.config import FAST, FitConfig
+from kgs.fit.run import choose_points
+
+from .cells import fit_and_measure
+from .grid import Cell
+
+__all__ = ["KNOBS", "fit_cell", "knob_cells", "write_knobs"]
+
+# The default of each stands in FitConfig; where None means the rule there, it is the default here too.
+KNOBS: dict[str, tuple[Any, ...]] = {
+    "steps": (500, 1000),
+    "coarse": (0.5,),
+    "growth": (0.8,),
+    "sh_degree": (0, 1),
+    "max_gaussians": (5_000, 10_000),
+    "drop": (0.0, 0.1, 0.3),
+}
+# What the table shows: head and decimals.
+COLUMNS = {
+    "psnr": ("PSNR [dB]", 2),
+    "gain": ("over the default", 2),
+    "ssim": ("SSIM", 3),
+    "train_psnr": ("PSNR of training views", 1),
+    "cpu_seconds": ("CPU seconds", 0),
+    "gaussians": ("Gaussians", 0),
+}
+SIZE = (126, 168)  # of the synthetic pictures
+
+
+def knob_cells(quick: bool = False) -> list[Cell]:
+    """The default, `--fast`, and each other value of each knob, with three seeds, on the built-in scene and on fern.
+
+    Args:
+        quick: two tiny cells instead.
+
+    Raises:
+        DataError: the folder of KGS_DATA lacks fern. Where the variable is not set fern is left out.
+    """
+    if quick:
+        return [{"scene": SYNTHETIC, "seed": 0, "steps": steps, "max_gaussians": 1000} for steps in (20, 40)]
+    scenes = [SYNTHETIC]
+    if "KGS_DATA" in os.environ:
+        check_scenes(Path(os.environ["KGS_DATA"]), ["llff/fern"])
+        scenes.append("fern")
+    settings: list[Cell] = [{}, {"fast": True}]
+    settings += [{knob: value} for knob, values in KNOBS.items() for value in values]
+    return [{"scene": scene, "seed": seed, **setting} for seed in range(3) for setting in settings for scene in scenes]
+
+
+def fit_cell(cell: Cell) -> dict[str, Any]:
+    """One fit.
+
+    Args:
+        cell: `scene`, "synthetic" or "fern" (found through KGS_DATA); `fast` where the fit starts from that setting and
+            not from the default; the rest are fields of FitConfig. The fit begins with SIFT points unless "init" says
+            otherwise.
+    """
+    settings = FAST if cell.get("fast") else FitConfig()
+    turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
+    config = FitConfig.from_dict(settings.to_dict() | {"init": "sift"} | turned)
+    if cell["scene"] == SYNTHETIC:
+        scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
+    else:
+        scene = load_scene(Path(os.environ["KGS_DATA"]) / "llff" / cell["scene"], train_views=3, downscale=2)
+    _, metrics, result = fit_and_measure(scene, config, choose_points(scene, config))
+    test, train = metrics["test"], metrics["train"]
+    return result | {"psnr": test["psnr"], "ssim": test["ssim"], "train_psnr": train["psnr"]}
+
+
+def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
+    """Write training.csv, training.md and training.png: each setting's mean and standard deviation over seeds.
+
+    The gain over the default is in dB of test PSNR, from the seeds that both have; the two fits of a seed have the same
+    first points.
+
+    Returns:
+        What training.md holds.
+    """
+    frame = pd.DataFrame([_knob(row["cell"]) | {key: row["result"].get(key) for key in COLUMNS} for row in rows])
+    default = frame[frame.knob == "default"].set_index(["scene", "seed"]).psnr
+    frame["gain"] = frame.psnr - default.reindex(pd.MultiIndex.from_frame(frame[["scene", "seed"]])).to_numpy()
+    groups = frame.groupby(["scene", "knob", "value"], sort=False)
+    table = groups[list(COLUMNS)].agg(["mean", "std"])
+    table.columns = [f"{name}_sd" if what == "std" else name for name, what in table.columns]
+    table = table.assign(n=groups.size()).reset_index()
+    table.to_csv(out / "training.csv", index=False)
+    lines = [
+        [scene, f"{knob} {value}".strip(), len(cells), *(mean_sd(cells[key], d) for key, (_, d) in COLUMNS.items())]
+        for (scene, knob, value), cells in sorted(groups, key=lambda g: (g[0][0], g[0][1] != "default", g[0][1]))
+    ]
+    title = "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)"
+    text = markdown_table(title, ["setting", "n", *(head for head, _ in COLUMNS.values())], lines, first="scene")
+    (out / "training.md").write_text(text, encoding="utf-8")
+    _plot(out / "training.png", table)
+    return text
+
+
+def _knob(cell: Mapping[str, Any]) -> dict[str, Any]:
+    turned = {key: value for key, value in cell.items() if key not in ("scene", "seed")}
+    knob, value = next(iter(turned.items()), ("default", ""))
+    return {"scene": cell["scene"], "seed": cell["seed"], "knob": knob, "value": "" if value is True else str(value)}
+
+
+def _plot(path: Path, table: pd.DataFrame) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.5 * table.scene.nunique(), 4), layout="constrained")
+    axes = figure.subplots(1, table.scene.nunique(), squeeze=False)[0]
+    for axis, (scene, lines) in zip(axes, table.groupby("scene", sort=False), strict=True):
+        is_default = lines.knob == "default"
+        for knob in lines.knob[~is_default].unique():
+            line = lines[is_default | (lines.knob == knob)].sort_values("cpu_seconds")
+            axis.errorbar(line.cpu_seconds, line.psnr, line.psnr_sd, marker="o", markersize=4, capsize=2, lw=1, label=knob)
+        axis.plot(lines.cpu_seconds[is_default], lines.psnr[is_default], "k*", markersize=12, label="default")
+        axis.set(xscale="log", title=scene, xlabel="CPU seconds of the fit", ylabel="test PSNR [dB]")
+        axis.grid(alpha=0.3, which="both")
+        axis.legend(frameon=False)
+    figure.savefig(path, dpi=120)
