@@ -184,7 +184,9 @@ def test_means_over_scenes(markdown):
     assert row[9:] == ["-", "-"]  # the paper has no such mean
     (llff,) = lines(markdown, "Test views", "mean of 2 LLFF scenes (fern, flower)", "progressive 0.2")
     assert llff[9:] == ["20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207", "+1.54 or +1.34"]
-    sentence = next(line for line in markdown.splitlines() if line.startswith("- The paper's rule (progressive 0.2) over"))
+    sentence = next(
+        line for line in markdown.splitlines() if line.startswith("- The paper's rule (progressive 0.2) over")
+    )
     assert f"no dropping (off): {row[5].removesuffix(' (9)')} dB" in sentence
     assert f"standard deviation of a pair: {math.sqrt(differences.var(1, ddof=1).mean()):.2f} dB" in sentence
     assert f"fern {interval(differences[0])}; flower" in sentence

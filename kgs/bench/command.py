@@ -54,7 +54,7 @@ def bench(
 
         precision(out=out, quick=quick)
     elif what == "training":
-        from .study import training
+        from .training import training
 
         return training(out=out, quick=quick, processes=processes, scheduler=scheduler)
     elif what == "study":

@@ -1,4 +1,4 @@
-"""The study of sparse views, and of the fit's own knobs: grids of fits whose finished cells are kept."""
+"""The study of sparse views: a grid of fits whose finished cells are kept, and its report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from kgs.errors import DataError
 from kgs.options import alias
 
-__all__ = ["study", "training"]
+__all__ = ["study"]
 
 
 def study(
@@ -59,29 +59,4 @@ def study(
             scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
             weighed = "" if lpips_weights is None else " --lpips-weights WEIGHTS"
             write_report(rows, out, f"{scenes}kgs bench study --preset {preset}{weighed} -o OUT", len(cells))
-    return 0
-
-
-def training(
-    *,
-    out: Annotated[Path, alias("-o")],
-    quick: bool = False,
-    processes: int | None = None,
-    scheduler: str | None = None,
-) -> int:
-    """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
-
-    Writes training.jsonl, training.csv, training.md and training.png. With KGS_DATA, a folder of scenes, also on fern.
-
-    Args:
-        out: folder for the results; cells that its training.jsonl has are not repeated.
-        quick: two tiny cells, to see that it works.
-        processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
-        scheduler: address of a Dask scheduler whose workers run the cells instead.
-    """
-    from .grid import run_grid
-    from .knobs import fit_cell, knob_cells, write_knobs
-
-    rows = run_grid(knob_cells(quick), fit_cell, out / "training.jsonl", scheduler=scheduler, processes=processes)
-    print(write_knobs(rows, out))
-    return 0
+    return int(len(rows) < len(cells))

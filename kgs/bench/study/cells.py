@@ -63,7 +63,9 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     """
     scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
-    trainer, metrics, result = fit_and_measure(scene, _config(cell["start"], cell["seed"], **cell["fit"]), points, lpips)
+    trainer, metrics, result = fit_and_measure(
+        scene, _config(cell["start"], cell["seed"], **cell["fit"]), points, lpips
+    )
     return result | {
         **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
         "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},

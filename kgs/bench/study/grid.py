@@ -54,19 +54,18 @@ def run_grid(
         say: where lines for the user go.
 
     Returns:
-        The lines of the given cells, in their order.
+        The lines of the given cells, in their order, without those that failed; `say` has their errors.
 
     Raises:
-        ValueError: two cells are equal, `processes` is below 1, another run has the file, or no scheduler answers.
-        RuntimeError: cells failed; the message has the first error. All others are done and kept.
-        ConnectionError: the scheduler was lost; finished cells are kept.
+        ValueError: two cells are equal, `processes` is below 1, another run has the file, no scheduler answers, or it
+            was lost; finished cells are kept.
     """
     if processes is not None and processes < 1:
         raise ValueError(f"processes: expected at least 1, got {processes}")
     keys = [_key(cell) for cell in cells]
     if len(set(keys)) < len(keys):
         raise ValueError("cells: expected each one once, got two that are equal")
-    failures: list[str] = []
+    failed = 0
     with _alone(path):
         done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
         missing = [cell for cell, key in zip(cells, keys, strict=True) if key not in done]
@@ -75,13 +74,13 @@ def run_grid(
             with _workers(processes or os.cpu_count() or 1, scheduler) as client:
                 for count, (cell, outcome) in enumerate(_outcomes(client, work, missing), 1):
                     if isinstance(outcome, BaseException):
-                        failures.append(f"{_key(cell)}: {type(outcome).__name__}: {outcome}")
-                        say(f"failed: {failures[-1]}")
+                        failed += 1
+                        say(f"failed: {_key(cell)}: {type(outcome).__name__}: {outcome}")
                     else:
                         _append(path, {"cell": cell, "result": outcome})
                         say(f"{count} of {len(missing)}: {_key(cell)}")
-    if failures:
-        raise RuntimeError(f"{len(failures)} of {len(missing)} cells failed, the first one: {failures[0]}")
+    if failed:
+        say(f"{failed} of {len(missing)} cells failed; run again to try them once more")
     return finished_rows(cells, path)
 
 
@@ -194,11 +193,11 @@ def _outcomes(
         except TimeoutError:
             pass
         except OSError:
-            raise ConnectionError(_LOST) from None
+            raise ValueError(_LOST) from None
         for future in [future for future in running if future.done() or running[future][1] not in workers]:
             cell, _ = running.pop(future)
             if future.status in ("cancelled", "lost"):
-                raise ConnectionError(_LOST)
+                raise ValueError(_LOST)
             error = future.exception() if future.done() else None
             if future.done() and not isinstance(error, KilledWorker):
                 yield cell, error or future.result()

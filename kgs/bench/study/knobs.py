@@ -124,7 +124,9 @@ def _plot(path: Path, table: pd.DataFrame) -> None:
         is_default = lines.knob == "default"
         for knob in lines.knob[~is_default].unique():
             line = lines[is_default | (lines.knob == knob)].sort_values("cpu_seconds")
-            axis.errorbar(line.cpu_seconds, line.psnr, line.psnr_sd, marker="o", markersize=4, capsize=2, lw=1, label=knob)
+            axis.errorbar(
+                line.cpu_seconds, line.psnr, line.psnr_sd, marker="o", markersize=4, capsize=2, lw=1, label=knob
+            )
         axis.plot(lines.cpu_seconds[is_default], lines.psnr[is_default], "k*", markersize=12, label="default")
         axis.set(xscale="log", title=scene, xlabel="CPU seconds of the fit", ylabel="test PSNR [dB]")
         axis.grid(alpha=0.3, which="both")

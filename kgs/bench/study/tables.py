@@ -84,7 +84,11 @@ def findings(frame: pd.DataFrame) -> list[str]:
     main, sentences = main_cells(frame), []
     paper = frame.merge(main[KEYS[:2]].drop_duplicates())
     paper = paper[paper.method == PAPER]
-    names = {PAPER: f"The paper's rule ({PAPER})", OFF: "no dropping (off)", FIXED: f"a fixed rate of the same mean ({FIXED})"}
+    names = {
+        PAPER: f"The paper's rule ({PAPER})",
+        OFF: "no dropping (off)",
+        FIXED: f"a fixed rate of the same mean ({FIXED})",
+    }
     names |= {"dense": "Dense first points", "sift": f"those of SIFT, both with {PAPER}"}
     for cells, key, value, base in (
         (main, "method", PAPER, OFF),
