@@ -30,17 +30,19 @@ def test_bare_photos_are_answered_with_what_is_needed(tmp_path: Path, folder: st
 
 
 def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path) -> None:
-    write_colmap(tmp_path / "my scene")
-    for given in (tmp_path, *(tmp_path / "my scene" / part for part in ("images", "sparse", "sparse/0"))):
+    scene = tmp_path / "data" / "my scene"
+    write_colmap(scene)
+    (tmp_path / "data" / "a folder before it").mkdir()
+    for given in (tmp_path, scene.parent, *(scene / part for part in ("images", "sparse", "sparse/0"))):
         with pytest.raises(DataError, match="my scene is one: give that folder"):
             load_scene(given)
     write_nerfstudio(tmp_path / "other")
     (tmp_path / "other" / "transforms.json").rename(tmp_path / "other" / "a.json")
     with pytest.raises(DataError, match="got a file$"):
         load_scene(tmp_path / "other" / "a.json")
-    (tmp_path / "my scene" / "notes.txt").touch()
+    (scene / "notes.txt").touch()
     with pytest.raises(DataError, match=r"got a file: the scene is .*my scene$"):
-        load_scene(tmp_path / "my scene" / "notes.txt")
+        load_scene(scene / "notes.txt")
 
 
 @pytest.mark.parametrize("folder", [".", "images"])

@@ -56,7 +56,8 @@ def _about_file(path: Path) -> str:
 
 def _about_folder(root: Path) -> str:
     """Why a folder is no scene: what it holds instead, and what to do."""
-    for folder in (*sorted(p for p in root.iterdir() if p.is_dir()), *list(root.resolve().parents)[:2]):
+    below = sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_dir())
+    for folder in (*below, *list(root.resolve().parents)[:2]):
         if _is_scene(folder):
             return f"is no scene, but {folder} is one: give that folder"
     photos = image_folder(root) or root
