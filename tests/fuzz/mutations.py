@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["Mutator", "mutate_bytes", "mutate_json", "mutate_words"]
+__all__ = ["GEOMETRIC_KEYS", "Mutator", "mutate_bytes", "mutate_json", "mutate_words"]
 
 Mutator = Callable[[bytes, random.Random], tuple[bytes, str]]
 
@@ -28,11 +28,19 @@ _TOKENS = (
     *("[" * 3000, "[" * 3000 + "]" * 3000, '"\\ud800"', '"\\u0000"'),
     *map(json.dumps, _NAMES),
 )
+# Keys of other programs' files: each one changes the cameras or the pictures, and must be used or refused.
+GEOMETRIC_KEYS: dict[str, Any] = {
+    **{"is_fisheye": True, "camera_model": "EQUIRECTANGULAR", "camera_angle_y": 0.3, "camera_angle_x": 1.1},
+    **{"fl_x": 20.0, "fl_y": 30.0, "cx": 5.0, "cy": 9.0, "k1": 0.1, "k2": 0.05, "k3": 0.03, "k4": 0.1, "p1": 0.01},
+    **{"p2": 0.01, "ftheta_p0": 0.1, "mask_path": "mask.png", "w": 17, "h": 13, "lens": "fisheye"},
+    **{"train_filenames": ["images/0.png"], "test_filenames": ["images/1.png"], "ply_file_path": "points.ply"},
+}
+_BOM = b"\xef\xbb\xbf"
 _MARK = "@damaged here@"
 
 
 def mutate_bytes(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """One to three of: bits flipped, extreme numbers written over, bytes cut, removed, repeated, inserted, swapped."""
+    """One to three of: bits flipped, extreme numbers written over, bytes cut, removed, repeated, ..."""
     words = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         data, what = rng.choice(_BYTE_OPERATIONS)(data, rng)
@@ -49,7 +57,7 @@ def mutate_words(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     words = lines[at].split(b" ")
     word = rng.randrange(len(words))
     token = rng.choice((*_NUMBER_WORDS, *_NAMES)).encode()
-    match rng.randrange(6):
+    match rng.randrange(7):
         case 0 | 1 | 2:
             words[word], what = token, f"word {word} of line {at} is {_short(token)}"
         case 3:
@@ -58,6 +66,10 @@ def mutate_words(data: bytes, rng: random.Random) -> tuple[bytes, str]:
         case 4:
             what = f"line {at} twice"
             lines.insert(at, lines[at])
+        case 5:
+            what = "a byte order mark"
+            lines[0] = _BOM + lines[0]
+            words = lines[at].split(b" ")
         case _:
             what = f"line {at} is gone"
             words = []
@@ -68,13 +80,15 @@ def mutate_words(data: bytes, rng: random.Random) -> tuple[bytes, str]:
 
 
 def mutate_json(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """A value replaced by a hostile one, a key or an element removed, doubled or renamed; at times damaged bytes."""
+    """A value replaced by a hostile one, a key or an element removed, doubled or added; at times damaged bytes."""
     if rng.random() < 0.15:
         return mutate_bytes(data, rng)
+    if rng.random() < 0.02:
+        return _BOM + data, "a byte order mark"
     tree = json.loads(data)
     holder, key = rng.choice(list(_places(tree)))
     token = rng.choice(_TOKENS)
-    match rng.randrange(7):
+    match rng.randrange(8):
         case 0 | 1 | 2 | 3:
             holder[key], what = _MARK, f"{key} is {_short(token.encode())}"
         case 4:
@@ -87,6 +101,10 @@ def mutate_json(data: bytes, rng: random.Random) -> tuple[bytes, str]:
         case 5:
             what = f"element {key} twice"
             holder.insert(key, holder[key])
+        case 6 if isinstance(holder, dict):
+            added = rng.choice(list(GEOMETRIC_KEYS))
+            what = f"{added} beside {key}"
+            holder[added] = GEOMETRIC_KEYS[added]
         case _:
             value, factor = holder[key], rng.choice((-1, 0, 0.5, 1.01, 2, 1e20, 1e-20))
             holder[key] = value * factor if isinstance(value, (int, float)) else [value]
@@ -156,6 +174,12 @@ def _insert(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     return data[:at] + new + data[at:], f"{size} bytes inserted at {at}"
 
 
+def _append(data: bytes, rng: random.Random) -> tuple[bytes, str]:
+    """As phones put a film behind a photo."""
+    new = rng.choice((b"\0", data, rng.randbytes(100), b"\xff\xd9", bytes(5000)))
+    return data + new, f"{len(new)} bytes behind the end"
+
+
 def _swap(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     begin, end = _slice(data, rng)
     middle = rng.randint(begin, end)
@@ -167,4 +191,4 @@ def _slice(data: bytes, rng: random.Random) -> tuple[int, int]:
     return begin, min(len(data), begin + rng.choice((1, 2, 4, 8, 17, 64, 1000)))
 
 
-_BYTE_OPERATIONS = (_flip, _flip, _overwrite, _overwrite, _overwrite, _cut, _remove, _repeat, _insert, _swap)
+_BYTE_OPERATIONS = (_flip, _flip, _overwrite, _overwrite, _overwrite, _cut, _remove, _repeat, _insert, _swap, _append)

@@ -7,6 +7,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import torch
+import trimesh
 from mutations import mutate_bytes, mutate_json, mutate_words
 from readers import Reader, Target, Unsound, check_range, inside_checkpoint, inside_png, inside_zip
 from tiny_scenes import (
@@ -26,6 +27,7 @@ from kgs.fit.config import FitConfig, timetable
 from kgs.fit.lpips import Lpips
 from kgs.fit.settings import read_settings
 from kgs.fit.starts import FirstPoints
+from kgs.fit.starts.files import read_points
 from kgs.fit.trainer import Trainer
 from kgs.ply import load_ply
 
@@ -100,6 +102,17 @@ def _read_lpips(folder: Path) -> None:
         check_range(name, value, -3.5e38, 3.5e38)
 
 
+def _write_points(folder: Path, kind: str) -> None:
+    points, colors = torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(0)).numpy()
+    trimesh.PointCloud(points, (255 * colors).astype("uint8")).export(folder / f"points.{kind}")
+
+
+def _read_cloud(folder: Path, kind: str) -> None:
+    points, colors = read_points(folder / f"points.{kind}")
+    check_range("points", points, -3.5e38, 3.5e38)
+    check_range("colors", colors, 0, 1)
+
+
 def _image_reader(name: str, suffix: str, *targets: Target, channels: int = 3) -> Reader:
     path = f"image.{suffix}"
     return Reader(
@@ -139,6 +152,7 @@ SCENE_READERS = (
 )
 _PNG, _HEADS = "image.png", "lpips_lin_alexnet.npz"
 _CHECKPOINT = "checkpoint.pt"
+_CLOUDS = {"ply": Target("points.ply", mutate_bytes), "xyz": Target("points.xyz", mutate_words)}
 FILE_READERS = (
     Reader("PLY, binary", write_ply, _read_ply, (Target("splat.ply", mutate_bytes),)),
     Reader("PLY, ascii", partial(write_ply, text=True), _read_ply, (Target("splat.ply", mutate_words),)),
@@ -169,5 +183,10 @@ FILE_READERS = (
     _image_reader("WebP", "webp"),
     _image_reader("BMP", "bmp"),
     _image_reader("TIFF", "tif"),
+    _image_reader("TIFF, RGBA", "tif", channels=4),
+    *(
+        Reader(f"points, {kind}", partial(_write_points, kind=kind), partial(_read_cloud, kind=kind), (target,))
+        for kind, target in _CLOUDS.items()
+    ),
 )
 READERS = (*SCENE_READERS, *FILE_READERS)

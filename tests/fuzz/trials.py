@@ -20,7 +20,7 @@ from readers import Reader
 
 from kgs.errors import DataError
 
-__all__ = ["Outcome", "is_cheap", "table_row", "try_reader"]
+__all__ = ["Outcome", "is_cheap", "table_row", "try_files", "try_reader"]
 
 _SLOWEST, _MEMORY_FACTOR, _MEMORY = 1.0, 4, 64 * 2**20
 
@@ -59,9 +59,9 @@ def try_reader(reader: Reader, seeds: Sequence[int]) -> list[Outcome]:
             path, data, what = reader.damage(folder, seed)
             whole = path.read_bytes()
             path.write_bytes(data)
-            outcome = _try(reader, folder, what)
+            outcome = try_files(reader, folder, what)
             outcomes.append(
-                outcome if outcome.seconds < _SLOWEST else min(outcome, _try(reader, folder, what), key=_time)
+                outcome if outcome.seconds < _SLOWEST else min(outcome, try_files(reader, folder, what), key=_time)
             )
             path.write_bytes(whole)
     return outcomes
@@ -88,7 +88,8 @@ def table_row(reader: Reader, outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _try(reader: Reader, folder: Path, what: str) -> Outcome:
+def try_files(reader: Reader, folder: Path, what: str) -> Outcome:
+    """Read the files as they are."""
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     before, start, kind = _reset_peak(), time.perf_counter(), "sound"
     try:

@@ -1,0 +1,117 @@
+"""Small files that ask for much memory, and what other programs write beside and behind what kgs reads."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mutations import GEOMETRIC_KEYS
+from readers import Reader, Target
+from tiny_scenes import write_blender, write_image, write_nerfstudio
+from trials import is_cheap, try_files
+
+from kgs.datasets import Views, load_scene
+from kgs.datasets.images import read_image
+from kgs.errors import DataError
+from kgs.fit.starts.files import read_points
+
+SIDE = 8000
+
+
+def grey_png(path: Path) -> None:
+    """62 kB, as no encoder at hand writes it without taking the memory."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    rows = zlib.compress(bytes(SIDE * (SIDE + 1)))
+    head = struct.pack(">IIBBBBB", SIDE, SIDE, 8, 0, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+
+
+def grey_jpeg(path: Path) -> None:
+    assert cv2.imwrite(str(path), np.full((SIDE, SIDE), 128, np.uint8))
+
+
+def zipped_points(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.xyz", b"1 2 3\n" * 30_000_000)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is measured on Linux")
+@pytest.mark.parametrize(
+    ("name", "write", "read", "largest"),
+    [
+        ("image.png", grey_png, read_image, 100_000),
+        ("image.jpg", grey_jpeg, read_image, 1_100_000),
+        ("points.zip", zipped_points, read_points, 600_000),
+    ],
+)
+def test_small_files_that_ask_for_much_memory_are_refused(
+    tmp_path: Path, name: str, write: Callable[[Path], None], read: Callable[[Path], object], largest: int
+) -> None:
+    write(path := tmp_path / name)
+    assert path.stat().st_size < largest
+    reader = Reader(
+        name, lambda _: None, lambda folder: read(folder / name) and None, (Target(name, lambda d, _: (d, "")),)
+    )
+    outcome = try_files(reader, tmp_path, name)
+    assert outcome.kind == "refused", outcome
+    assert is_cheap(outcome), outcome
+
+
+# Lists of files, which say what is trained on, have their place at the top of nerfstudio's file alone.
+PLACES = [
+    (write, key, in_a_frame)
+    for write in (write_blender, write_nerfstudio)
+    for key in GEOMETRIC_KEYS
+    for in_a_frame in (False, True)
+    if not key.endswith("_filenames") or (write is write_nerfstudio and not in_a_frame)
+]
+
+
+@pytest.mark.parametrize(("write", "key", "in_a_frame"), PLACES)
+def test_a_key_is_used_refused_or_noted(
+    tmp_path: Path, write: Callable[[Path], None], key: str, in_a_frame: bool
+) -> None:
+    """What a file says about cameras and pictures is never passed over in silence."""
+    write(tmp_path)
+    if key.startswith("camera_angle"):
+        for path in tmp_path.glob("transforms.json"):  # a focal length says the same, and comes first
+            content = json.loads(path.read_text())
+            kept = {name: value for name, value in content.items() if name not in ("fl_x", "fl_y")}
+            path.write_text(json.dumps({**kept, "camera_angle_x": 0.9}))
+    plain = load_scene(tmp_path)
+    for path in tmp_path.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        (content["frames"][0] if in_a_frame else content)[key] = GEOMETRIC_KEYS[key]
+        path.write_text(json.dumps(content))
+    try:
+        scene = load_scene(tmp_path)
+    except DataError:
+        return
+    noted = any(key in note for note in scene.notes)
+    assert noted or any(numbers(a) != numbers(b) for a, b in ((scene.train, plain.train), (scene.test, plain.test)))
+
+
+def numbers(views: Views) -> list[list[float]]:
+    """All that a fit takes from views."""
+    return [x.flatten().tolist() for x in (views.images, views.cameras.intrinsics, views.cameras.extrinsics)]
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "bmp"])
+@pytest.mark.parametrize("behind", [b"\0", b"\xff\xd8\xff\xe1 film \xff\xd9", bytes(range(256)) * 40], ids=len)
+def test_data_behind_an_image_change_nothing(tmp_path: Path, suffix: str, behind: bytes) -> None:
+    write_image(tmp_path, suffix)
+    path = tmp_path / f"image.{suffix}"
+    plain = read_image(path)
+    path.write_bytes(path.read_bytes() + behind)
+    assert np.array_equal(read_image(path), plain)
