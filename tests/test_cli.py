@@ -31,7 +31,8 @@ def fitted(folder, tmp_path_factory):
 
 
 def test_fit_writes_everything(fitted):
-    assert {"splat.ply", "metrics.json", "config.json", "curve.png", "checkpoint.pt", "test"} <= set(os.listdir(fitted))
+    assert {"splat.ply", "metrics.json", "config.json", "curve.png", "test"} <= set(os.listdir(fitted))
+    assert "checkpoint.safetensors" in os.listdir(fitted)
     assert sorted(os.listdir(fitted / "test")) == ["test_r_0.png", "test_r_1.png"]
     assert cv2.imread(str(fitted / "test" / "test_r_0.png")).shape == (36, 40, 3)
     assert cv2.imread(str(fitted / "curve.png")) is not None
@@ -101,8 +102,8 @@ def test_resume_of_a_finished_fit_changes_nothing(fitted, folder):
 
 
 def test_resume_with_other_numbers_is_refused(fitted, folder, capsys):
-    assert run("fit", folder, "-o", fitted, "--steps", STEPS + 1, *FIT, "--resume") == 2
-    assert "config.steps" in one_line(capsys)
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--seed", 1, *FIT, "--resume") == 2
+    assert "--seed: expected 0, as the fit was begun with, got 1" in one_line(capsys)
 
 
 def one_line(capsys):

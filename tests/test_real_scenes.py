@@ -10,7 +10,7 @@ from kgs.cli import main
 
 pytestmark = pytest.mark.slow
 
-FILES = {"splat.ply", "metrics.json", "config.json", "curve.png", "checkpoint.pt", "test"}
+FILES = {"splat.ply", "metrics.json", "config.json", "curve.png", "checkpoint.safetensors", "test"}
 
 
 def fit(scene, out, *arguments):

@@ -68,8 +68,8 @@ def test_a_fit_with_scores_resumes_bit_for_bit(scene, points, tmp_path, change):
     whole, first = Trainer(scene, config, points), Trainer(scene, config, points)
     whole.fit()
     first.fit(lambda trainer, _: trainer.step == 31)
-    first.save(tmp_path / "checkpoint.pt")
-    second = Trainer.resume(scene, config, tmp_path / "checkpoint.pt")
+    first.save(tmp_path / "checkpoint.safetensors")
+    second = Trainer.resume(scene, config, tmp_path / "checkpoint.safetensors")
     second.fit()
     for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
         assert torch.equal(a, b)

@@ -1,32 +1,42 @@
-"""Checkpoints: files that are whole or absent, verified on loading, without code inside; the last two are kept.
+"""Checkpoints: safetensors files that are whole or absent and are verified on loading; the last two are kept.
 
-A file is a line "kgs-checkpoint 2 <sha256 of the rest>", a line of JSON, and the bytes of all tensors one after the
-other (little endian). In the JSON a tensor is {"tensor": dtype, "shape": [...]}, a dict {"dict": [[key, value], ...]}
-and a tuple {"tuple": [...]}. There is no pickle in it: loading makes tensors and plain values and nothing else.
+The tensors of a nested dict stand in the file under their keys joined by "/". All else of it is JSON in the file's
+metadata under "state", beside the format and the SHA-256 of the tensors and the JSON. There is no pickle in it: loading
+makes tensors and plain values and nothing else.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import safetensors
+import safetensors.torch
 import torch
 from torch import Tensor
 
+from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
 from kgs.json_files import parse_json
 
-__all__ = ["load_checkpoint", "newest_checkpoint", "previous", "save_checkpoint"]
+from .config import FitConfig
 
-_MAGIC = b"kgs-checkpoint "
-_VERSION = b"2 "
-_MOST_JSON = 16 * 2**20
-_DTYPES = {"uint8": "|u1", "int32": "<i4", "int64": "<i8", "float32": "<f4", "float64": "<f8"}
+__all__ = [
+    "check_state",
+    "fingerprint",
+    "load_checkpoint",
+    "load_moments",
+    "newest_checkpoint",
+    "previous",
+    "save_checkpoint",
+]
+
+_FORMAT = "kgs-checkpoint 3"
+_OLD = b"kgs-checkpoint "
 
 
 def previous(path: Path) -> Path:
@@ -41,24 +51,21 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
     Args:
         path: the file.
-        state: nested dicts, lists and tuples of tensors, finite numbers, strings and None.
+        state: nested dicts, with text as keys, of tensors and of what JSON knows.
 
     Raises:
         OSError: the file cannot be written; those that were there are untouched.
         TypeError: `state` holds something else.
         ValueError: a number outside a tensor is not finite.
     """
-    arrays: list[bytes] = []
-    description = json.dumps(_describe(state, arrays), allow_nan=False, separators=(",", ":")).encode() + b"\n"
-    content = [description, *arrays]
-    checksum = hashlib.sha256()
-    for part in content:
-        checksum.update(part)
+    tensors: dict[str, Tensor] = {}
+    text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
+    metadata = {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)}
+    content = safetensors.torch.save(tensors, metadata)
     temporary = path.with_name(path.name + ".partial")
     try:
         with open(temporary, "wb") as file:
-            file.write(_MAGIC + _VERSION + checksum.hexdigest().encode() + b"\n")
-            file.writelines(content)
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         if path.exists():
@@ -93,34 +100,168 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read what `save_checkpoint` wrote; tensors come on the CPU.
 
     Raises:
-        DataError: the file is missing, is no checkpoint, its content does not match its checksum, or a number is not
-            finite. A right checksum is not taken as proof that the rest is well formed.
+        DataError: the file is missing, is no checkpoint or one of an older version, its content does not match its
+            checksum, or a number is not finite. A right checksum is not taken as proof that the rest is well formed.
     """
+    old = path.with_suffix(".pt")
     try:
-        content = path.read_bytes()
+        content = path.read_bytes() if path.exists() or not old.exists() else _OLD
     except OSError as error:
         raise DataError(path, "", f"expected a checkpoint, got {error.strerror}") from error
-    end = content.find(b"\n", 0, 200)
-    head = content[: max(end, 0)]
-    if not head.startswith(_MAGIC):
-        raise DataError(path, "header", "expected a checkpoint of kgs, got something else")
-    if not head.startswith(_MAGIC + _VERSION):
-        raise DataError(path, "header", "is a checkpoint of another version of kgs: expected 2, fit again")
-    body = memoryview(content)[end + 1 :]
-    if head[len(_MAGIC + _VERSION) :] != hashlib.sha256(body).hexdigest().encode():
-        raise DataError(path, "sha256", "expected the checksum of the content, got another: the file is damaged")
-    split = content.find(b"\n", end + 1, end + 1 + _MOST_JSON)
-    if split < 0:
-        raise DataError(path, "description", "expected a line of JSON, got no end of it")
-    reader = _Reader(memoryview(content)[split + 1 :])
+    if content.startswith(_OLD):
+        raise DataError(old, "", "is a checkpoint of an older version of kgs and cannot be used: fit without --resume")
     try:
-        state = reader.value(parse_json(content[end + 1 : split]))
-        reader.finish()
-    except (ValueError, RecursionError) as error:
-        raise DataError(path, "description", str(error)) from error
+        tensors = safetensors.torch.load(content)
+        metadata = parse_json(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+        if metadata["format"] != _FORMAT:
+            raise ValueError(f"expected the format {_FORMAT!r}, got {metadata['format']!r}")
+        if metadata["sha256"] != _digest_all(metadata["state"], tensors):
+            raise ValueError("expected the checksum of the content, got another: the file is damaged")
+        state = parse_json(metadata["state"].encode())
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+                raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+            *folders, key = name.split("/")
+            holder = state
+            for folder in folders:
+                holder = holder[folder]
+            holder[key] = tensor.clone()
+    except KeyError as error:
+        raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint of kgs, got none") from error
+    except (safetensors.SafetensorError, TypeError, ValueError) as error:
+        raise DataError(path, "", f"is no whole checkpoint of kgs ({error})") from error
     if not isinstance(state, dict):
-        raise DataError(path, "description", f"expected a dict, got a {type(state).__name__}")
+        raise DataError(path, "state", f"expected a dict, got a {type(state).__name__}")
     return state
+
+
+def fingerprint(scene: Scene) -> dict[str, Any]:
+    """SHA-256 sums by which any change of a photo, mask, pose, intrinsics or the background is noticed and named."""
+
+    def of(views: Views) -> dict[str, Any]:
+        masks, cameras = views.masks, views.cameras
+        return {
+            "names": list(views.names),
+            "photos": [_digest(image) for image in views.images],
+            "masks": None if masks is None else [_digest(mask) for mask in masks],
+            "poses": [_digest(pose) for pose in cameras.extrinsics],
+            "intrinsics": [_digest(matrix) for matrix in cameras.intrinsics],
+        }
+
+    return {"training": of(scene.train), "test": of(scene.test), "background": _digest(scene.background)}
+
+
+def check_state(state: dict[str, Any], scene: Scene, config: FitConfig) -> list[str]:
+    """Make sure that a state belongs to this fit and that its plain values can be used.
+
+    Returns:
+        Notes for the user: what it means that the fit goes on for more steps than it was begun with, if it does.
+
+    Raises:
+        ValueError: an entry is missing or wrong, or the scene or the configuration is another.
+    """
+    views = len(scene.train)
+    for name, expected, is_right in (
+        ("config", "settings", lambda v: isinstance(v, dict) and _is_int(v.get("steps"), 1, 2**48)),
+        ("init", "a kind and a number of points", _is_init),
+        ("step", "a number of steps", lambda v: _is_int(v, 0, state["config"]["steps"])),
+        ("seconds", "a number, not negative", lambda v: _is_number(v) and v >= 0),
+        ("curve", "a list of measurements", lambda v: isinstance(v, list) and all(map(_is_point, v))),
+        ("notes", "a list of texts", lambda v: isinstance(v, list) and all(isinstance(x, str) for x in v)),
+        ("extent", "a number above 0", lambda v: _is_number(v) and v > 0),
+        ("near_plane", "a number above 0", lambda v: _is_number(v) and v > 0),
+        ("sh_degree", "a degree of the harmonics", lambda v: _is_int(v, 0, config.sh_degree)),
+        ("stack", "views", lambda v: isinstance(v, list) and all(_is_int(x, 0, views - 1) for x in v)),
+    ):
+        if name not in state or not is_right(state[name]):
+            got = f"{str(state[name])[:80]!r}" if name in state else "none"
+            raise ValueError(f"{name}: expected {expected}, got {got}")
+    steps, done, notes = state["config"]["steps"], state["step"], list[str]()
+    asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
+    if steps == done < config.steps:
+        asked["steps"] = steps
+        notes.append(
+            f"trained on from step {done}, the end of a fit of {steps} steps: from here on learning rates, drop rate, "
+            f"densification and resets are those of {config.steps} steps, so that the result differs from a fit of "
+            f"{config.steps} steps from the start"
+        )
+    elif steps != config.steps:
+        wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
+        raise ValueError(f"--steps: expected {wanted} got {config.steps}")
+    _compare_settings(state["config"], asked)
+    _compare_scenes(state.get("scene"), fingerprint(scene))
+    return notes
+
+
+def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Put Adam's steps and moments in place, by the names of the groups; shapes and signs are checked.
+
+    Raises:
+        ValueError: they are not those of the optimiser's parameters.
+    """
+    groups, found = optimizer.state_dict()["param_groups"], {}
+    for group, held in zip(groups, optimizer.param_groups, strict=True):
+        shape, moments = held["params"][0].shape, state[group["name"]]
+        if moments:
+            shapes = {"step": torch.Size(()), "exp_avg": shape, "exp_avg_sq": shape}
+            if {key: value.shape for key, value in moments.items()} != shapes or any(
+                bool((moments[key] < 0).any()) for key in ("step", "exp_avg_sq")
+            ):
+                raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
+            found[group["params"][0]] = moments
+    optimizer.load_state_dict({"state": found, "param_groups": groups})
+
+
+def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], flag: str = "--") -> None:
+    for name, value in asked.items():
+        before = saved.get(name)
+        if isinstance(value, dict) and isinstance(before, dict):
+            _compare_settings(before, value, f"{flag}{name}.")
+        elif before != value:
+            name = (flag + name).replace("_", "-")
+            raise ValueError(f"{name}: expected {before!r}, as the fit was begun with, got {value!r}")
+
+
+def _compare_scenes(saved: Any, asked: dict[str, Any]) -> None:
+    expected = "expected those that the fit was begun with, got others"
+    for part in ("training", "test"):
+        for what, values in asked[part].items():
+            before = saved[part][what]
+            if before != values:
+                both = zip(asked[part]["names"], before or [], values or [], strict=False)
+                changed = ", ".join(name for name, one, other in both if one != other)
+                raise ValueError(f"{what} of the {part} views: {expected}" + f" for {changed:.200}" * bool(changed))
+    if saved["background"] != asked["background"]:
+        raise ValueError("--background: expected the one that the fit was begun with, got another")
+
+
+def _digest(*tensors: Tensor) -> str:
+    """SHA-256 of the types, shapes and numbers of tensors, in hexadecimal digits."""
+    checksum = hashlib.sha256()
+    for tensor in tensors:
+        checksum.update(f"{tensor.dtype} {tuple(tensor.shape)} ".encode())
+        checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return checksum.hexdigest()
+
+
+def _digest_all(text: str, tensors: Mapping[str, Tensor]) -> str:
+    parts = [text, *(f"{name} {_digest(tensors[name])}" for name in sorted(tensors))]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any:
+    """The value without its tensors, which go to `tensors`."""
+    if not isinstance(value, dict):
+        return value
+    rest = {}
+    for key, item in value.items():
+        if not isinstance(key, str) or "/" in key:
+            raise TypeError(f"state: expected text without '/' as keys, got {key!r}")
+        if isinstance(item, Tensor):
+            tensors[path + key] = item.detach().to("cpu", copy=True).contiguous()  # tensors may share memory
+        else:
+            rest[key] = _take_tensors(item, tensors, f"{path}{key}/")
+    return rest
 
 
 def _sync_folder(folder: Path) -> None:
@@ -134,70 +275,18 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _describe(value: Any, arrays: list[bytes]) -> Any:
-    """A value as JSON knows it; the tensors' numbers are appended to `arrays`."""
-    if isinstance(value, Tensor):
-        name = str(value.dtype).removeprefix("torch.")
-        if name not in _DTYPES:
-            raise TypeError(f"state: expected tensors of {', '.join(_DTYPES)}, got {name}")
-        array = value.detach().cpu().contiguous().numpy().astype(_DTYPES[name], copy=False)
-        arrays.append(array.tobytes())
-        return {"tensor": name, "shape": list(value.shape)}
-    if isinstance(value, dict):
-        return {"dict": [[key, _describe(item, arrays)] for key, item in value.items()]}
-    if isinstance(value, (list, tuple)):
-        items = [_describe(item, arrays) for item in value]
-        return {"tuple": items} if isinstance(value, tuple) else items
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    raise TypeError(f"state: expected tensors and plain values, got a {type(value).__name__}")
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
 
 
-class _Reader:
-    """Makes values of a description; each tensor takes the next bytes, so that none is larger than the file."""
-
-    def __init__(self, data: memoryview) -> None:
-        self._data = data
-        self._at = 0
-
-    def value(self, given: Any) -> Any:
-        """The inverse of `_describe`.
-
-        Raises:
-            ValueError: the description is none, bytes are missing, or a number is not finite.
-        """
-        match given:
-            case {"tensor": str(name), "shape": list(shape), **more} if not more and name in _DTYPES:
-                return self._tensor(name, shape)
-            case {"dict": list(pairs), **more} if not more and all(map(_is_pair, pairs)):
-                return {key: self.value(item) for key, item in pairs}
-            case {"tuple": list(items), **more} if not more:
-                return tuple(self.value(item) for item in items)
-            case list(items):
-                return [self.value(item) for item in items]
-            case None | bool() | int() | float() | str():
-                return given
-        raise ValueError(f"expected a value of a checkpoint, got {str(given)[:80]}")
-
-    def finish(self) -> None:
-        """Make sure that nothing is left."""
-        if self._at != len(self._data):
-            raise ValueError(f"{len(self._data) - self._at} bytes are left over")
-
-    def _tensor(self, name: str, shape: list[Any]) -> Tensor:
-        if not all(type(size) is int and 0 <= size < 2**48 for size in shape) or len(shape) > 8:
-            raise ValueError(f"expected the shape of a tensor, got {str(shape)[:80]}")
-        dtype, count = np.dtype(_DTYPES[name]), math.prod(shape)
-        size = count * dtype.itemsize
-        if size > len(self._data) - self._at:
-            raise ValueError(f"needs {size} bytes for a tensor, the file has {len(self._data) - self._at} more")
-        array = np.frombuffer(self._data, dtype, count, self._at).astype(dtype.newbyteorder("="))
-        self._at += size
-        tensor = torch.from_numpy(array)
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise ValueError("expected finite numbers in all tensors, got NaN or infinity")
-        return tensor.reshape(shape)
+def _is_int(value: Any, least: int, most: int) -> bool:
+    return type(value) is int and least <= value <= most
 
 
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and isinstance(value[0], (str, int))
+def _is_init(value: Any) -> bool:
+    return isinstance(value, dict) and value.keys() == {"kind", "points"} and _is_int(value["points"], 1, 2**48)
+
+
+def _is_point(value: Any) -> bool:
+    keys = {"step", "seconds", "test_psnr", "train_psnr"}
+    return isinstance(value, dict) and value.keys() == keys and all(x is None or _is_number(x) for x in value.values())

@@ -14,9 +14,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-import torch
-
-__all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable", "usable_device"]
+__all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
 
 _MIN_DENSIFICATIONS = 20
 
@@ -211,21 +209,6 @@ def timetable(config: FitConfig) -> Timetable:
     return Timetable(
         tuple(max(1, step) for step in sh), densify, reset, tuple(sorted(evaluate)), round(config.coarse * steps)
     )
-
-
-def usable_device(name: str) -> torch.device:
-    """The device of that name, after a number was written to it and read again.
-
-    Raises:
-        ValueError: torch knows no such device, or it cannot be used here.
-    """
-    try:
-        device = torch.device(name)
-        torch.ones(1, device=device).item()
-    except (AssertionError, NotImplementedError, RuntimeError) as error:  # torch has one for each reason
-        reason = str(error).split("\n")[0][:100]
-        raise ValueError(f"device: expected one that can be used here, got {name!r} ({reason})") from error
-    return device
 
 
 @lru_cache

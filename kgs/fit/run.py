@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +12,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.ply import save_ply
@@ -21,10 +19,12 @@ from kgs.ply import save_ply
 from .checkpoint import previous
 from .config import FitConfig
 from .figures import write_curve
+from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, locked, publish
 from .lpips import Lpips
+from .machine import check_device
 from .metrics import evaluate
-from .outputs import check_folder, png_names, remove_others, run_metrics, write_json, write_png
-from .settings import CHECKPOINT
+from .outputs import check_folder, is_own, png_names, run_metrics, write_json, write_png
+from .progress import progress, say
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
@@ -41,9 +41,12 @@ def fit_scene(
     resume: bool = False,
     lpips: Lpips | None = None,
     request: dict[str, Any] | None = None,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = say,
 ) -> tuple[dict[str, Any], int]:
     """Fit a scene and write splat.ply, metrics.json, config.json, curve.png, test/*.png and the checkpoint.
+
+    Results that are in the folder stay whole until all new ones are there; `unfinished` holds what there is until then.
+    A fit that a signal stopped writes its results too, but leaves those of a finished one in their place.
 
     Args:
         scene: posed training and test views.
@@ -58,50 +61,100 @@ def fit_scene(
         What metrics.json holds, and the signal that interrupted the fit or 0 (its results are valid all the same).
 
     Raises:
-        DataError: the checkpoint is damaged or belongs to another fit, or `out` holds files that kgs did not write
-            and would overwrite.
+        DataError: the checkpoint is damaged or belongs to another fit, images are too small, another fit is at work in
+            `out`, or `out` cannot be written to or holds files that kgs did not write and would overwrite.
         TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
         OSError: a result cannot be written.
+        ValueError: the device cannot be used.
     """
+    check_device(config.device)
+    smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
+    for views in (scene.train, scene.test):
+        height, width = views.images.shape[-2:]
+        if min(height, width) < smallest:
+            reason = f"expected at least {smallest}x{smallest} pixels, got {width}x{height}"
+            raise DataError(scene.root, "images", reason)
     names = png_names([*scene.train.names, *scene.test.names])
-    pictures = [f"test/{names[view]}" for view in scene.test.names]
-    check_folder(out, ["splat.ply", "config.json", "metrics.json", "curve.png", *pictures], scene.root)
-    checkpoint = out / CHECKPOINT
-    if resume and (checkpoint.exists() or previous(checkpoint).exists()):
-        trainer = Trainer.resume(scene, config, checkpoint)
-        say(f"resumed at step {trainer.step}")
-    else:
-        if checkpoint.exists():
-            say(f"{out}: replacing the results of an earlier fit (--resume would go on with it)")
-        points = choose_points(scene, config)
-        say(f"first points: {len(points.points)} ({points.kind})")
-        trainer = Trainer(scene, config, points)
-        say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
-        for old in (checkpoint, previous(checkpoint)):
-            old.unlink(missing_ok=True)
-    write_json(
-        out / "config.json",
-        {
-            "request": request or {},
-            "fit": config.to_dict(),
-            "timetable": asdict(trainer.times),
-            "max_gaussians": trainer.max_gaussians,
-            "near_plane": trainer.renderer.near_plane,
-            "extent": trainer.extent,
-        },
-    )
-    stopped_by = train(trainer, checkpoint)
-    for note in trainer.notes:
-        say(note)
-    save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
-    write_curve(out / "curve.png", {"": trainer.curve})
-    (out / "test").mkdir(exist_ok=True)
-    for i, name in enumerate(scene.test.names):
-        write_png(out / "test" / names[name], trainer.render(scene.test.camera(i))[0])
-    remove_others(out / "test", names.values())
-    metrics = measure(trainer, lpips)
-    write_json(out / "metrics.json", metrics)
+    try:
+        check_folder(out, [*RESULTS, *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
+    except OSError as error:
+        raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
+    with locked(out):
+        end_move(out)
+        new = out / UNFINISHED
+        trainer, source = _resumed(scene, config, out) if resume else (None, out)
+        if trainer is not None:
+            say(f"resumed at step {trainer.step}")
+        else:
+            if is_own(out / "splat.ply"):
+                say(f"{out}: the fit there will be replaced when this one is done (--resume would go on with it)")
+            points = choose_points(scene, config)
+            say(f"first points: {len(points.points)} ({points.kind})")
+            trainer = Trainer(scene, config, points)
+            say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
+        for note in trainer.notes:
+            say(note)
+        told, saved = len(trainer.notes), trainer.saved
+        try:
+            if source != new:
+                shutil.rmtree(new, ignore_errors=True)
+                new.mkdir()
+                trainer.save(new / CHECKPOINT)  # first points may have taken a minute
+                trainer.saved = saved
+            write_json(new / "config.json", _settings(trainer, request or {}))
+            stopped_by = train(trainer, new / CHECKPOINT)
+            metrics = _write_results(trainer, new, names, lpips)
+        except BaseException:
+            if not trainer.saved:
+                shutil.rmtree(new, ignore_errors=True)
+            raise
+        replaces = not stopped_by or not is_finished(out)
+        if replaces:
+            publish(out)
+        for note in trainer.notes[told:]:
+            say(note)
+        if not replaces:
+            say(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
     return metrics, stopped_by
+
+
+def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None, Path]:
+    """The fit that was interrupted in the folder, else the one that was finished, else None; and where it lies."""
+    errors = []
+    for folder in (out / UNFINISHED, out):
+        path = folder / CHECKPOINT
+        if any(file.exists() for file in (path, previous(path), path.with_suffix(".pt"))):
+            try:
+                return Trainer.resume(scene, config, path), folder
+            except DataError as error:
+                errors.append(error)
+    if errors:
+        raise errors[0]
+    return None, out
+
+
+def _settings(trainer: Trainer, request: dict[str, Any]) -> dict[str, Any]:
+    """What config.json holds."""
+    return {
+        "request": request,
+        "fit": trainer.config.to_dict(),
+        "timetable": asdict(trainer.times),
+        "max_gaussians": trainer.max_gaussians,
+        "near_plane": trainer.renderer.near_plane,
+        "extent": trainer.extent,
+    }
+
+
+def _write_results(trainer: Trainer, new: Path, names: dict[str, str], lpips: Lpips | None) -> dict[str, Any]:
+    scene = trainer.scene
+    save_ply(new / "splat.ply", trainer.model, offset=scene.offset)
+    write_curve(new / "curve.png", {"": trainer.curve})
+    (new / "test").mkdir(exist_ok=True)
+    for i, name in enumerate(scene.test.names):
+        write_png(new / "test" / names[name], trainer.render(scene.test.camera(i))[0])
+    metrics = measure(trainer, lpips)
+    write_json(new / "metrics.json", metrics)
+    return metrics
 
 
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
@@ -133,7 +186,7 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
     """Train to the end with a progress line and checkpoints, each minute and at evaluations.
 
-    On Ctrl-C or SIGTERM the step is finished and saved. A checkpoint that cannot be written (a full disk) stops
+    On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved. A checkpoint that cannot be written (a full disk) stops
     nothing: a note says so, and the next one is tried.
 
     Returns:
@@ -151,21 +204,10 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
         except OSError as error:
             trainer.notes.append(f"step {trainer.step}: no checkpoint: {error}")
 
-    with (
-        _interruptible() as stopped,
-        tqdm(
-            total=trainer.config.steps,
-            initial=trainer.step,
-            desc=title,
-            unit="step",
-            mininterval=0.5,
-            file=sys.stderr,
-        ) as bar,
-    ):
+    with _interruptible() as stopped, progress(trainer.config.steps, title, trainer.step) as advance:
 
         def after_step(trainer: Trainer, loss: float) -> bool:
-            bar.set_postfix(loss=f"{loss:.4f}", gaussians=str(len(trainer.model)), refresh=False)
-            bar.update()
+            advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")
             if trainer.step in trainer.times.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
                 save()
             return bool(stopped)
@@ -201,16 +243,19 @@ def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """The signals that came: Ctrl-C and SIGTERM are only noted; a second one acts as usual."""
+    """The signals that came: Ctrl-C, SIGTERM and SIGHUP are only noted; a second one acts as usual.
+
+    One that is ignored (SIGHUP under nohup) stays so.
+    """
     came: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield came
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    is_main = threading.current_thread() is threading.main_thread()
+    found = {number: signal.getsignal(number) for number in numbers if is_main}
+    before = {number: handler for number, handler in found.items() if handler not in (None, signal.SIG_IGN)}
 
     def note(number: int, _: object) -> None:
         came.append(number)
-        signal.signal(number, before[signal.Signals(number)])
+        signal.signal(number, before[number])
 
     for number in before:
         signal.signal(number, note)

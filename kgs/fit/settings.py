@@ -18,10 +18,9 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import newest_checkpoint
 from .config import FitConfig
+from .folder import CHECKPOINT, recover
 
-__all__ = ["CHECKPOINT", "SavedFit", "load_fit", "read_settings"]
-
-CHECKPOINT = "checkpoint.pt"
+__all__ = ["SavedFit", "load_fit", "read_settings"]
 
 _CHOICES: dict[str, tuple[Any, ...]] = {"background": ("black", "white"), "points": ("none", "model-points")}
 
@@ -94,6 +93,7 @@ def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
     Raises:
         DataError: config.json or the checkpoint is missing or damaged.
     """
+    recover(out)
     request, config = read_settings(out / "config.json")
     path = out / CHECKPOINT
     state, _ = newest_checkpoint(path)

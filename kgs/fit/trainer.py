@@ -6,6 +6,7 @@ DropGaussian. Two fits that differ in the drop rate alone therefore see the same
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Callable
@@ -25,12 +26,12 @@ from kgs.losses import TargetMoments, opacity_l1, photometric_loss, target_momen
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .checkpoint import newest_checkpoint, save_checkpoint
+from .checkpoint import check_state, fingerprint, load_moments, newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
+from .machine import check_device
 from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
-from .state import check_state, restore, trainer_state
 
 __all__ = ["Trainer"]
 
@@ -43,6 +44,7 @@ _GROUPS = {
     "sh_rest": "lr_sh_rest",
 }
 # Measured, with some room; the first is what libraries load when they are used for the first time.
+_ROOM, _LITTLE = 1.25, "--max-gaussians"
 _BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 
 
@@ -68,27 +70,32 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
-        self.scene = scene
-        self.config = config
-        self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
-        self.device = torch.device(config.device)
+        self._prepare(scene, config)
         nearest, median = typical_depths(scene.train, points.points)
         # a rig without extent (one camera, or a pure rotation) still has to move its Gaussians
         self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)
-        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 2 * len(points.points))
-        model = GaussianModel.from_points(points.points, points.colors, config.sh_degree)
+        self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
+        model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree)
         model.sh_degree = 0
         self._build(model, config.recipe.near_plane * nearest)
-        self.step = 0
-        self.seconds = 0.0
+
+    def _prepare(self, scene: Scene, config: FitConfig) -> None:
+        """All that follows from the scene and the configuration alone."""
+        self.scene, self.config, self.device = scene, config, check_device(config.device)
+        self.times = timetable(config)
+        self.step, self.seconds = 0, 0.0
         self.curve: list[dict[str, float | None]] = []
         self.notes: list[str] = []
         self.saved = ""
         self.stack: list[int] = []
+        self._background = scene.background.to(self.device, torch.float32)
+        self._views = self._targets(scene.train)
+        self._coarse_views = self._targets(scene.train.halved()) if self.times.coarse else []
 
     def _build(self, model: GaussianModel, near_plane: float) -> None:
         config, recipe = self.config, self.config.recipe
-        self.times = timetable(config)
+        first = int(self.init["points"])
+        self.max_gaussians = max(10 * config.steps, 2 * first) if config.max_gaussians is None else config.max_gaussians
         self.model = model.to(self.device)
         groups = [
             {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, rate), "name": name}
@@ -108,15 +115,12 @@ class Trainer:
             generator=torch.Generator().manual_seed(_seed(config, 2)),
         )
         self.order = torch.Generator().manual_seed(_seed(config, 3))
-        self._background = self.scene.background.to(self.device)
-        self._views = self._targets(self.scene.train)
-        self._coarse_views = self._targets(self.scene.train.halved()) if self.times.coarse else []
 
     def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
         """What a step needs of each view: its camera, its image and what D-SSIM wants of that."""
         targets = []
         for i in range(len(views)):
-            image = views.images[i : i + 1].to(self.device)
+            image = views.images[i : i + 1].to(self.device, torch.float32)
             targets.append((move_camera(views.camera(i), self.device), image, target_moments(image)))
         return targets
 
@@ -173,11 +177,11 @@ class Trainer:
         if step in self.times.densify:
             self._stop_if(scale_fault(self.model, self.extent))
             self.densifier.max_gaussians = limit = self._limit()
-            capped = self.densifier.step().capped
-            if capped and limit == self.max_gaussians and not any("max_gaussians" in note for note in self.notes):
+            capped, first = self.densifier.step().capped, int(self.init["points"])
+            if capped and limit == self.max_gaussians < _ROOM * first and not any(_LITTLE in n for n in self.notes):
                 self.notes.append(
-                    f"step {step}: {capped} Gaussians were not densified, to keep their number at "
-                    f"max_gaussians = {self.max_gaussians}; raise it with --max-gaussians"
+                    f"step {step}: {_LITTLE} {self.max_gaussians} leaves little room beside the {first} first points: "
+                    f"{capped} Gaussians that should have been cloned or split were not"
                 )
         if step in self.times.reset:
             self.densifier.reset_opacity(self.config.recipe.reset_opacity)
@@ -193,20 +197,73 @@ class Trainer:
         return image
 
     def psnr(self, views: Views) -> float | None:
-        """Mean PSNR over some views in dB, clamped renders; None where there are none."""
+        """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
         values = [
-            float(psnr(self.render(views.camera(i)).clamp(0, 1).cpu(), views.images[i : i + 1], 1.0))
+            float(psnr(self.render(views.camera(i)).clamp(0, 1).cpu(), views.images[i : i + 1].float(), 1.0))
             for i in range(len(views))
         ]
-        return round(sum(values) / len(values), 4) if values else None
+        mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
+        return round(mean, 4) if math.isfinite(mean) else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the rest of the fit depends on, copied: nested dicts of tensors and plain values."""
+        moments = self.optimizer.state
+        state = {
+            "config": self.config.to_dict(),
+            "scene": fingerprint(self.scene),
+            "init": self.init,
+            "step": self.step,
+            "seconds": self.seconds,
+            "curve": self.curve,
+            "notes": self.notes,
+            "extent": self.extent,
+            "near_plane": self.renderer.near_plane,
+            "sh_degree": self.model.sh_degree,
+            "stack": self.stack,
+            "model": self.model.state_dict(),
+            "optimizer": {group["name"]: moments.get(group["params"][0], {}) for group in self.optimizer.param_groups},
+            "densifier": self.densifier.state_dict(),
+            "order": self.order.get_state(),
+            "drop": None if self.drop is None else self.drop.get_rng_state(),
+        }
+        return copy.deepcopy(state)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from where :meth:`state_dict` was taken, bit for bit; on another device if need be.
+
+        The scene and the configuration must be those of the state. Only a fit that had done all its steps may go on
+        with a larger `steps`; `notes` then says what that means.
+
+        Raises:
+            ValueError: they are others, or an entry is missing or wrong; the message begins with its name. The trainer
+                cannot be used any more.
+        """
+        try:
+            longer = check_state(state, self.scene, self.config)
+            self.init, self.extent = dict(state["init"]), state["extent"]
+            model = GaussianModel(**state["model"], sh_degree=state["sh_degree"])
+            if model.max_sh_degree != self.config.sh_degree or model.means.dtype != torch.float32:
+                raise ValueError(f"model: expected float32 and harmonics of degree {self.config.sh_degree}, got others")
+            self._build(model, state["near_plane"])
+            load_moments(self.optimizer, state["optimizer"])
+            self.densifier.load_state_dict(state["densifier"])
+            self.order.set_state(state["order"])
+            if self.drop is not None:
+                self.drop.set_rng_state(state["drop"])
+        except KeyError as error:
+            raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
+        except (AttributeError, RuntimeError, TypeError) as error:
+            raise ValueError(f"state: {error}") from error
+        self.step, self.seconds, self.stack = state["step"], state["seconds"], list(state["stack"])
+        self.curve, self.notes = [dict(point) for point in state["curve"]], [*state["notes"], *longer]
 
     def save(self, path: Path) -> None:
-        """Write everything that the rest of the fit depends on.
+        """Write :meth:`state_dict` to a file, see :func:`save_checkpoint`.
 
         Raises:
             OSError: the file cannot be written; earlier ones are untouched.
         """
-        save_checkpoint(path, trainer_state(self))
+        save_checkpoint(path, self.state_dict())
         self.saved = f"{path} of step {self.step}"
 
     @classmethod
@@ -219,21 +276,13 @@ class Trainer:
             DataError: both files are damaged, or they belong to another scene or configuration.
         """
         state, damage = newest_checkpoint(path)
-        check_state(path, state, scene, config)
         trainer = cls.__new__(cls)
-        trainer.scene, trainer.config, trainer.device = scene, config, torch.device(config.device)
-        trainer.init, trainer.extent, trainer.max_gaussians = state["init"], state["extent"], state["max_gaussians"]
+        trainer._prepare(scene, config)
         try:
-            model = GaussianModel(**state["model"], sh_degree=state["sh_degree"])
-        except (TypeError, ValueError) as error:
-            raise DataError(path, "model", str(error)) from error
-        trainer._build(model, state["near_plane"])
-        try:
-            restore(trainer, state)
-        except KeyError as error:
-            raise DataError(path, str(error.args[0]), "expected this entry in the checkpoint, got none") from error
-        except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-            raise DataError(path, "state", str(error)) from error
+            trainer.load_state_dict(state)
+        except ValueError as error:
+            field, _, reason = str(error).partition(": ")
+            raise DataError(path, field, reason) from error
         trainer.saved = f"{path} of step {trainer.step}"
         if damage:
             trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
@@ -246,7 +295,8 @@ class Trainer:
         self.optimizer.param_groups[0]["lr"] = self.extent * math.exp(
             (1 - progress) * math.log(recipe.lr_means) + progress * math.log(recipe.lr_means_final)
         )
-        self.model.sh_degree = sum(self.step >= step for step in self.times.sh)
+        degree = sum(self.step >= step for step in self.times.sh)
+        self.model.sh_degree = max(self.model.sh_degree, degree)  # a fit that is trained on keeps what it has
         views = self._coarse_views if self.step <= self.times.coarse else self._views
         camera, target, moments = views[self._next_view()]
         if self.drop is not None:

@@ -22,7 +22,7 @@ from fits import PATIENCE, Fit, memory_of
 
 from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
-from kgs.fit.run import CHECKPOINT
+from kgs.fit.folder import CHECKPOINT, UNFINISHED
 
 SHORT, LONG = 45, 450  # steps
 
@@ -55,7 +55,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
     steps, expected = alone
     trials, longest = (30, 0.6) if steps == LONG else (2, 0.1)
     fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
-    path, corrupt, fallen_back, different, fits, kills = fit.out / CHECKPOINT, 0, 0, 0, 0, 0
+    path, corrupt, fallen_back, different, fits, kills = fit.out / UNFINISHED / CHECKPOINT, 0, 0, 0, 0, 0
     while kills < trials:
         process = fit.start()
         if fit.wait_for_steps(process):
@@ -68,7 +68,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
             fits += 1
             shutil.rmtree(fit.out)
             continue
-        if not fit.out.exists() or not any(fit.out.glob(f"{path.stem}*{path.suffix}")):
+        if not any(path.parent.glob(f"{path.stem}*{path.suffix}")):
             continue
         try:
             load_checkpoint(path)
@@ -102,10 +102,10 @@ def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..
     process.join(PATIENCE)
     code = process.exitcode
     try:
-        step = newest_checkpoint(fit.out / CHECKPOINT)[0]["step"]
+        step = newest_checkpoint(fit.out / UNFINISHED / CHECKPOINT)[0]["step"]
     except DataError:
         step = -1
-    partial = [path.name for path in fit.out.glob("*.partial")]
+    partial = [path.name for path in fit.out.rglob("*.partial")]
     same = fit.finish() == alone[1]
     found = f"the checkpoint of step {step} is whole, {len(partial)} partial files; resumed: {_bits(same)}"
     record("full disk", 1, int(step < 0), found, code != 0 and step > 0 and not partial and same)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
+import json
 import random
 import struct
 import zipfile
@@ -12,8 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import safetensors.torch
 from mutations import Mutator
 from torch import Tensor
+
+from kgs.fit.checkpoint import _digest_all
 
 __all__ = ["Reader", "Target", "Unsound", "check_range", "inside_checkpoint", "inside_png", "inside_zip"]
 
@@ -70,14 +73,23 @@ def check_range(name: str, value: Tensor, low: float = -1e30, high: float = 1e30
 
 
 def inside_checkpoint(mutate: Mutator, part: int) -> Mutator:
-    """Damage to a checkpoint's description (part 1) or to its tensors (part 2), with the checksum made right again."""
+    """Damage to a checkpoint's JSON (part 1) or to its tensors (part 2), with the checksum made right again."""
 
     def mutate_part(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-        parts = data.split(b"\n", 2)
-        parts[part], what = mutate(parts[part], rng)
-        body = parts[1] + b"\n" + parts[2]
-        head = parts[0][:-64] + hashlib.sha256(body).hexdigest().encode()
-        return head + b"\n" + body, f"part {part}, checksum right: {what}"
+        size = int.from_bytes(data[:8], "little")
+        header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
+        metadata = header["__metadata__"]
+        if part == 1:
+            text, what = mutate(metadata["state"].encode(), rng)
+            metadata["state"] = text.decode(errors="replace")
+        else:
+            body, what = mutate(body, rng)
+            body = body[: len(data) - 8 - size].ljust(len(data) - 8 - size, b"\0")  # of the size in the header
+        head = json.dumps(header).encode()
+        tensors = safetensors.torch.load(len(head).to_bytes(8, "little") + head + body)
+        metadata["sha256"] = _digest_all(metadata["state"], tensors)
+        head = json.dumps(header).encode()
+        return len(head).to_bytes(8, "little") + head + body, f"part {part}, checksum right: {what}"
 
     return mutate_part
 

@@ -79,11 +79,11 @@ def _write_checkpoint(folder: Path) -> None:
     points = torch.rand(_POINTS, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 4.0])
     trainer = Trainer(_scene(), _CONFIG, FirstPoints(points, torch.full((_POINTS, 3), 0.5), "random"))
     trainer.fit(lambda trainer, _: trainer.step == 2)
-    trainer.save(folder / "checkpoint.pt")
+    trainer.save(folder / "checkpoint.safetensors")
 
 
 def _read_checkpoint(folder: Path) -> None:
-    trainer = Trainer.resume(_scene(), _CONFIG, folder / "checkpoint.pt")
+    trainer = Trainer.resume(_scene(), _CONFIG, folder / "checkpoint.safetensors")
     for name, value in trainer.model.state_dict().items():
         check_range(name, value, -3.5e38, 3.5e38)
     for parameter, state in trainer.optimizer.state.items():
@@ -151,7 +151,7 @@ SCENE_READERS = (
     Reader("nerfstudio", write_nerfstudio, _read, (Target("transforms.json", mutate_json),)),
 )
 _PNG, _HEADS = "image.png", "lpips_lin_alexnet.npz"
-_CHECKPOINT = "checkpoint.pt"
+_CHECKPOINT = "checkpoint.safetensors"
 _CLOUDS = {"ply": Target("points.ply", mutate_bytes), "xyz": Target("points.xyz", mutate_words)}
 FILE_READERS = (
     Reader("PLY, binary", write_ply, _read_ply, (Target("splat.ply", mutate_bytes),)),
