@@ -1,9 +1,7 @@
 """Adaptive density control: clone, split and prune Gaussians while they are being fitted, and reset opacities.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023, section 5.2, with the numbers of the DropGaussian
-recipe (threshold 5e-4, pruning by opacity alone).
-
-This is the only place where the number of Gaussians changes, and with it the optimiser's state.
+recipe (threshold 5e-4, pruning by opacity alone). Only here does the number of Gaussians change in a fit.
 """
 
 from __future__ import annotations
@@ -57,9 +55,8 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: holds each of the model's parameters, and other ones that are left alone. Any whose state for a
-            parameter is made of tensors of its shape that begin at 0, and scalars: Adam and its kin, SGD, RMSprop,
-            Adagrad; not LBFGS, Adafactor and Rprop.
+        optimizer: holds each of the model's parameters, and other ones that are left alone. Its state for a parameter
+            is made of scalars and tensors of its shape that begin at 0: Adam, SGD, RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
@@ -69,7 +66,7 @@ class Densifier:
 
     Raises:
         ValueError: a number is out of range, or the optimizer does not hold the model's parameters or keeps another
-            state; the latter from `step` and `reset_opacity` too, which change nothing then.
+            state (from `step` and `reset_opacity` too, which then change nothing).
 
     Example:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
@@ -90,15 +87,16 @@ class Densifier:
         max_gaussians: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        for name, number in (("extent", extent), ("percent_dense", percent_dense)):
-            if not 0.0 < number < math.inf:
-                raise ValueError(f"{name}: expected a finite number > 0, got {number}")
-        if not grad_threshold >= 0.0:
-            raise ValueError(f"grad_threshold: expected a number >= 0, got {grad_threshold}")
-        if not 0.0 <= prune_opacity <= 1.0:
-            raise ValueError(f"prune_opacity: expected a number in [0, 1], got {prune_opacity}")
-        if max_gaussians is not None and (max_gaussians % 1 != 0 or max_gaussians < 1):
-            raise ValueError(f"max_gaussians: expected an integer >= 1 or None, got {max_gaussians}")
+        most = 1 if max_gaussians is None else max_gaussians
+        for name, number, fits, expected in (
+            ("extent", extent, 0.0 < extent < math.inf, "a finite number > 0"),
+            ("percent_dense", percent_dense, 0.0 < percent_dense < math.inf, "a finite number > 0"),
+            ("grad_threshold", grad_threshold, grad_threshold >= 0.0, "a number >= 0"),
+            ("prune_opacity", prune_opacity, 0.0 <= prune_opacity <= 1.0, "a number in [0, 1]"),
+            ("max_gaussians", max_gaussians, most >= 1 and most % 1 == 0, "an integer >= 1 or None"),
+        ):
+            if not fits:
+                raise ValueError(f"{name}: expected {expected}, got {number}")
         if isinstance(optimizer, _NOT_BY_ROWS):
             raise ValueError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
         self.model = model
@@ -122,27 +120,21 @@ class Densifier:
 
     @torch.no_grad()
     def observe(self, projected: ProjectedGaussians) -> None:
-        """Take the gradients of one render into account; call it after `backward`.
-
-        Args:
-            projected: what the renderer returned; every listed pair counts as seen.
+        """Take the gradients of one render into account, of which every listed pair counts as seen.
 
         Raises:
-            ValueError: `projected.means2d` has no gradient, or the number of Gaussians is another.
+            ValueError: `projected.means2d` has no gradient (call it after `backward`), or the number of Gaussians is
+                another.
         """
         self._check()
-        if projected.num_gaussians != len(self.model):
-            raise ValueError(
-                f"projected: expected a render of the model's {len(self.model)} Gaussians, "
-                f"got one of {projected.num_gaussians}"
-            )
+        count, expected = projected.num_gaussians, len(self.model)
+        if count != expected:
+            raise ValueError(f"projected: expected a render of the model's {expected} Gaussians, got one of {count}")
         if len(projected) == 0:
             return
         gradient = projected.means2d.grad
         if gradient is None:
-            raise ValueError(
-                "projected: expected means2d.grad, got None; render with gradients on and call observe after backward"
-            )
+            raise ValueError("projected: expected means2d.grad, got None; call observe after backward")
         height, width = projected.image_size
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         ids = projected.gaussian_ids
@@ -180,11 +172,7 @@ class Densifier:
 
     @torch.no_grad()
     def reset_opacity(self, ceiling: float = 0.01) -> None:
-        """Lower all opacities to at most `ceiling`, in (0, 1), and zero their Adam moments (not the step count).
-
-        Raises:
-            ValueError: `ceiling` is not in (0, 1).
-        """
+        """Lower all opacities to at most `ceiling`, in (0, 1) (else a ValueError), and zero their moments."""
         if not 0.0 < ceiling < 1.0:
             raise ValueError(f"ceiling: expected a number in (0, 1), got {ceiling}")
         self._check()
@@ -206,12 +194,13 @@ class Densifier:
         Raises:
             ValueError: an entry is missing, or the number of Gaussians is another.
         """
-        missing = {"gradient_sums", "counts", "last_gradients", "generator"} - state.keys()
+        names, shape = ("gradient_sums", "counts", "last_gradients"), (len(self.model),)
+        missing = {*names, "generator"} - state.keys()
         if missing:
             raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
-        for name in ("gradient_sums", "counts", "last_gradients"):
-            if state[name].shape != (len(self.model),):
-                raise ValueError(f"{name}: expected shape ({len(self.model)},), got {tuple(state[name].shape)}")
+        for name in names:
+            if state[name].shape != shape:
+                raise ValueError(f"{name}: expected shape {shape}, got {tuple(state[name].shape)}")
         self._reset_statistics(state["last_gradients"].to(self.model.means, copy=True))
         self._gradient_sums.copy_(state["gradient_sums"])
         self._counts.copy_(state["counts"])
@@ -227,15 +216,14 @@ class Densifier:
         for name, parameter in self.model.named_parameters():
             if id(parameter) not in held:
                 raise ValueError(f"optimizer: expected it to hold all of the model's parameters, got none for {name}")
+            shape = tuple(parameter.shape)
             for key, entry in self.optimizer.state.get(parameter, {}).items():
-                if isinstance(entry, Tensor) and entry.numel() != 1 and entry.shape != parameter.shape:
-                    raise ValueError(
-                        f"optimizer: expected the state {key} of {name} to have shape {tuple(parameter.shape)}, "
-                        f"got {tuple(entry.shape)}"
-                    )
+                if isinstance(entry, Tensor) and entry.numel() != 1 and entry.shape != shape:
+                    got = tuple(entry.shape)
+                    raise ValueError(f"optimizer: expected the state {key} of {name} to have shape {shape}, got {got}")
 
     def _choose(self, hot: Tensor, average: Tensor, remaining: int) -> tuple[Tensor, int]:
-        """Leave of `hot` no more than may be added (each one adds 1), the largest first; and how many were left out."""
+        """Of `hot` no more than may be added (each adds 1), the largest first, and how many were left out."""
         wanted = int(hot.sum())
         room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - remaining)
         if wanted <= room:
@@ -257,10 +245,8 @@ class Densifier:
     def _replace(self, name: str, value: Tensor, kept: Tensor) -> None:
         """Put `value` in the place of a parameter, in the model, the param group and the optimizer's state.
 
-        State that has the parameter's shape (Adam's moments) begins with the old rows `kept` and goes on with zeros.
-
-        A new Parameter rather than new data in the old one: an old graph that is still alive would hold the latter to
-        its old shape in the next backward.
+        State that has the parameter's shape (Adam's moments) begins with the old rows `kept` and goes on with zeros. A
+        new Parameter rather than new data in the old one, which a graph that is alive would hold to its old shape.
         """
         old = self.model.get_parameter(name)
         new = nn.Parameter(value, requires_grad=old.requires_grad)
@@ -290,13 +276,10 @@ def camera_extent(extrinsics: Tensor) -> float:
         World-to-camera matrices [R | t] with a rotation R: the centre is -R^T t.
 
     Args:
-        extrinsics: `(C, 4, 4)`, C >= 1.
+        extrinsics: `(C, 4, 4)`, C >= 1, else a ValueError.
 
     Returns:
         The extent in world units; 0 for a single camera.
-
-    Raises:
-        ValueError: `extrinsics` has another shape.
     """
     if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
         raise ValueError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")

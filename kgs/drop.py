@@ -76,11 +76,9 @@ class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
     The rate of a call is `p * schedule(progress)`. `progress` is a plain attribute in [0, 1] that the training loop
-    sets; it defaults to 1, so that a layer whose progress is never set is plain dropout at p. The `state_dict` is
+    sets; it defaults to 1, so that a layer whose progress is never set is plain dropout at p. A layer warns once if
+    that is so, and once if opacities on the CPU lie outside [0, 1]: those are probably logits. The `state_dict` is
     empty, whatever is assigned to the layer.
-
-    A layer warns once if its progress was never set, and once if opacities on the CPU lie outside [0, 1]: those are
-    probably logits.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
@@ -108,17 +106,15 @@ class DropGaussian(nn.Module):
         self, p: float = 0.2, schedule: str | Callable[[float], float] = "linear", seed: int | None = None
     ) -> None:
         super().__init__()
-        if isinstance(schedule, str) and schedule not in SCHEDULES:
+        if not (schedule in SCHEDULES if isinstance(schedule, str) else callable(schedule)):
             raise ValueError(f"schedule: expected one of {sorted(SCHEDULES)} or a callable, got {schedule!r}")
-        if not isinstance(schedule, str) and not callable(schedule):
-            raise ValueError(f"schedule: expected a name or a callable, got {schedule!r}")
         if seed is not None and not _is_seed(seed):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
         self.seed = seed
         self._progress: float | None = None
-        # Objects, not values: shallow copies such as the replicas of nn.DataParallel share and advance them.
+        # objects, not values: shallow copies such as the replicas of nn.DataParallel share and advance them
         self._warned: set[str] = set()
         self._stream = None if seed is None else torch.Generator("cpu").manual_seed(int(seed))
 
@@ -141,21 +137,19 @@ class DropGaussian(nn.Module):
         if not self.training:
             return opacities
         if self._progress is None and self.schedule is not constant:
+            message = (
+                f"progress was never set, so the schedule has no effect and the rate is {self.rate:g} throughout; "
+            )
             self._warn_once(
-                "progress",
-                f"DropGaussian: progress was never set, so the schedule has no effect and the rate is {self.rate:g} "
-                "throughout; set `drop.progress = step / total_steps` in the loop, or schedule='constant'",
+                "progress", message + "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
             )
         dropped = drop_gaussian(opacities, self.rate, True, self._stream)
-        if "values" not in self._warned and opacities.device.type == "cpu" and not torch.compiler.is_compiling():
+        if opacities.device.type == "cpu" and not torch.compiler.is_compiling():
             with contextlib.suppress(RuntimeError, IndexError):  # none, or inside vmap: no values to look at
                 low, high = opacities.detach().aminmax()
                 if low < 0 or high > 1:
-                    self._warn_once(
-                        "values",
-                        f"DropGaussian: expected opacities in [0, 1], got {low:.3g} to {high:.3g}; the layer belongs "
-                        "behind their activation (sigmoid), not on logits",
-                    )
+                    message = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits, "
+                    self._warn_once("values", f"{message}got {low:.3g} to {high:.3g}")
         return dropped
 
     def get_rng_state(self) -> Tensor:
@@ -185,7 +179,7 @@ class DropGaussian(nn.Module):
     def _warn_once(self, kind: str, message: str) -> None:
         if kind not in self._warned:
             self._warned.add(kind)
-            warnings.warn(message, stacklevel=3)
+            warnings.warn(f"DropGaussian: {message}", stacklevel=3)
 
     def _replicate_for_data_parallel(self) -> DropGaussian:
         replica: DropGaussian = super()._replicate_for_data_parallel()

@@ -1,4 +1,4 @@
-"""The two errors of kgs that are not a wrong argument: a bad file, and a training run that left the numbers."""
+"""The errors of kgs that are not a wrong argument: a bad file, and a fit whose numbers are no longer finite."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON from files that nobody vouches for: every number finite, a limit on the size, one kind of error."""
+"""JSON from files of unknown origin: every number finite, a limit on the size, one kind of error."""
 
 from __future__ import annotations
 
@@ -15,13 +15,10 @@ _MOST_BYTES = 64 * 2**20
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object from UTF-8 text.
-
-    Integers may be of any size; where a key is there twice, the last one counts.
+    """Read a JSON object from UTF-8 text: integers of any size; of a key that is repeated, the last value.
 
     Raises:
-        DataError: the file is missing, larger than 64 MiB, no JSON (NaN and Infinity are none), nested too deep, holds
-            a number beyond float64, or is no object.
+        DataError: the file is missing, larger than 64 MiB, not an object, or what :func:`parse_json` refuses.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -37,7 +34,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(text: bytes) -> Any:
-    """The value that UTF-8 text stands for.
+    """The value that UTF-8 text stands for, which may begin with a byte order mark.
 
     Raises:
         ValueError: it is no JSON (NaN and Infinity are none), nested too deep, or holds a number beyond float64.

@@ -1,8 +1,7 @@
 """The parameters of a splat: what the optimiser sees, and the activations that make Gaussians of them.
 
-Source: B. Kerbl, G. Kopanas, T. Leimkühler, G. Drettakis, "3D Gaussian Splatting for Real-Time Radiance Field
-Rendering", SIGGRAPH 2023, section 5: exponential for scales, sigmoid for opacities, isotropic start with the mean
-distance to the three nearest points.
+Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023, section 5:
+exponential for scales, sigmoid for opacities, isotropic start with the mean distance to the three nearest points.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ class GaussianModel(nn.Module):
 
     The harmonics are two parameters because they have two learning rates. `state_dict()` holds the six parameters and
     the active degree: `GaussianModel(**state_dict)` makes the same model again, and `load_state_dict` takes over the
-    number of Gaussians and both degrees too. The parameters stay the same objects, so that an optimiser goes on
-    holding them; its own state has to be loaded after a change of size.
+    number of Gaussians and both degrees. An optimiser goes on holding the parameters; load its state after them.
 
     Args:
         means: centres in world units, `(N, 3)`, float32 or float64.
@@ -78,18 +76,15 @@ class GaussianModel(nn.Module):
         for name, value in zip(PARAMETERS, values, strict=True):
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"{name}: expected float32 or float64, got {getattr(value, 'dtype', type(value))}")
-            if value.dtype != means.dtype or value.device != means.device:
-                raise TypeError(
-                    f"{name}: expected {means.dtype} on {means.device} as means, got {value.dtype} on {value.device}"
-                )
+            if (value.dtype, value.device) != (means.dtype, means.device):
+                wanted = f"{means.dtype} on {means.device} as means"
+                raise TypeError(f"{name}: expected {wanted}, got {value.dtype} on {value.device}")
         _check_shapes(values)
         for name, value in zip(PARAMETERS, values, strict=True):
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
-        self.sh_degree = self.max_sh_degree
-        if sh_degree is not None:
-            self.sh_degree = sh_degree
-        elif _extra_state is not None:
-            self.set_extra_state(_extra_state)
+        if sh_degree is None:
+            sh_degree = self.max_sh_degree if _extra_state is None else int(_extra_state)
+        self.sh_degree = sh_degree
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> GaussianModel:
@@ -113,25 +108,18 @@ class GaussianModel(nn.Module):
         if not colors.is_floating_point():
             raise TypeError(f"colors: expected floating point values in [0, 1], got {colors.dtype}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
-            raise ValueError(
-                f"points, colors: expected two of shape (N, 3), got {tuple(points.shape)} and {tuple(colors.shape)}"
-            )
+            got = f"{tuple(points.shape)} and {tuple(colors.shape)}"
+            raise ValueError(f"points, colors: expected two of shape (N, 3), got {got}")
         for name, value in (("points", points), ("colors", colors)):
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
         _check_degree(sh_degree, len(SH_SIZES) - 1)
-        points = points.detach()
-        n = len(points)
-        log_scales = log_spacing(points).to(points)
-        dc = (colors.detach().to(points) - 0.5) / SH_C0
-        return cls(
-            means=points,
-            quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            log_scales=log_scales[:, None].repeat(1, 3),
-            opacity_logits=points.new_full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
-            sh_dc=dc[:, None, :],
-            sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),
-        )
+        points, n = points.detach(), len(points)
+        quats = points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+        log_scales = log_spacing(points).to(points)[:, None].repeat(1, 3)
+        logits = points.new_full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)))
+        sh_dc = ((colors.detach().to(points) - 0.5) / SH_C0)[:, None]
+        return cls(points, quats, log_scales, logits, sh_dc, points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3))
 
     @property
     def max_sh_degree(self) -> int:
@@ -155,13 +143,8 @@ class GaussianModel(nn.Module):
             colors = torch.cat([self.sh_dc, active], dim=1)
         # where exp is infinite (that Gaussian is not drawn) its gradient would be 0 times infinity
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
-        return Gaussians(
-            means=self.means,
-            quats=self.quats,
-            scales=self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf),
-            opacities=self.opacity_logits.sigmoid(),
-            colors=colors,
-        )
+        scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
+        return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)
 
     def __len__(self) -> int:
         return self.means.shape[0]

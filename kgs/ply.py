@@ -56,42 +56,25 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
     n, means = len(model), values["means"].astype(np.float64)
     if offset is not None:  # not + 0: that would lose the sign of zero
         means += _vector("offset", offset)
+    rest = values["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * model.sh_rest.shape[1])
+    parts = [means, np.zeros((n, 3)), values["sh_dc"][:, 0], rest, values["opacity_logits"][:, None]]
     with np.errstate(over="ignore"):
-        columns = np.concatenate(
-            [
-                means,
-                np.zeros((n, 3)),
-                values["sh_dc"][:, 0],
-                values["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * model.sh_rest.shape[1]),
-                values["opacity_logits"][:, None],
-                values["log_scales"],
-                values["quats"],
-            ],
-            axis=1,
-            dtype="<f4",
-            casting="unsafe",
-        )
-    names = [*"xyz", "nx", "ny", "nz", *_splat_names(model.sh_rest.shape[1])]
+        columns = np.hstack([*parts, values["log_scales"], values["quats"]], dtype="<f4", casting="unsafe")
+    names = [*"xyz", "nx", "ny", "nz", *_splat_names(rest.shape[1])]
     bad = np.flatnonzero(~np.isfinite(columns).all(axis=0))
     if len(bad):
         raise ValueError(f"model: expected values that are finite in float32, got others in {names[bad[0]]}")
     double = _float32_moves(means, values["log_scales"])
     if double:
-        columns = np.concatenate([means.astype("<f8").view("<f4"), columns[:, 3:]], axis=1)
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment kgs sh_degree {model.sh_degree}",
-        f"element vertex {n}",
-        *(f"property {'double' if double and name in 'xyz' else 'float'} {name}" for name in names),
-        "end_header\n",
-    ]
+        columns = np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
+    kinds = ("double" if double and name in "xyz" else "float" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\ncomment kgs sh_degree {model.sh_degree}\nelement vertex {n}\n"
+    header += "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, names, strict=True)) + "end_header\n"
     target = Path(os.path.realpath(path))
     unfinished = target.with_name(f".kgs-{uuid.uuid4().hex}.tmp")
     try:
         with open(unfinished, "wb") as file:
-            file.write("\n".join(header).encode("ascii"))
-            file.write(columns.tobytes())
+            file.write(header.encode("ascii") + columns.tobytes())
         os.replace(unfinished, target)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -120,12 +103,22 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     try:
         with open(path, "rb") as file:
             header = _read_header(path, file)
-            vertex, names = _splat_element(path, header)
-            columns = _read_columns(path, header, vertex, file)
+            vertices = [element for element in header.elements if element.name == "vertex"]
+            if len(vertices) != 1:
+                raise DataError(path, "vertex", f"expected one element of that name, got {len(vertices)}")
+            rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices[0].properties)
+            sizes = [3 * (k - 1) for k in SH_SIZES]
+            if rest not in sizes:
+                raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
+            names = [*"xyz", *_splat_names(rest)]
+            for name in names:
+                if name not in vertices[0].properties:
+                    raise DataError(path, name, "expected this property of a splat, got none")
+            columns = _read_columns(path, header, vertices[0], file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
-        raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
+        raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertices[0].count}") from error
 
     means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - start
     with np.errstate(over="ignore"):
@@ -134,22 +127,13 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     if len(bad):
         row, column = bad[0]
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
-
-    n, rest = len(table), len(names) - 14
     means32, dc, sh_rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
     if _float32_moves(means, scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
-    degree = SH_SIZES.index(rest // 3 + 1)
-    return GaussianModel(
-        means=means32,
-        quats=quats,
-        log_scales=scales,
-        opacity_logits=opacity[:, 0],
-        sh_dc=dc.reshape(n, 1, 3),
-        sh_rest=sh_rest.reshape(n, 3, rest // 3).mT,
-        sh_degree=degree if header.sh_degree is None else min(header.sh_degree, degree),
-    )
+    sh_rest = sh_rest.unflatten(1, (3, rest // 3)).mT
+    degree = min(sizes.index(rest), 3 if header.sh_degree is None else header.sh_degree)
+    return GaussianModel(means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, degree)
 
 
 def _vector(name: str, value: Tensor) -> NDArray[np.float64]:
@@ -178,9 +162,9 @@ class _Element:
     def dtype(self, order: str) -> np.dtype[np.void]:
         return np.dtype([(name, BYTE_ORDERS[order] + code) for name, code in self.properties.items()])
 
-    def width(self, order: str) -> int:
-        """How many bytes, or words of text, one of it takes."""
-        return len(self.properties) if order == "ascii" else self.dtype(order).itemsize
+    def size(self, order: str) -> int:
+        """How many bytes, or words of text, all of it takes."""
+        return self.count * (len(self.properties) if order == "ascii" else self.dtype(order).itemsize)
 
 
 @dataclass
@@ -191,14 +175,9 @@ class _Header:
 
 
 def _splat_names(rest: int) -> list[str]:
-    """The properties after the position and normal, for so many harmonics above degree 0."""
-    return [
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(3 * rest)),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
+    """The properties after the position and normal, with so many of f_rest."""
+    colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
+    return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
 def _read_header(path: Path, file: BinaryIO) -> _Header:
@@ -232,43 +211,21 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
     return _Header(order, elements, degree)
 
 
-def _splat_element(path: Path, header: _Header) -> tuple[_Element, list[str]]:
-    """The element of the Gaussians, and the names of the properties of theirs that are read."""
-    vertices = [element for element in header.elements if element.name == "vertex"]
-    if len(vertices) != 1:
-        raise DataError(path, "vertex", f"expected one element of that name, got {len(vertices)}")
-    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices[0].properties)
-    sizes = [3 * (k - 1) for k in SH_SIZES]
-    if rest not in sizes:
-        raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
-    names = [*"xyz", *_splat_names(rest // 3)]
-    for name in names:
-        if name not in vertices[0].properties:
-            raise DataError(path, name, "expected this property of a splat, got none")
-    return vertices[0], names
-
-
 def _read_columns(path: Path, header: _Header, vertex: _Element, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
     """The vertices' properties; nothing is read before the file is known to be long enough."""
-    before = header.elements[: header.elements.index(vertex)]
-    if vertex.has_list or any(element.has_list for element in before):
+    is_text, place = header.order == "ascii", header.elements.index(vertex)
+    if any(element.has_list for element in header.elements[: place + 1]):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
-    ascii_words = header.order == "ascii"
-    start = sum(element.count * element.width(header.order) for element in before)
-    end = start + vertex.count * vertex.width(header.order)
-    rest = header.elements[len(before) + 1 :]
-    total = end + sum(element.count * element.width(header.order) for element in rest)
-    begin, size = file.tell(), os.fstat(file.fileno()).st_size
-    available, most = size - begin, ""
-    if ascii_words and available < 2 * end - 1:
-        most = "at most "
-        available = (available + 1) // 2  # a sign and a space each
-    elif ascii_words:
-        numbers, available = _numbers(path, file, start, end)
-    if available < end or (available != total and not any(element.has_list for element in rest)):
-        unit = "numbers" if ascii_words else "bytes"
-        raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {most}{available}")
-    if ascii_words:
+    sizes = [element.size(header.order) for element in header.elements]
+    start, end, total = sum(sizes[:place]), sum(sizes[: place + 1]), sum(sizes)
+    begin = file.tell()
+    available, unit = os.fstat(file.fileno()).st_size - begin, "bytes"
+    if is_text:
+        most, unit = (available + 1) // 2, "numbers"  # a digit and a space each
+        numbers, available = _numbers(path, file, start, end) if most >= end else (np.empty(0), most)
+    if available < end or (available != total and not any(element.has_list for element in header.elements)):
+        raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
+    if is_text:
         return dict(zip(vertex.properties, numbers.reshape(vertex.count, len(vertex.properties)).T, strict=True))
     file.seek(begin + start)
     rows = np.fromfile(file, vertex.dtype(header.order), vertex.count)

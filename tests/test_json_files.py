@@ -1,4 +1,4 @@
-"""JSON that nobody vouches for."""
+"""JSON from files of unknown origin."""
 
 from __future__ import annotations
 
@@ -48,6 +48,11 @@ def test_files_that_are_refused(tmp_path: Path, text: bytes, reason: str) -> Non
     (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(DataError, match=reason):
         read_json(tmp_path / "a.json")
+
+
+def test_a_byte_order_mark_and_repeated_keys_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"a": 1, "a": 2}')
+    assert read_json(tmp_path / "a.json") == {"a": 2}
 
 
 def test_a_huge_file_is_not_read(tmp_path: Path) -> None:

@@ -134,7 +134,7 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "underscore"),
-        (handmade(FLOATS, [ROW], "ascii", count=10**17), "vertex", "numbers after the header, got at most 38"),
+        (handmade(FLOATS, [ROW], "ascii", count=10**17), "vertex", "numbers after the header, got"),
     ],
 )
 def test_bad_files_are_described(tmp_path, data, field, reason):
