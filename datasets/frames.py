@@ -64,7 +64,7 @@ class Frame:
             raise wrong("expected a pose with a right-handed rotation, got another matrix")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PointCloud:
     """Points `(P, 3)` float64 in the world of the poses, colours `(P, 3)` in [0, 1], and `Scene.init_kind` of both."""
 
@@ -76,7 +76,7 @@ class PointCloud:
 NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64, device="cpu"), torch.zeros(0, 3, device="cpu"), "none")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameSet:
     """All that a layout's files say.
 

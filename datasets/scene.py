@@ -23,7 +23,7 @@ def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> P
     return PinholeCamera(intrinsics, extrinsics, *(intrinsics.new_full((len(intrinsics),), float(s)) for s in size))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Views:
     """V posed images of one size: a data set of dicts, `views[0]["image"]`.
 
@@ -130,7 +130,7 @@ class Views:
         return Views(cameras, avg_pool2d(self.images, 2), self.names, masks)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Training and test views in one world frame, with what the layout itself says about first points.
 

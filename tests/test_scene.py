@@ -62,6 +62,14 @@ def test_views_are_a_data_set_of_dicts():
     assert "mask" not in synthetic_scene(train_views=1, test_views=0, size=(6, 8)).train[0]
 
 
+def test_comparing_does_not_raise():
+    scene, again = (synthetic_scene(train_views=1, test_views=1, size=(6, 8)) for _ in range(2))
+    assert scene == scene  # what is tested
+    assert scene != again
+    assert scene.train != again.train
+    assert len({scene, again, scene}) == 2
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 def test_torchs_loader_makes_batches_of_views(workers):
     given = synthetic_scene(train_views=5, test_views=1, size=(6, 8)).train
