@@ -20,6 +20,7 @@ __all__ = ["DensifyReport", "Densifier", "camera_extent"]
 
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
+_STATISTICS = ("gradient_sums", "counts", "last_gradients")
 _NOT_BY_ROWS = (torch.optim.LBFGS, torch.optim.Adafactor, torch.optim.Rprop)
 
 
@@ -181,12 +182,8 @@ class Densifier:
 
     def state_dict(self) -> dict[str, Tensor]:
         """The statistics and the generator's state, for a checkpoint."""
-        return {
-            "gradient_sums": self._gradient_sums.clone(),
-            "counts": self._counts.clone(),
-            "last_gradients": self._last_gradients.clone(),
-            "generator": self.generator.get_state(),
-        }
+        statistics = {name: getattr(self, f"_{name}").clone() for name in _STATISTICS}
+        return statistics | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from what `state_dict` returned; the model must hold as many Gaussians as it did then.
@@ -194,16 +191,15 @@ class Densifier:
         Raises:
             ValueError: an entry is missing, or the number of Gaussians is another.
         """
-        names, shape = ("gradient_sums", "counts", "last_gradients"), (len(self.model),)
-        missing = {*names, "generator"} - state.keys()
+        shape, missing = (len(self.model),), {*_STATISTICS, "generator"} - state.keys()
         if missing:
             raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
-        for name in names:
+        for name in _STATISTICS:
             if state[name].shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {tuple(state[name].shape)}")
-        self._reset_statistics(state["last_gradients"].to(self.model.means, copy=True))
-        self._gradient_sums.copy_(state["gradient_sums"])
-        self._counts.copy_(state["counts"])
+        self._reset_statistics(self.model.means.new_zeros(shape))
+        for name in _STATISTICS:
+            getattr(self, f"_{name}").copy_(state[name])
         self.generator.set_state(state["generator"].cpu())
 
     def _check(self) -> None:

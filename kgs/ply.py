@@ -102,8 +102,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     path, start = Path(path), np.zeros(3) if origin is None else _vector("origin", origin)
     try:
         with open(path, "rb") as file:
-            header = _read_header(path, file)
-            vertices = [element for element in header.elements if element.name == "vertex"]
+            order, elements, degree = _read_header(path, file)
+            vertices = [element for element in elements if element.name == "vertex"]
             if len(vertices) != 1:
                 raise DataError(path, "vertex", f"expected one element of that name, got {len(vertices)}")
             rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices[0].properties)
@@ -114,7 +114,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
             for name in names:
                 if name not in vertices[0].properties:
                     raise DataError(path, name, "expected this property of a splat, got none")
-            columns = _read_columns(path, header, vertices[0], file)
+            columns = _read_columns(path, order, elements, elements.index(vertices[0]), file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
@@ -132,8 +132,9 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
     sh_rest = sh_rest.unflatten(1, (3, rest // 3)).mT
-    degree = min(sizes.index(rest), 3 if header.sh_degree is None else header.sh_degree)
-    return GaussianModel(means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, degree)
+    return GaussianModel(
+        means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, sh_degree=min(degree, sizes.index(rest))
+    )
 
 
 def _vector(name: str, value: Tensor) -> NDArray[np.float64]:
@@ -167,23 +168,17 @@ class _Element:
         return self.count * (len(self.properties) if order == "ascii" else self.dtype(order).itemsize)
 
 
-@dataclass
-class _Header:
-    order: str
-    elements: list[_Element]
-    sh_degree: int | None
-
-
 def _splat_names(rest: int) -> list[str]:
     """The properties after the position and normal, with so many of f_rest."""
     colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _read_header(path: Path, file: BinaryIO) -> _Header:
+def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
+    """The byte order, the elements in order, and the active degree (3 where none is written down)."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
         raise DataError(path, "", "not a PLY file: expected 'ply' in the first line")
-    order, elements, degree = None, list[_Element](), None
+    order, elements, degree = None, list[_Element](), 3
     while True:
         line = file.readline(MAX_HEADER)
         if not line.endswith(b"\n") or file.tell() > MAX_HEADER:
@@ -208,27 +203,29 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
                 raise DataError(path, "header", f"expected a line of a PLY header, got {text!r}")
     if order is None:
         raise DataError(path, "format", f"expected one of {sorted(BYTE_ORDERS)}, got none")
-    return _Header(order, elements, degree)
+    return order, elements, degree
 
 
-def _read_columns(path: Path, header: _Header, vertex: _Element, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
-    """The vertices' properties; nothing is read before the file is known to be long enough."""
-    is_text, place = header.order == "ascii", header.elements.index(vertex)
-    if any(element.has_list for element in header.elements[: place + 1]):
+def _read_columns(
+    path: Path, order: str, elements: list[_Element], place: int, file: BinaryIO
+) -> dict[str, NDArray[np.generic]]:
+    """The properties of the element in that place; nothing is read before the file is known to be long enough."""
+    is_text, vertex = order == "ascii", elements[place]
+    if any(element.has_list for element in elements[: place + 1]):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
-    sizes = [element.size(header.order) for element in header.elements]
+    sizes = [element.size(order) for element in elements]
     start, end, total = sum(sizes[:place]), sum(sizes[: place + 1]), sum(sizes)
     begin = file.tell()
     available, unit = os.fstat(file.fileno()).st_size - begin, "bytes"
     if is_text:
         most, unit = (available + 1) // 2, "numbers"  # a digit and a space each
         numbers, available = _numbers(path, file, start, end) if most >= end else (np.empty(0), most)
-    if available < end or (available != total and not any(element.has_list for element in header.elements)):
+    if available < end or (available != total and not any(element.has_list for element in elements)):
         raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
     if is_text:
         return dict(zip(vertex.properties, numbers.reshape(vertex.count, len(vertex.properties)).T, strict=True))
     file.seek(begin + start)
-    rows = np.fromfile(file, vertex.dtype(header.order), vertex.count)
+    rows = np.fromfile(file, vertex.dtype(order), vertex.count)
     return {name: rows[name] for name in vertex.properties}
 
 

@@ -19,14 +19,11 @@ def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:
     have mean 1/2 whatever the scores are, and nothing depends on the order of the Gaussians.
 
     Args:
-        opacities: activated, in [0, 1], `(N,)`; the gradient goes to these alone.
-        scores: which Gaussians to penalise more, `(N,)`, in any unit.
+        opacities: activated, in [0, 1], `(N,)` (else a ValueError); the gradient goes to these alone.
+        scores: which Gaussians to penalise more, `(N,)` (else a ValueError), in any unit.
 
     Returns:
         A number in [0, 1]; 0 where there are no Gaussians.
-
-    Raises:
-        ValueError: the shapes are others.
 
     Example:
         >>> opacity_l1(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([1.0, 7.0, 2.0]))

@@ -35,9 +35,7 @@ EPS = 1e-12
 
 @dataclass(frozen=True)
 class TargetMoments:
-    """What the SSIM needs to know of a target, computed once for many calls by `target_moments`.
-
-    Images and channels share one axis.
+    """What the SSIM needs to know of a target, made by `target_moments`; images and channels share one axis.
 
     Args:
         padded: the target with its reflected border, `(1, B C, H + 10, W + 10)`.
@@ -61,16 +59,16 @@ def photometric_loss(
 ) -> Tensor:
     """Mean absolute difference plus `dssim_weight` times 1 - SSIM.
 
-    Images in float32 of at least 11 x 11 pixels take a path with an analytic gradient, about three times as fast as
-    Kornia's. All others, targets that require a gradient, and `fast=False` take `kornia.losses.ssim_loss`.
+    Images in float32 of at least 11 x 11 pixels take a path with an analytic gradient, three times as fast as Kornia's;
+    all others, targets that require a gradient, and `fast=False` take `kornia.losses.ssim_loss`.
 
     Args:
         image: `(B, C, H, W)`, float32 or float64, H, W >= 6 (any at weight 0); meant for [0, 1], never clamped.
         target: like `image`, or `target_moments` of such an image.
         dssim_weight: weight of 1 - SSIM, >= 0; at 0 no SSIM is computed.
-        mask: the pixels that count, bool or 0 and 1, `(H, W)`, `(1, H, W)` or, one per image, `(B, 1, H, W)`. The
-            first term is the mean over these pixels, the second that over the windows (11 x 11, less at the border)
-            that lie in the mask whole, 0 where there are none. What is outside has no gradient and may be NaN.
+        mask: the pixels that count, bool or 0 and 1, `(H, W)`, `(1, H, W)` or, one per image, `(B, 1, H, W)`: the
+            first term is their mean, the second that of the windows (11 x 11, less at the border) that lie in the mask
+            whole, 0 without such a window. What is outside has no gradient and may be NaN.
         fast: False keeps to Kornia's own operations, as second derivatives need.
         moments: `target_moments(target)` of this very target, to save that work. Used by the fast path only.
 
@@ -127,17 +125,11 @@ def photometric_loss(
 
 @torch.no_grad()
 def target_moments(target: Tensor) -> TargetMoments:
-    """Compute the part of the SSIM that depends on the target alone.
+    """The part of the SSIM that depends on the target alone, for :func:`photometric_loss` with this target or for it.
 
     Args:
-        target: `(B, C, H, W)`, float32 or float64, H, W >= 6. No gradient flows to it.
-
-    Returns:
-        The moments, to be given to :func:`photometric_loss` with the same target or in its place.
-
-    Raises:
-        TypeError: `target` is no tensor, or neither float32 nor float64.
-        ValueError: `target` has another shape.
+        target: `(B, C, H, W)`, H, W >= 6 (else a ValueError), float32 or float64 (else a TypeError). No gradient flows
+            to it.
     """
     _check_images(target, target)
     if min(target.shape[-2:]) <= RADIUS:
@@ -195,7 +187,7 @@ class _MeanSsim(torch.autograd.Function):
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
-    """The mean of `(B, C, H, W)` over what is not outside, `(B, 1, H, W)` or `(B, C, H, W)`."""
+    """The mean over what is not outside."""
     if outside is None:
         return values.mean()
     outside = outside.expand_as(values)
@@ -205,9 +197,9 @@ def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
 def _outside(mask: Tensor, image: Tensor) -> Tensor:
     """The pixels that do not count, bool `(B, 1, H, W)`."""
     images, size = image.shape[0], tuple(image.shape[-2:])
-    if not isinstance(mask, Tensor) or tuple(mask.shape) not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
-        got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
-        raise ValueError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {got}")
+    shape = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
+    if shape not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
+        raise ValueError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {shape}")
     outside = mask == 0
     if not bool((outside | (mask == 1)).all()):
         raise ValueError("mask: expected True and False, or 0 and 1; for other values write mask > 0.5")
