@@ -26,7 +26,7 @@ def round_mask(height=16, width=19, radius=7.6):
 
 def by_windows(image, target, mask, weight):
     """The definition: mean over masked pixels, mean over the windows that lie in the mask; 121 taps for each pixel."""
-    (b, c, h, w), inside = image.shape, mask.expand(image.shape[0], 1, *mask.shape[-2:])
+    (b, _, h, w), inside = image.shape, mask.expand(image.shape[0], 1, *mask.shape[-2:])
     l1 = (image - target).abs()[inside.expand_as(image)].mean()
     taps = torch.exp(-((torch.arange(11.0, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
     taps = (taps / taps.sum()).outer(taps / taps.sum()).reshape(1, 1, 121, 1)
