@@ -8,15 +8,13 @@ with the most trials is shown, so that the slow tests replace what the fast ones
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from kgs.bench.output import markdown_table, write_csv
-from kgs.fit.outputs import versions
+from kgs.bench.output import markdown_table, write_results
 
 __all__ = ["pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
 
@@ -47,12 +45,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         if rows := [row for table, row in found if table == name]:
             path = folder / place / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            text = make(rows := _of_most_trials(rows), path)
-            path.with_suffix(".md").write_text(text, encoding="utf-8")
-            content = json.dumps({"rows": rows, "versions": versions()}, indent=1)
-            path.with_suffix(".json").write_text(content + "\n", encoding="utf-8")
-            write_csv(path.with_suffix(".csv"), rows)
-            terminalreporter.write_line(text)
+            rows = _of_most_trials(rows)
+            write_results(path, rows, make(rows, path))
 
 
 def _of_most_trials(rows: list[Row]) -> list[Row]:
@@ -94,6 +88,11 @@ def _bits(rows: list[Row], _: Path) -> str:
     return markdown_table("Largest difference of images and gradients, which must be 0", heads, lines, first="case")
 
 
+def _flatness(rows: list[Row], _: Path) -> str:
+    lines = [[row["name"], *(f"{value:.1e}" for value in list(row.values())[2:])] for row in rows]
+    return markdown_table("Largest difference between float32 images", list(rows[0])[2:], lines)
+
+
 def _projection(rows: list[Row], path: Path) -> str:
     """Also plots."""
     from matplotlib.figure import Figure
@@ -122,4 +121,5 @@ _TABLES: dict[str, tuple[str, Callable[[list[Row], Path], str]]] = {  # by folde
     "faults": ("faults", _faults),
     "bits": ("extremes", _bits),
     "projection": ("precision", _projection),
+    "flatness": ("precision", _flatness),
 }

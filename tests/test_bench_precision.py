@@ -20,7 +20,7 @@ def measured(tmp_path_factory):
     out = tmp_path_factory.mktemp("precision")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(precision, "SCENES", {name: SCENES[name] for name in ("ordinary", "far origin")})
-        assert precision.precision(out=out / "new", quick=True) == 0
+        precision.precision(out=out / "new", quick=True)
     return out / "new", json.loads((out / "new" / "precision.json").read_text())
 
 
@@ -32,8 +32,8 @@ def _row(result, setting, scene="ordinary"):
 
 def test_it_writes_tables_and_plots(measured):
     out, result = measured
-    assert set(result) == {"rows", "flatness", "threads", "versions"}
-    assert (out / "precision.md").read_text().count("| far origin |") == 2
+    assert set(result) == {"rows", "threads", "versions"}
+    assert (out / "precision.md").read_text().count("| far origin |") == 1
     with (out / "precision.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == len(result["rows"])
     for name in ("render", "gradients"):
@@ -71,10 +71,3 @@ def test_exact_thresholds_leave_rounding_alone(measured):
 def test_far_from_the_origin_float32_loses_and_float64_does_not(measured):
     assert _row(measured[1], EXACT, "far origin")["max_error"] > 1e-5
     assert _row(measured[1], EXACT64, "far origin")["max_error"] < 1e-10
-
-
-def test_tiles_and_chunks_do_not_change_the_image(measured):
-    flat = measured[1]["flatness"]["ordinary"]
-    assert flat["tiles 4 to 16, exact"] <= 1e-6
-    assert flat["chunks 4 to 256, exact"] <= 1e-6
-    assert flat["tiles 4 to 64, exact"] <= 5e-5  # the tile's polynomial loses digits with the square of its side

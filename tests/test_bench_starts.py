@@ -142,7 +142,7 @@ def test_a_fallback_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_files_of_the_quick_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(starts, "QUICK", (63, 84))
-    assert starts.starts(out=tmp_path, quick=True) == 0
+    starts.starts(out=tmp_path, quick=True)
     rows = json.loads((tmp_path / "starts.json").read_text())["rows"]
     assert (rows[0]["came"], rows[0]["fallback"]) == ("dense", "")
     assert [row["asked"] for row in rows] == ["dense", "sift", "random"]

@@ -17,19 +17,17 @@ from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 import kgs.reference
-from kgs.options import alias
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
-from .output import markdown_table
-from .results import write_results
+from .output import markdown_table, write_results
 from .scenes import DTYPES, Scene, cast, centred_camera, gradients, relative_errors
 from .timing import take_turns
 
@@ -42,14 +40,12 @@ NUMBERS = ("forward_float32", "gradient_float32", "forward_float64", "gradient_f
 Row = dict[str, Any]
 
 
-def extremes(*, out: Annotated[Path, alias("-o")], quick: bool = False) -> int:
+def extremes(*, out: Path, quick: bool = False) -> int:
     """Errors, bounds and times of stiff and extreme cases on this machine.
 
-    Writes extremes.csv, extremes.json and extremes.md. Examples:
-
-    kgs bench extremes -o extremes           a minute
-
-    kgs bench extremes -o extremes --quick   seconds
+    Writes extremes.csv, extremes.json and extremes.md. A minute, or seconds:
+      kgs bench extremes -o extremes
+      kgs bench extremes -o extremes --quick
 
     Args:
         out: folder for the results, made if it is not there.

@@ -1,4 +1,4 @@
-"""What the benchmarks write: tables in Markdown and CSV, and a mean with its spread."""
+"""What the benchmarks write: tables in Markdown, CSV and JSON, and a mean with its spread."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["markdown_table", "mean_sd", "write_csv"]
+import torch
+
+from kgs.fit.machine import versions
+from kgs.fit.outputs import write_json
+
+__all__ = ["markdown_table", "mean_sd", "write_results"]
 
 
 def markdown_table(title: str, columns: Iterable[object], rows: Iterable[Iterable[object]], first: str = "") -> str:
@@ -35,9 +40,20 @@ def mean_sd(values: Iterable[float], decimals: int) -> str:
     return f"{statistics.fmean(numbers):.{decimals}f}{spread}"
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """One line per dict; the first one's keys are the columns, in that order."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+def write_results(path: Path, rows: list[dict[str, Any]], tables: str, **more: Any) -> None:
+    """Write a benchmark's .csv, .json and .md file, and print the tables.
+
+    Args:
+        path: the files without their endings.
+        rows: lines of the CSV; all have the keys of the first.
+        tables: Markdown.
+        more: what the JSON holds beside "rows", "threads" and "versions".
+    """
+    with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
+    content = {"rows": rows, **more, "threads": torch.get_num_threads(), "versions": versions()}
+    write_json(path.with_suffix(".json"), content)
+    path.with_suffix(".md").write_text(tables, encoding="utf-8")
+    print(tables)

@@ -11,92 +11,78 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 import kgs.reference
-from kgs.options import alias
 from kgs.projection import project
 from kgs.raster import composite
-from kgs.types import Gaussians
+from kgs.types import Gaussians, RasterOptions
 
-from .output import markdown_table
-from .results import write_results
+from .output import markdown_table, write_results
 from .scenes import DTYPES, PARAMETERS, Scene, cast, centred_camera, gradients, layered_scene, relative_errors
 from .timing import take_turns
 
 __all__ = ["DEFAULT", "EXACT", "KNOBS", "SCENES", "Setting", "precision"]
 
 LEVELS = {"half a grey level, 2e-3": (2e-3, "--"), "float32 floor, 1.4e-6": (1.4e-6, ":")}
-NEAR_PLANE = 0.01
 
 
 @dataclass(frozen=True)
 class Setting:
     """One way to render, in the options of the renderer and of `composite`; the defaults are theirs."""
 
-    alpha_threshold: float = 1 / 255
-    transmittance_stop: float = 1e-4
+    alpha_threshold: float = RasterOptions.alpha_threshold
+    transmittance_stop: float = RasterOptions.transmittance_stop
     dtype: str = "float32"
-    tile_size: int = 8
+    tile_size: int = RasterOptions.tile_size
     chunk_size: int | None = None
 
 
 DEFAULT, EXACT = Setting(), Setting(alpha_threshold=0.0, transmittance_stop=0.0)
 EXACT64 = replace(EXACT, dtype="float64")
-_SHAPES: dict[str, list[dict[str, Any]]] = {
-    "tiles 4 to 16": [{"tile_size": t} for t in (4, 8, 16)],
-    "tiles 4 to 64": [{"tile_size": t} for t in (4, 8, 16, 32, 64)],
-    "chunks 4 to 256": [{"chunk_size": k} for k in (4, 16, 64, 256)],
-}
 _ALPHAS = (0.0, 1e-4, 1 / 1024, 1 / 512, 1 / 255, 1 / 128)
 KNOBS = {
     "alpha threshold 0 to 1/128, stop 0": [replace(EXACT, alpha_threshold=a) for a in _ALPHAS],
     "alpha threshold 0 to 1/128, stop 1e-4": [replace(DEFAULT, alpha_threshold=a) for a in _ALPHAS],
     "stop 0 to 1e-2, alpha threshold 0": [replace(EXACT, transmittance_stop=t) for t in (0.0, 1e-6, 1e-4, 1e-3, 1e-2)],
     "float64: exact, default": [EXACT64, replace(DEFAULT, dtype="float64")],
-    **{name: [replace(DEFAULT, **shape) for shape in _SHAPES[name]] for name in ("tiles 4 to 64", "chunks 4 to 256")},
+    "tiles 4 to 64": [replace(DEFAULT, tile_size=t) for t in (4, 8, 16, 32, 64)],
+    "chunks 4 to 256": [replace(DEFAULT, chunk_size=k) for k in (4, 16, 64, 256)],
 }
 _COLUMNS = {"default": DEFAULT, "alpha 1/1024": replace(DEFAULT, alpha_threshold=1 / 1024)}
 _COLUMNS |= {"exact, float32": EXACT, "exact, float64": EXACT64}
 
 
-def precision(*, out: Annotated[Path, alias("-o")], quick: bool = False) -> int:
+def precision(*, out: Path, quick: bool = False) -> None:
     """Errors of images, gradients and footprints against the time they take, for each knob of the renderer.
 
-    Writes precision.csv, .json and .md, render.png and gradients.png. Examples:
-
-    kgs bench precision -o precision           five minutes
-
-    kgs bench precision -o precision --quick   half a minute
+    Writes precision.csv, precision.json, precision.md, render.png and gradients.png. Five minutes, or half a one:
+      kgs bench precision -o precision
+      kgs bench precision -o precision --quick
 
     Args:
         out: folder for the results, made if it is not there.
         quick: small images with few Gaussians.
-
-    Returns:
-        The exit code, 0.
     """
     out.mkdir(parents=True, exist_ok=True)
-    rows, flatness = [], {}
+    rows = []
     for name, make in SCENES.items():
         print(f"{name} ...")
-        scene = make(*((300, 48) if quick else (3000, 96)))
-        rows += [{"scene": name, **row} for row in scene.measure(repeats=1 if quick else 3)]
-        flatness[name] = scene.flatness()
+        measured = make(*((300, 48) if quick else (3000, 96))).measure(repeats=1 if quick else 3)
+        rows += [{"scene": name, **row} for row in measured]
     _plot_scenes(out / "render.png", rows, "max_error", "forward_s", "largest error of the image")
     _plot_scenes(out / "gradients.png", rows, "gradient", "backward_s", "largest relative error of a gradient")
-    write_results(out / "precision", rows, _markdown(rows, flatness), flatness=flatness)
-    return 0
+    write_results(out / "precision", rows, _markdown(rows))
 
 
 class _Measured:
     """Gaussians in float64 before one camera, black background."""
 
-    def __init__(self, scene: Scene, near_plane: float = NEAR_PLANE) -> None:
+    def __init__(self, scene: Scene, near_plane: float = RasterOptions.near_plane) -> None:
         self.near_plane, self.inputs = near_plane, {name: cast(scene, dtype) for name, dtype in DTYPES.items()}
 
     def image(self, s: Setting, grad: bool = False) -> Tensor:
@@ -127,15 +113,6 @@ class _Measured:
             rows.append(row)
         return rows
 
-    def flatness(self) -> dict[str, float]:
-        """Largest difference between float32 images that should be the same."""
-        found = {}
-        for start, label in ((EXACT, "exact"), (DEFAULT, "default")):
-            for name, shapes in _SHAPES.items():
-                images = torch.stack([self.image(replace(start, **shape)) for shape in shapes])
-                found[f"{name}, {label}"] = float((images.amax(0) - images.amin(0)).max())
-        return found
-
 
 def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> _Measured:
     """As training leaves it; in other units, or turned and moved `far` from the origin together with the camera."""
@@ -148,7 +125,7 @@ def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> _Me
         pose[:3, 3] = -pose[:3, :3] @ (far * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64))
     camera.extrinsics.copy_(pose)
     means = (unit * g.means - pose[:3, 3]) @ pose[:3, :3]
-    return _Measured((replace(g, means=means, scales=unit * g.scales), camera), NEAR_PLANE * unit)
+    return _Measured((replace(g, means=means, scales=unit * g.scales), camera), RasterOptions.near_plane * unit)
 
 
 def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, float]) -> _Measured:
@@ -181,17 +158,13 @@ def _find(rows: list[dict[str, Any]], scene: str, setting: Setting) -> dict[str,
     return next(row for row in rows if row["scene"] == scene and row.items() >= asdict(setting).items())
 
 
-def _markdown(rows: list[dict[str, Any]], flatness: dict[str, Any]) -> str:
-    errors = []
-    for scene in flatness:
+def _markdown(rows: list[dict[str, Any]]) -> str:
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
         found = (_find(rows, scene, setting) for setting in _COLUMNS.values())
-        errors.append([scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)])
-    flat = [[scene, *(f"{value:.1e}" for value in values.values())] for scene, values in flatness.items()]
+        lines.append([scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)])
     title = "Largest error of the image / of a gradient, the latter over its largest value"
-    first = next(iter(flatness.values()))
-    return markdown_table(title, _COLUMNS, errors) + markdown_table(
-        "Largest difference between float32 images", first, flat
-    )
+    return markdown_table(title, _COLUMNS, lines)
 
 
 def _plot_scenes(path: Path, rows: list[dict[str, Any]], error: str, seconds: str, label: str) -> None:

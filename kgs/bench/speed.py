@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,17 +17,15 @@ from torch import Tensor
 from kgs.camera import move_camera
 from kgs.fit.machine import check_device, peak_rss_mb
 from kgs.losses import photometric_loss, target_moments
-from kgs.options import alias
 from kgs.projection import project
 from kgs.raster import composite
 from kgs.raster.tiles import bin_to_tiles
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
-from .output import markdown_table
-from .results import write_results
+from .output import markdown_table, write_results
 from .scenes import PARAMETERS, layered_scene
-from .timing import Times, calibrations, take_turns, time_parts
+from .timing import Times, seconds_of_exp, take_turns, time_parts
 
 __all__ = ["SIZE", "TARGETS", "Cases", "speed"]
 
@@ -42,22 +40,17 @@ TARGETS = {
 Row = dict[str, Any]
 
 
-def speed(*, out: Annotated[Path, alias("-o")], quick: bool = False, device: str = "cpu") -> int:
+def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     """Time and memory of renders and training steps on this machine, by stage and by what is asked for.
 
-    Writes speed.csv, speed.json, speed.md and scaling.png. Examples:
-
-    kgs bench speed -o speed                         minutes
-
-    kgs bench speed -o speed --quick --device cuda   tens of seconds, on a GPU
+    Writes speed.csv, speed.json, speed.md and scaling.png. Minutes, or tens of seconds on a GPU:
+      kgs bench speed -o speed
+      kgs bench speed -o speed --quick --device cuda
 
     Args:
         out: folder for the results, made if it is not there.
         quick: fewer Gaussians and repetitions.
         device: where to render: cpu, cuda, cuda:1, ...
-
-    Returns:
-        The exit code, 0.
 
     Raises:
         ValueError: the device is unknown or not there.
@@ -65,7 +58,7 @@ def speed(*, out: Annotated[Path, alias("-o")], quick: bool = False, device: str
     where = check_device(device)
     out.mkdir(parents=True, exist_ok=True)
     repeats, counts = (3, (2_000, 10_000)) if quick else (7, (10_000, 50_000, 200_000))
-    units, rows = calibrations(where), []
+    unit, rows = seconds_of_exp(where), []
 
     def note(table: str, cases: Cases, found: dict[str, Times]) -> None:
         for name, times in found.items():
@@ -73,7 +66,7 @@ def speed(*, out: Annotated[Path, alias("-o")], quick: bool = False, device: str
             row |= {"height": cases.size[0], "width": cases.size[1], "pairs_millions": cases.pairs}
             row |= {f"{key}_s": value for key, value in times._asdict().items()} | {"repeats": repeats}
             row["target_s"] = TARGETS[name].get(cases.count) if table == "main" else None
-            rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / units["exp"]})
+            rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / unit})
 
     for count in counts:
         print(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
@@ -91,10 +84,9 @@ def speed(*, out: Annotated[Path, alias("-o")], quick: bool = False, device: str
         note("scaling", cases, take_turns({"forward + backward": cases.both}, repeats, where))
     points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
     exponents = {name: _exponent(of) for name, of in points.items()}
-    more = {"peak_memory_mb": memory, "calibrations": units, "exponents": exponents, "device": device}
+    more = {"peak_memory_mb": memory, "exp_s": unit, "exponents": exponents, "device": device}
     _plot(out / "scaling.png", points)
-    write_results(out / "speed", rows, _markdown(rows, memory, units, exponents), **more)
-    return 0
+    write_results(out / "speed", rows, _markdown(rows, memory, unit, exponents), **more)
 
 
 class Cases:
@@ -215,7 +207,7 @@ def _exponent(points: np.ndarray) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float], exponents: dict[str, float]) -> str:
+def _markdown(rows: list[Row], memory: dict[int, float], unit: float, exponents: dict[str, float]) -> str:
     tables: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         tables.setdefault(row["table"], {}).setdefault(row["case"], []).append(row)
@@ -237,8 +229,7 @@ def _markdown(rows: list[Row], memory: dict[int, float], units: dict[str, float]
         + markdown_table(less, ["ms", "of everything"], left_out)
         + f"Time grows as count^{exponents['Gaussians']:.2f}, pairs^{exponents['pairs']:.2f}, "
         f"pixels^{exponents['pixels']:.2f} (at a fixed count).\n"
-        f"Calibration: exp {units['exp'] * 1e9:.2f} ns per element, dense oracle (400 Gaussians, 48x64) "
-        f"{units['dense'] * 1e3:.0f} ms.\n"
+        f"Calibration: exp {unit * 1e9:.2f} ns per element.\n"
     )
 
 

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,10 +18,8 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit.starts import FirstPoints, first_points
 from kgs.fit.starts.triangulate import camera_centers, project_all, unproject
-from kgs.options import alias
 
-from .output import markdown_table, mean_sd
-from .results import write_results
+from .output import markdown_table, mean_sd, write_results
 from .scenes import check_scenes
 
 __all__ = ["complete_pixels", "depth_errors", "model_errors", "seen_twice", "starts"]
@@ -49,24 +47,19 @@ _OF_MODEL |= {"model_within_2": ("within 2 %", 1, 100)}
 Row = dict[str, Any]
 
 
-def starts(*, out: Annotated[Path, alias("-o")], quick: bool = False) -> int:
+def starts(*, out: Path, quick: bool = False) -> None:
     """Depth errors, completeness and times of the first points of a fit.
 
     The synthetic scene has exact depths. Real scenes, in the folder of the environment variable KGS_DATA, have counts
     and times; three views are also compared with the points of a COLMAP model where there is one, which were refined
     with the test views too and are not exact. (Most of many views that such a point projects into do not observe it.)
-    Writes starts.csv, starts.json and starts.md. Examples:
-
-    KGS_DATA=SCENES kgs bench starts -o starts   twenty minutes
-
-    kgs bench starts -o starts --quick           ten seconds
+    Writes starts.csv, starts.json and starts.md. Twenty minutes, or ten seconds:
+      KGS_DATA=SCENES kgs bench starts -o starts
+      kgs bench starts -o starts --quick
 
     Args:
         out: folder for the results, made if it is not there.
         quick: one small synthetic scene of three views with one seed.
-
-    Returns:
-        The exit code, 0.
 
     Raises:
         DataError: KGS_DATA is set and one of the scenes is not there.
@@ -86,7 +79,6 @@ def starts(*, out: Annotated[Path, alias("-o")], quick: bool = False) -> int:
         print(f"{name}, {count} views ...")
         rows += _real_rows(Path(data or ""), name, count)
     write_results(out / "starts", rows, _markdown(rows))
-    return 0
 
 
 def _find(views: Views, asked: str, seed: int) -> tuple[FirstPoints, Row]:

@@ -9,14 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-import kgs.reference
-from kgs.camera import move_camera
-
-from .scenes import layered_scene
-
-__all__ = ["Times", "calibrations", "take_turns", "time_parts"]
-
-_EXP_ELEMENTS = 2**18
+__all__ = ["Times", "seconds_of_exp", "take_turns", "time_parts"]
 
 
 class Times(NamedTuple):
@@ -64,25 +57,13 @@ def time_parts(
     return {n: Times(statistics.median(w), min(w), max(w), statistics.median(c)) for n, (w, c) in times.items()}
 
 
-def calibrations(device: torch.device) -> dict[str, float]:
-    """What this machine does with two known pieces of work, in seconds: to compare figures of two machines.
-
-    Returns:
-        "exp": per element of `torch.exp` over 2^18 float32 in cache, on all threads. "dense": the dense float64
-        reference with 400 Gaussians at 48x64, forward and backward.
-    """
-    values = torch.full((_EXP_ELEMENTS,), -1.0, device=device)
+def seconds_of_exp(device: torch.device) -> float:
+    """Seconds per element of `torch.exp` over 2^18 float32 in cache, on all threads: to compare two machines."""
+    values = torch.full((2**18,), -1.0, device=device)
     results = torch.empty_like(values)
 
     def exponentials() -> None:
         for _ in range(50):
             torch.exp(values, out=results)
 
-    model, camera = layered_scene(400, (48, 64))
-    gaussians, camera = model.to(device)(), move_camera(camera, device)
-
-    def dense() -> None:
-        kgs.reference.render(gaussians, camera).sum().backward(retain_graph=True)
-
-    times = take_turns({"exp": exponentials, "dense": dense}, 5, device)
-    return {"exp": times["exp"].best / 50 / _EXP_ELEMENTS, "dense": times["dense"].wall}
+    return take_turns({"exp": exponentials}, 5, device)["exp"].best / 50 / len(values)
