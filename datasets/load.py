@@ -64,7 +64,7 @@ def load_scene(
         DataError: the folder is no scene, or its files are missing, damaged or contradict each other.
         ValueError: train_views, downscale, background or points is out of range.
 
-    Example:
+    Examples:
         >>> scene = load_scene("fern", train_views=3, downscale=2)  # doctest: +SKIP
         >>> scene.train.images.shape  # doctest: +SKIP
         torch.Size([3, 3, 189, 252])

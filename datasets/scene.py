@@ -41,7 +41,7 @@ class Views:
     Raises:
         ValueError: counts, shapes or sizes do not fit.
 
-    Example:
+    Examples:
         >>> from torch.utils.data import DataLoader
         >>> from kgs.datasets import synthetic_scene
         >>> batch = next(iter(DataLoader(synthetic_scene().train, batch_size=2)))

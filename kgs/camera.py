@@ -115,7 +115,7 @@ def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers
         TypeError: no tensors, or of different dtypes or devices.
         ValueError: shapes or sizes do not fit.
 
-    Example:
+    Examples:
         >>> import torch, kgs
         >>> k = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]])
         >>> kgs.cameras(torch.eye(4), k, width=32, height=24, pixel_centers="half").cx

@@ -69,7 +69,7 @@ class Densifier:
         ValueError: a number is out of range, or the optimizer does not hold the model's parameters or keeps another
             state (from `step` and `reset_opacity` too, which then change nothing).
 
-    Example:
+    Examples:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
         >>> densifier = Densifier(model, torch.optim.Adam(model.parameters()), extent=1.0)
         >>> densifier.step()

@@ -43,7 +43,7 @@ def drop_gaussian(
         TypeError: `opacities` is no floating point tensor.
         ValueError: p is outside [0, 1). The rate 1 is refused, other than in `nn.Dropout`: it would leave no image.
 
-    Example:
+    Examples:
         >>> _ = torch.manual_seed(0)
         >>> drop_gaussian(torch.full((4,), 0.8), p=0.2)
         tensor([1., 0., 1., 1.])
@@ -93,7 +93,7 @@ class DropGaussian(nn.Module):
         ValueError: p or the resulting rate is outside [0, 1), the schedule's name is unknown, or the seed is no integer
             from -2^63 to 2^64 - 1.
 
-    Example:
+    Examples:
         >>> drop = DropGaussian(p=0.2)
         >>> for step in range(1, 4):
         ...     drop.progress = step / 3

@@ -44,7 +44,7 @@ class GaussianModel(nn.Module):
         TypeError: a tensor is not float32 or float64, or differs in dtype or device from `means`.
         ValueError: a tensor has another shape, or `sh_degree` is out of range.
 
-    Example:
+    Examples:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
         >>> model.sh_degree = 1
         >>> other = GaussianModel.from_points(torch.rand(5, 3), torch.rand(5, 3), sh_degree=0)

@@ -126,7 +126,7 @@ def rasterization(
         TypeError: a tensor is none, or of another dtype or device.
         ValueError: shapes or options do not fit, or an argument of gsplat's asks for what kgs does not do.
 
-    Example:
+    Examples:
         >>> import torch, kgs
         >>> k = torch.tensor([[[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]]])
         >>> renders, alphas, meta = kgs.rasterization(

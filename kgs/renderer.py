@@ -43,7 +43,7 @@ class GaussianRenderer(nn.Module):
     Raises:
         ValueError: an option is out of range, or there is no such backend.
 
-    Example:
+    Examples:
         >>> import torch, kgs
         >>> k = torch.tensor([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
         >>> camera = kgs.cameras(torch.eye(4), k, width=32, height=24)

@@ -25,7 +25,7 @@ def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:
     Returns:
         A number in [0, 1]; 0 where there are no Gaussians.
 
-    Example:
+    Examples:
         >>> opacity_l1(torch.tensor([0.5, 0.5, 1.0]), torch.tensor([1.0, 7.0, 2.0]))
         tensor(0.3333)
     """

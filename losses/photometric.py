@@ -80,7 +80,7 @@ def photometric_loss(
         ValueError: shapes or the weight do not fit, or the mask is empty or has other values than 0 and 1.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
-    Example:
+    Examples:
         >>> target = torch.rand(1, 3, 32, 32)
         >>> float(photometric_loss(target, target)) < 1e-4
         True

@@ -1,8 +1,9 @@
-"""The house itself: who may import whom, and what every module says."""
+"""The house itself: who may import whom, and what every public name says."""
 
 import ast
 import functools
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
+PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
 FLOORS = ("core", "fit", "bench", "cli")  # each imports from those before it only
 HEAVY = ("cv2", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "viser", "distributed")
 
@@ -58,6 +60,22 @@ def floor(name):
 # -- imports -------------------------------------------------------------------------------------------------------
 
 
+def test_there_are_no_circles():
+    done, path = set(), []
+
+    def visit(name):
+        assert name not in path, " -> ".join([*path[path.index(name) :], name])
+        if name not in done:
+            path.append(name)
+            for other in sorted(imported_modules(name) - {name}):
+                visit(other)
+            done.add(path.pop())
+
+    for name in SOURCES:
+        visit(name)
+    assert done == set(SOURCES)
+
+
 def test_imports_go_one_way():
     allowed = {
         "core": {"core"},
@@ -67,7 +85,12 @@ def test_imports_go_one_way():
         "bench": {"core", "losses", "datasets", "fit", "bench"},
         "cli": {"core", "losses", "datasets", "fit", "bench", "cli"},
     }
-    small = ("kgs.errors", "kgs.json_files", "kgs.compiled")  # of the core, what losses and datasets may use
+    small = (
+        "kgs.errors",
+        "kgs.json_files",
+        "kgs.backends",
+        "kgs.compiled",
+    )  # of the core, what losses and datasets may use
     wrong = [
         (name, other)
         for name in SOURCES
@@ -105,6 +128,39 @@ def test_every_module_says_what_it_is_and_exports_what_it_has(name):
     assert len(set(module.__all__)) == len(module.__all__)
     missing = [exported for exported in module.__all__ if not hasattr(module, exported)]
     assert not missing, "in __all__, but not there"
+
+
+def described(name, value):
+    """What the docstring of a public name does not say."""
+    text = inspect.getdoc(value) or ""
+    if not text or text.startswith(f"{value.__name__}("):  # what dataclass writes
+        yield f"{name}: no docstring"
+        return
+    if inspect.isclass(value):
+        for method_name, method in vars(value).items():
+            function = getattr(method, "__func__", getattr(method, "fget", method))
+            if not method_name.startswith("_") and inspect.isfunction(function) and not function.__doc__:
+                yield f"{name}.{method_name}: no docstring"
+        if issubclass(value, Exception):
+            return
+    if "see there for arguments" in text:
+        return
+    signature = inspect.signature(value)
+    for parameter in signature.parameters:
+        if not re.search(rf"\b{parameter}\b", text):
+            yield f"{name}: does not describe {parameter}"
+    if signature.parameters and "Args:" not in text:
+        yield f"{name}: no Args"
+    plain = re.match(r"Tensor|tuple|list|dict|float|int", str(signature.return_annotation))  # a class describes itself
+    if inspect.isfunction(value) and plain and "Returns:" not in text:
+        yield f"{name}: no Returns"
+
+
+@pytest.mark.parametrize("module", PUBLIC)
+def test_public_names_say_what_they_take_and_return(module):
+    public = importlib.import_module(module)
+    values = [(f"{module}.{name}", getattr(public, name)) for name in public.__all__]
+    assert not [line for name, value in values if callable(value) for line in described(name, value)]
 
 
 # -- words ---------------------------------------------------------------------------------------------------------

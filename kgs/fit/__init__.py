@@ -1,6 +1,6 @@
 """Fits: turns a scene into a splat, with one call or in a loop of one's own.
 
-Example:
+Examples:
     >>> from kgs.fit import FitConfig, Trainer, first_points
     >>> from kgs.datasets import synthetic_scene
     >>> scene = synthetic_scene(train_views=2, size=(16, 16))

@@ -38,7 +38,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
     Yields:
         `advance(note="")`: one more unit is done; the note stands behind the figures.
 
-    Example:
+    Examples:
         >>> with progress(3, "depth maps", unit="view") as advance:
         ...     for _ in range(3):
         ...         advance()

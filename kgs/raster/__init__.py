@@ -71,7 +71,7 @@ def composite(
         TypeError: an argument has another type, dtype or device.
         ValueError: an option is out of range, shapes do not fit, or one row of tiles alone exceeds `max_bytes`.
 
-    Example:
+    Examples:
         >>> import torch, kgs
         >>> gaussians = kgs.Gaussians(
         ...     means=torch.tensor([[0.0, 0.0, 2.0]]), quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
