@@ -103,10 +103,11 @@ class GaussianModel(nn.Module):
             ValueError: shapes do not fit, there are fewer than 4 points, one is not finite, all coincide, or
                 `sh_degree` is out of range.
         """
-        if points.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"points: expected float32 or float64, got {points.dtype}")
-        if not colors.is_floating_point():
-            raise TypeError(f"colors: expected floating point values in [0, 1], got {colors.dtype}")
+        if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"points: expected float32 or float64, got {getattr(points, 'dtype', type(points))}")
+        if not isinstance(colors, Tensor) or not colors.is_floating_point():
+            got = getattr(colors, "dtype", type(colors))
+            raise TypeError(f"colors: expected floating point values in [0, 1], got {got}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
             got = f"{tuple(points.shape)} and {tuple(colors.shape)}"
             raise ValueError(f"points, colors: expected two of shape (N, 3), got {got}")

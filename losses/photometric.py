@@ -123,6 +123,7 @@ def photometric_loss(
     return loss + dssim_weight * (1.0 - mean_ssim)
 
 
+@torch.inference_mode(False)  # else a training step could not save what is made in inference mode
 @torch.no_grad()
 def target_moments(target: Tensor) -> TargetMoments:
     """The part of the SSIM that depends on the target alone, for :func:`photometric_loss` with this target or for it.
@@ -232,7 +233,7 @@ def _blur(maps: Tensor) -> Tensor:
 
     Shifted sums add in the order of a convolution, in little memory, with no TF32 and no autocast.
     """
-    weights = get_gaussian_kernel1d(WINDOW, SIGMA, dtype=maps.dtype).flatten().tolist()
+    weights = get_gaussian_kernel1d(WINDOW, SIGMA, device=torch.device("cpu"), dtype=maps.dtype).flatten().tolist()
     for dim in (-1, -2):
         size = maps.shape[dim] - 2 * RADIUS
         blurred = maps.narrow(dim, 0, size) * weights[0]

@@ -162,6 +162,32 @@ def test_autocast_does_not_reach_the_ssim():
     torch.testing.assert_close(inside, photometric_loss(image, target), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("mask", [None, torch.ones(32, 32)])
+def test_default_device_and_default_dtype_do_not_reach_the_loss(mask):
+    image, target = make_pair((1, 3, 32, 32))
+    expected, expected_gradient = value_and_gradient(lambda x: photometric_loss(x, target, mask=mask), image)
+    try:
+        torch.set_default_device("meta")  # stands for an accelerator
+        torch.set_default_dtype(torch.float64)
+        value, gradient = value_and_gradient(lambda x: photometric_loss(x, target, mask=mask), image)
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(value, expected)
+    assert torch.equal(gradient, expected_gradient)
+
+
+def test_moments_made_in_inference_mode_serve_a_training_step():
+    image, target = make_pair((1, 3, 32, 32))
+    expected = value_and_gradient(lambda x: photometric_loss(x, target), image)
+    with torch.inference_mode():
+        there = target.clone()
+        moments = target_moments(there)
+    found = value_and_gradient(lambda x: photometric_loss(x, there, moments=moments), image)
+    assert torch.equal(found[0], expected[0])
+    assert torch.equal(found[1], expected[1])
+
+
 def test_nan_in_the_image_reaches_the_loss():
     image, target = make_pair((1, 3, 16, 16))
     image[0, 0, 3, 3] = math.nan
