@@ -155,7 +155,7 @@ def _tiff(data: Buffer) -> tuple[int, ...]:
 def _tags(data: Buffer) -> dict[int, tuple[int, int]]:
     """The first image's tags that are whole numbers: the first value of each, and where it stands in the file.
 
-    Where a tag is there twice the larger value counts, so that no size is larger than it seems.
+    Where a tag occurs twice the larger value counts, so that no size is larger than it seems.
     """
     order = "<" if data[:1] == b"I" else ">"
     start = struct.unpack_from(f"{order}I", data, 4)[0]

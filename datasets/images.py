@@ -181,7 +181,7 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
         return replace(intrinsics, distortion=()), None
     width, height = intrinsics.width, intrinsics.height
     if max(width, height) > _LONGEST_REMAPPED:
-        raise ValueError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels a side, the image has more")
+        raise ValueError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels of width or height, got more")
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
     rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap

@@ -25,7 +25,7 @@ __all__ = ["load_scene"]
 
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
-_FINE_PIXELS = 1_000_000  # of the images for the first points: twice the pixels a side halves the error of the depths
+_FINE_PIXELS = 1_000_000  # of the images for the first points: twice the width and height halves the error of depths
 
 
 def load_scene(

@@ -115,7 +115,7 @@ class Views:
         return Views(self.camera(rows), self.images[rows], tuple(self.names[i] for i in indices), masks)
 
     def halved(self) -> Views:
-        """The views in half the pixels a side: means of 2 x 2; an odd last row or column is left out.
+        """The views at half the width and height: means of 2 x 2 pixels; an odd last row or column is left out.
 
         Images of a single row or column are a ValueError.
         """

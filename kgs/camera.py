@@ -1,4 +1,4 @@
-"""All that knows a camera model: Kornia's cameras one by one, the pixel of a point and its derivative.
+"""Everything about camera models: Kornia's cameras one by one, the pixel of a point and its derivative.
 
 Convention:
     World-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
@@ -98,7 +98,7 @@ class Lens:
 def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers: str = "integer") -> PinholeCamera:
     """Kornia's pinhole cameras from matrices and plain sizes; differentiable.
 
-    A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make it anew in each step.
+    A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make a new one in each step.
 
     Convention:
         World-to-camera, OpenCV axes.

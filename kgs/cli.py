@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except (OSError, AttributeError):  # nobody reads it; Python would complain on its way out
+        except (OSError, AttributeError):  # nothing reads it any more; Python would complain at exit
             with suppress(OSError, AttributeError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     sys.exit(code)

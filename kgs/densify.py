@@ -144,7 +144,7 @@ class Densifier:
 
     @torch.no_grad()
     def step(self) -> DensifyReport:
-        """Clone, split and prune by what was observed since the last step, and start observing anew.
+        """Clone, split and prune by what was observed since the last step, and start observing again.
 
         New Gaussians have zero Adam moments, the others keep theirs bit for bit. The parameters become new objects in
         the model and the optimizer alike, without `.grad`: call it between `optimizer.step` and the next render.

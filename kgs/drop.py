@@ -173,7 +173,7 @@ class DropGaussian(nn.Module):
 
     def _own_stream(self) -> torch.Generator:
         if self._stream is None:
-            raise ValueError("seed: expected an integer to have a state of one's own, got None")
+            raise ValueError("seed: expected an integer, got None: the layer then has no state of its own")
         return self._stream
 
     def _warn_once(self, kind: str, message: str) -> None:

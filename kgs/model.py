@@ -88,7 +88,7 @@ class GaussianModel(nn.Module):
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> GaussianModel:
-        """Start from a coloured point cloud: one round, faint Gaussian a point, as wide as the points are apart.
+        """Start from a coloured point cloud: one round, faint Gaussian per point, as wide as the points are apart.
 
         The standard deviation is the root of the mean squared distance to the three nearest points, at least a
         thousandth of the cloud's median one (points may coincide); the opacity is 0.1, the colour has no direction.

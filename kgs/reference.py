@@ -1,4 +1,4 @@
-"""The oracle: a dense float64 renderer of Gaussians, made to be read and believed rather than to be fast.
+"""The oracle: a dense float64 renderer of Gaussians, made to be easy to check, not to be fast.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023; M. Zwicker et al., "EWA
 Volume Splatting", 2001. Every Gaussian meets every pixel, derivatives are autograd's, and no stage of the package is

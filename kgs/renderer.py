@@ -35,7 +35,7 @@ class GaussianRenderer(nn.Module):
         tile_size: see :class:`kgs.RasterOptions`, as for the next five.
         near_plane: Gaussians with z <= near_plane are left out; in world units.
         eps2d: variance in px^2 added to each footprint.
-        alpha_threshold: alphas below it are skipped. The knob that trades accuracy for time: 0 is exact.
+        alpha_threshold: alphas below it are skipped. The option that trades accuracy for time: 0 is exact.
         transmittance_stop: a pixel is done when less light than this is left.
         max_bytes: bound for the working memory of one call.
         backend: "auto" (the fastest that covers the call) or "torch", see `kgs.backends`.

@@ -35,7 +35,7 @@ class RasterOptions:
         near_plane: Gaussians with z <= near_plane are left out; in world units, at least 1e-7 for perspective cameras
             (Kornia does not divide by less than 1e-8).
         eps2d: variance in px^2 added to the diagonal of each footprint, the low-pass filter of 3D Gaussian splatting.
-        alpha_threshold: alphas below it are skipped, in [0, 1). The knob that trades accuracy for time: 0 is exact;
+        alpha_threshold: alphas below it are skipped, in [0, 1). The option that trades accuracy for time: 0 is exact;
             the error is at most the number of layers times it.
         transmittance_stop: light below it counts as 0, in [0, 1); the error is at most it.
         max_bytes: bound for the working memory of one call, beside what is kept for each Gaussian and each pixel; an

@@ -229,7 +229,7 @@ def _fold(grad: Tensor) -> Tensor:
 
 
 def _blur(maps: Tensor) -> Tensor:
-    """Window each map, which loses 5 pixels a side: `(..., H + 10, W + 10)` to `(..., H, W)`.
+    """Window each map, which loses 5 pixels on each side: `(..., H + 10, W + 10)` to `(..., H, W)`.
 
     Shifted sums add in the order of a convolution, in little memory, with no TF32 and no autocast.
     """

@@ -232,7 +232,7 @@ def test_test_poses_never_reach_the_training_cameras(tmp_path: Path) -> None:
         ("images", " 7 img3.png", " 7 /img3.png", "inside the scene"),
         ("images", " 7 img3.png", " 7 C:\\img3.png", "inside the scene"),
         ("images", " 7 img3.png", " 7 img4.png", "img4.png.*several times"),
-        ("images", "\n97 ", "\n96 ", "image 96: is there twice"),
+        ("images", "\n97 ", "\n96 ", "image 96: occurs twice"),
         ("images", " 7 img3.png", " seven img3.png", "line"),
     ],
 )

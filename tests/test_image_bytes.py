@@ -215,7 +215,7 @@ print(json.dumps([peak() - before, image.size]))
 def test_reading_an_image_takes_the_memory_that_is_foretold(
     tmp_path: Path, name: str, shape: tuple[int, ...], kind: type[np.uint8]
 ) -> None:
-    """At most 24 bytes a pixel, the file, and a few MiB for the decoder; docs/stiff-cases.md says so."""
+    """At most 24 bytes per pixel, the file, and a few MiB for the decoder; docs/stiff-cases.md says so."""
     path, small = tmp_path / name, tmp_path / f"small{Path(name).suffix}"
     image = np.full(shape, 77, kind)
     if name.startswith("noise"):

@@ -20,7 +20,7 @@ _RANDOM_POINTS = 10_000
 
 
 def load_blender(root: Path) -> FrameSet:
-    """Read the two json files, see :func:`read_transforms`, as NeRF's scenes and scenes of one's own have them.
+    """Read the two json files, see :func:`read_transforms`, as NeRF's scenes and your own have them.
 
     All frames of the test file are test views. Eight training views are the published ones (2, 16, 26, 55, 73, 76,
     86, 93 in the file's order). First points are random in [-1, 1]^3. A missing or damaged file is a DataError.

@@ -72,7 +72,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Read cameras.bin or cameras.txt.
 
     Raises:
-        DataError: the file is damaged, an id is there twice, or a camera model cannot be undistorted.
+        DataError: the file is damaged, an id occurs twice, or a camera model cannot be undistorted.
     """
     cameras: dict[int, ColmapCamera] = {}
     if path.suffix == ".bin":
@@ -93,7 +93,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
-    """Read images.bin or images.txt without the 2D observations; damage or an id there twice is a DataError."""
+    """Read images.bin or images.txt without the 2D observations; damage, or an id that occurs twice, is a DataError."""
     images: dict[int, ColmapImage] = {}
     if path.suffix == ".bin":
         data = _Binary(path)
@@ -234,5 +234,5 @@ def _parameter_count(path: Path, camera_id: int, model: str) -> int:
 
 def _add(path: Path, what: str, table: dict[int, T], key: int, value: T) -> None:
     if key in table:
-        raise DataError(path, f"{what} {key}", "is there twice")
+        raise DataError(path, f"{what} {key}", "occurs twice")
     table[key] = value

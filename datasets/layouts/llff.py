@@ -20,7 +20,7 @@ __all__ = ["load_llff"]
 
 
 def load_llff(root: Path) -> FrameSet:
-    """Read `poses_bounds.npy`, one row an image in the order of the names in `images/` or else `images_k/`.
+    """Read `poses_bounds.npy`, one row per image in the order of the names in `images/` or else `images_k/`.
 
     A damaged file, or one with more or fewer rows than there are images, is a DataError.
 

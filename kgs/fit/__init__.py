@@ -1,4 +1,4 @@
-"""Fits: turns a scene into a splat, with one call or in a loop of one's own.
+"""Fits: turns a scene into a splat, with one call or in a loop of your own.
 
 Examples:
     >>> from kgs.fit import FitConfig, Trainer, first_points

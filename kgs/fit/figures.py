@@ -21,7 +21,7 @@ LEGIBLE = 200  # pixels; narrower pictures are enlarged on a sheet
 
 
 def side_by_side(views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> Tensor:
-    """Pictures of some views, one row a view: the photo, then one column a method, each with its title.
+    """Pictures of some views, one row per view: the photo, then one column per method, each with its title.
 
     Args:
         views: where the photos are.

@@ -54,7 +54,7 @@ class Lpips(nn.Module):
         net: "vgg16" or "alexnet".
 
     Raises:
-        ValueError: `net` is none of the two.
+        ValueError: `net` is neither of the two.
     """
 
     def __init__(self, net: str = "vgg16") -> None:

@@ -1,4 +1,4 @@
-"""The training loop: one training view a step, deterministic, resumable at every step.
+"""The training loop: one training view per step, deterministic, resumable at every step.
 
 Random numbers come from three streams that never mix: the order of views, the children of splits, and the masks of
 DropGaussian. Two fits that differ in the drop rate alone therefore see the same views in the same order.

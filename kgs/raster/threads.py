@@ -26,11 +26,11 @@ _pools: dict[int, ThreadPoolExecutor] = {}
 
 
 def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], None]], device: torch.device) -> None:
-    """Call a worker on every item, on as many threads as torch has; items are taken in order, the longest first best.
+    """Call a worker on every item, on as many threads as torch has; items are taken in order; put the longest first.
 
     Args:
         items: the pieces of work.
-        make_worker: called once a thread; returns the function that does one piece (a place for its buffers).
+        make_worker: called once per thread; returns the function that does one piece (a place for its buffers).
         device: where the work runs; on anything but a CPU one thread does it all.
     """
     queue = deque(items)

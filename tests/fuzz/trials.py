@@ -45,7 +45,7 @@ class Outcome:
 
 
 def try_reader(reader: Reader, seeds: Sequence[int]) -> list[Outcome]:
-    """Damage a valid set of files once a seed and read it.
+    """Damage a valid set of files once per seed and read it.
 
     Raises:
         DataError: the reader refuses the undamaged files.

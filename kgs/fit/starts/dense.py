@@ -25,8 +25,8 @@ def dense_points(
 
     Where the views have masks, points lie where the masks of both are above 0.5.
 
-    Large pictures, and many of them, are swept in half the pixels a side, or a quarter: they find enough points all
-    the same, in bounded time and memory.
+    Large pictures, and many of them, are swept at half the width and height, or a quarter: they give enough points, in
+    bounded time and memory.
 
     Args:
         views: at least two, posed.

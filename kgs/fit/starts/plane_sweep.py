@@ -24,7 +24,7 @@ from .triangulate import camera_centers
 __all__ = ["DepthMap", "sweep_depths"]
 
 PLANES = 128
-WINDOW = 7  # pixels a side of the patches that are compared
+WINDOW = 7  # pixels, the side of the patches that are compared
 NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
 # Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
@@ -159,7 +159,7 @@ def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
 
 
 def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
-    """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right a row."""
+    """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right per row."""
     rows = range(cost.shape[1] - 1, -1, -1) if flip else range(cost.shape[1])
     before: Tensor | None = None
     last = 0
