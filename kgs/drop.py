@@ -76,9 +76,8 @@ class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
     The rate of a call is `p * schedule(progress)`. `progress` is a plain attribute in [0, 1] that the training loop
-    sets; it defaults to 1, so that a layer whose progress is never set is plain dropout at p. A layer warns once if
-    that is so, and once if opacities on the CPU lie outside [0, 1]: those are probably logits. The `state_dict` is
-    empty, whatever is assigned to the layer.
+    sets; it defaults to 1: a layer whose progress is never set is plain dropout at p, and warns once. So does one that
+    gets opacities outside [0, 1] on the CPU, probably logits. The `state_dict` is empty, whatever is assigned to it.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
@@ -108,7 +107,9 @@ class DropGaussian(nn.Module):
         super().__init__()
         if not (schedule in SCHEDULES if isinstance(schedule, str) else callable(schedule)):
             raise ValueError(f"schedule: expected one of {sorted(SCHEDULES)} or a callable, got {schedule!r}")
-        if seed is not None and not _is_seed(seed):
+        number: Any = seed
+        is_integer = isinstance(number, Integral) and not isinstance(number, bool)
+        if seed is not None and not (is_integer and -(2**63) <= number < 2**64):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
@@ -153,11 +154,7 @@ class DropGaussian(nn.Module):
         return dropped
 
     def get_rng_state(self) -> Tensor:
-        """The state of the layer's own stream, a tensor on the CPU, for a checkpoint.
-
-        Raises:
-            ValueError: the layer has no stream of its own (seed is None).
-        """
+        """The state of the layer's own stream, a tensor on the CPU; a ValueError where it has none (seed is None)."""
         return self._own_stream().get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
@@ -190,10 +187,6 @@ class DropGaussian(nn.Module):
 
     def __setattr__(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value.detach() if isinstance(value, Tensor) else value)
-
-
-def _is_seed(value: Any) -> bool:
-    return not isinstance(value, bool) and isinstance(value, Integral) and -(2**63) <= int(value) < 2**64
 
 
 def _fraction(name: str, value: Any, closed: bool = False) -> float:

@@ -18,14 +18,10 @@ def log_spacing(points: Tensor) -> Tensor:
     """Logarithm of the root mean squared distance to the three nearest points, float64 `(N,)`.
 
     It is at least a thousandth of the cloud's median one, as points may coincide. Where points coincide by fours and
-    more than half of the places hold three or more (each triangle of an STL has corners of its own), distances are
-    those between places.
+    more than half of the places hold three or more (triangles of an STL), distances are those between places.
 
     Args:
-        points: `(N, 3)`, N >= 4, finite.
-
-    Raises:
-        ValueError: there are fewer than four points, or all are in one place.
+        points: `(N, 3)`, N >= 4, finite, not all in one place; else a ValueError.
     """
     if len(points) <= NEIGHBOURS:
         raise ValueError(f"points: expected at least {NEIGHBOURS + 1} to take a spacing from, got {len(points)}")

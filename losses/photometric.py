@@ -39,8 +39,7 @@ class TargetMoments:
 
     Args:
         padded: the target with its reflected border, `(1, B C, H + 10, W + 10)`.
-        mean: local mean, `(1, B C, H, W)`.
-        variance: local variance, `(1, B C, H, W)`.
+        mean, variance: local mean and variance, `(1, B C, H, W)`.
     """
 
     padded: Tensor
@@ -76,7 +75,7 @@ def photometric_loss(
         The loss, 0-d.
 
     Raises:
-        TypeError: an image is no tensor, or neither float32 nor float64, or the two differ in dtype or device.
+        TypeError: an image is no float32 or float64 tensor, or the two differ in dtype or device.
         ValueError: shapes or the weight do not fit, or the mask is empty or has other values than 0 and 1.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
@@ -92,18 +91,16 @@ def photometric_loss(
     if moments is not None:
         if (moments.mean.shape, moments.mean.dtype, moments.mean.device) != (shape, image.dtype, image.device):
             raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
-        if moments is target:
-            target = moments.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
+    if isinstance(target, TargetMoments):
+        target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
         raise ValueError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
     outside = None
-    if mask is None:
-        loss = F.l1_loss(image, target)
-    else:
+    if mask is not None:
         outside = _outside(mask, image)
         image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
-        loss = _mean((image - target).abs(), outside)
+    loss = _mean((image - target).abs(), outside)
     if dssim_weight == 0.0:
         return loss
     if min(shape[-2:]) <= RADIUS:
@@ -141,7 +138,7 @@ def target_moments(target: Tensor) -> TargetMoments:
 
 
 class _MeanSsim(torch.autograd.Function):
-    """Mean of the SSIM map of an image `(1, K, H, W)` with a target given by its moments, over windows not `outside`.
+    """Mean SSIM of an image `(1, K, H, W)` and a target given by its moments, over the windows that are not `outside`.
 
     The derivatives of the map by the image's local mean, square and product with the target are pointwise; one more
     blur, the adjoint of the first, brings them to the pixels.
@@ -254,10 +251,9 @@ def _check_images(image: Tensor, target: Tensor) -> None:
             raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
         if value.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
-    if target.dtype != image.dtype or target.device != image.device:
-        raise TypeError(
-            f"target: expected {image.dtype} on {image.device} as image, got {target.dtype} on {target.device}"
-        )
+    wanted, got = (f"{value.dtype} on {value.device}" for value in (image, target))
+    if wanted != got:
+        raise TypeError(f"target: expected {wanted} as image, got {got}")
     if image.ndim != 4 or image.numel() == 0:
         raise ValueError(f"image: expected shape (B, C, H, W) without a zero, got {tuple(image.shape)}")
     if target.shape != image.shape:
