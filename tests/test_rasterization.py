@@ -1,0 +1,169 @@
+"""gsplat's call: against the renderer and the dense reference, and what it refuses."""
+
+import inspect
+
+import pytest
+import torch
+from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace
+
+import kgs
+import kgs.reference
+from kgs import GaussianRenderer, rasterization
+
+SIZE = (24, 32)
+POSITIONAL = (  # gsplat's, in its order
+    "means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree packed "
+    "tile_size backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed camera_model"
+).split()
+
+
+def scene(sh_degree=None, dtype=torch.float64, cameras=2):
+    gaussians = random_gaussians(60, 0, dtype, sh_degree, 32)
+    return gaussians, batch(*(random_camera(*SIZE, seed, dtype) for seed in range(cameras)))
+
+
+def call(gaussians, cameras, half=True, **options):
+    """With intrinsics as gsplat has them, and as kgs does."""
+    k = cameras.intrinsics[:, :3, :3].clone()
+    k[:, :2, 2] += 0.5 if half else 0.0
+    arguments = {name: getattr(gaussians, name) for name in FIELDS} | options
+    centers = {} if half else {"pixel_centers": "integer"}
+    return rasterization(viewmats=cameras.extrinsics, Ks=k, width=32, height=24, **centers, **arguments)
+
+
+def test_the_names_and_their_order_are_gsplats():
+    assert list(inspect.signature(rasterization).parameters)[: len(POSITIONAL)] == POSITIONAL
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("half", [True, False])
+def test_renders_are_those_of_the_renderer(half, dtype, bound):
+    gaussians, cameras = scene(dtype=dtype)
+    out = GaussianRenderer()(gaussians, cameras, outputs=("image", "alpha", "depth"))
+    renders, alphas, meta = call(gaussians, cameras, half, render_mode="RGB+ED")
+    assert renders.shape == (2, 24, 32, 4)
+    assert alphas.shape == (2, 24, 32, 1)
+    assert (renders[..., :3] - out.image.permute(0, 2, 3, 1)).abs().max() <= bound
+    assert (alphas - out.alpha.permute(0, 2, 3, 1)).abs().max() <= bound
+    covered = out.alpha.permute(0, 2, 3, 1) > 1e-3
+    assert ((renders[..., 3:] - out.depth.permute(0, 2, 3, 1)) * covered).abs().max() <= 100 * bound
+    seen = out.projected
+    for name in ("camera_ids", "gaussian_ids", "radii"):
+        assert torch.equal(meta[name], getattr(seen, name))
+    for name in ("depths", "opacities", "conics"):
+        assert torch.allclose(meta[name], getattr(seen, name))
+    assert (meta["means2d"] - seen.means2d - (0.5 if half else 0.0)).abs().max() <= 1e-4
+    assert (meta["width"], meta["height"], meta["tile_size"], meta["n_cameras"]) == (32, 24, 8, 2)
+
+
+def test_a_point_lands_where_its_intrinsics_say():
+    gaussians, cameras = scene(cameras=1)
+    _, _, meta = call(gaussians, cameras)
+    k = cameras.intrinsics[0, :3, :3].clone()
+    k[:2, 2] += 0.5
+    points = gaussians.means @ cameras.extrinsics[0, :3, :3].T + cameras.extrinsics[0, :3, 3]
+    pixels = (points @ k.T)[meta["gaussian_ids"]]
+    assert torch.allclose(meta["means2d"], pixels[:, :2] / pixels[:, 2:])
+
+
+@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+def test_the_modes_are_what_the_weights_of_the_reference_say(mode):
+    gaussians, cameras = scene(cameras=1)
+    exact = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
+    drawn = kgs.reference.layers(gaussians, cameras, **exact)
+    color = torch.einsum("lhw,lc->hwc", drawn.weights, drawn.colors)
+    depth = torch.einsum("lhw,l->hw", drawn.weights, drawn.depths)[..., None]
+    alpha = (1 - drawn.transmittance)[..., None]
+    parts = {"RGB": color, "D": depth, "ED": depth / alpha}
+    renders, alphas, _ = call(gaussians, cameras, render_mode=mode, **exact)
+    assert torch.allclose(renders[0], torch.cat([parts[part] for part in mode.split("+")], 2), atol=1e-11)
+    assert torch.allclose(alphas[0], alpha, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_up_to_a_degree(degree):
+    gaussians, cameras = scene(3)
+    lower = replace(gaussians, colors=gaussians.colors[:, : (degree + 1) ** 2])
+    expected = GaussianRenderer()(lower, cameras).image.permute(0, 2, 3, 1)
+    assert torch.allclose(call(gaussians, cameras, sh_degree=degree)[0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [1, 2, 7])
+@pytest.mark.parametrize("own", [False, True])
+def test_features_of_any_width_also_one_set_per_camera(width, own):
+    gaussians, cameras = scene()
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(2, 60, width, generator=generator, dtype=torch.float64)
+    backgrounds = torch.randn(2, width, generator=generator, dtype=torch.float64)
+    leaf = (features if own else features[0]).clone().requires_grad_()
+    renders, _, _ = call(gaussians, cameras, colors=leaf, backgrounds=backgrounds)
+    for c in range(2):
+        padded = torch.cat([features[c if own else 0], torch.zeros(60, 6 - width if width < 6 else 2)], 1)
+        bright = torch.cat([backgrounds[c], torch.zeros(len(padded[0]) - width, dtype=torch.float64)])
+        for first in range(0, width, 3):
+            part = replace(gaussians, colors=padded[:, first : first + 3])
+            single = random_camera(*SIZE, c)
+            image = GaussianRenderer()(part, single, bright[first : first + 3]).image[0].permute(1, 2, 0)
+            assert torch.allclose(renders[c, :, :, first : first + 3], image[..., : width - first], atol=1e-12)
+    renders.square().sum().backward()
+    assert leaf.grad.isfinite().all()
+    assert leaf.grad.reshape(-1, 60, width).flatten(1).any(1).all()
+
+
+def test_opacities_of_each_camera_and_gradients_of_everything():
+    gaussians, cameras = scene(1)
+    own = torch.stack([gaussians.opacities, gaussians.opacities.flip(0)])
+    gaussians, inputs = leaves(replace(gaussians, opacities=own))
+    k = cameras.intrinsics[:, :3, :3].clone().requires_grad_()
+    pose = cameras.extrinsics.clone().requires_grad_()
+    renders, _, meta = rasterization(*inputs, pose, k, 32, 24, sh_degree=1, pixel_centers="integer")
+    renders.square().sum().backward()
+    again, expected = leaves(gaussians)
+    image = GaussianRenderer()(again, kgs.cameras(cameras.extrinsics, k.detach(), 32, 24)).image
+    image.square().sum().backward()
+    for got, wanted in zip(inputs, expected, strict=True):
+        assert torch.allclose(got.grad, wanted.grad, atol=1e-9)
+    assert k.grad.any()
+    assert pose.grad.any()
+    assert meta["means2d"].grad.shape == meta["means2d"].shape
+    assert meta["means2d"].grad.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rasterize_mode", "antialiased"),
+        ("sparse_grad", True),
+        ("absgrad", True),
+        ("distributed", True),
+        ("camera_model", "fisheye"),
+        ("radius_clip", 0.5),
+        ("far_plane", 100.0),
+        ("covars", torch.eye(3).expand(60, 3, 3)),
+        ("with_ut", True),
+        ("radial_coeffs", torch.zeros(2, 4)),
+        ("render_mode", "RGBD"),
+        ("pixel_centers", "corner"),
+        ("sh_degree", 4),
+        ("sh_degree", 0),
+        ("colors", torch.zeros(59, 3).double()),
+        ("colors", torch.zeros(3, 60, 3).double()),
+        ("backgrounds", torch.zeros(2, 4).double()),
+        ("near_plane", -1.0),
+        ("tile_size", 0),
+        ("backend", "cuda"),
+    ],
+)
+def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
+    gaussians, cameras = scene()
+    named = "colors" if (name, value) == ("sh_degree", 0) else name
+    with pytest.raises(ValueError, match=rf"^{named}: expected"):
+        call(gaussians, cameras, **{name: value})
+
+
+def test_what_does_nothing_is_accepted_and_unknown_names_are_not():
+    gaussians, cameras = scene()
+    harmless = {"packed": False, "channel_chunk": 8, "segmented": True, "far_plane": 1e12, "radial_coeffs": None}
+    assert torch.equal(call(gaussians, cameras, **harmless)[0], call(gaussians, cameras)[0])
+    with pytest.raises(TypeError, match="unexpected argument 'near'"):
+        call(gaussians, cameras, near=0.1)
