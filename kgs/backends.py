@@ -1,8 +1,7 @@
 """Which implementation runs which stage: the one place where compiled stages stand beside those in torch.
 
-Each stage has one contract. The torch implementation covers every call and defines what is right; another one may
-cover fewer, gives the same within the rounding of its dtype, and differentiates what torch differentiates. Arguments
-are checked before a stage is called.
+Each stage has one contract. Torch covers every call and defines what is right; another implementation may cover fewer,
+gives the same within the rounding of its dtype and differentiates the same. Arguments are checked before.
 
     "projection"   (gaussians, cameras, image size, RasterOptions, with colours) -> ProjectedGaussians
     "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
@@ -15,19 +14,13 @@ makes its own. They decide nothing: a pixel depends on the alphas of its layers 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 __all__ = ["available", "check_backend", "choose", "register"]
 
 STAGES = ("projection", "compositing", "loss")
-
-
-class _Implementation(NamedTuple):
-    run: Callable[..., Any]
-    covers: Callable[..., bool]
-
-
-_registry: dict[str, dict[str, _Implementation]] = {stage: {} for stage in STAGES}
+Pair = tuple[Callable[..., Any], Callable[..., bool]]  # run, covers
+_registry: dict[str, dict[str, Pair]] = {stage: {} for stage in STAGES}
 
 
 def register(stage: str, backend: str, run: Callable[..., Any], covers: Callable[..., bool] = lambda *_: True) -> None:
@@ -44,7 +37,7 @@ def register(stage: str, backend: str, run: Callable[..., Any], covers: Callable
     """
     if stage not in _registry:
         raise ValueError(f"stage: expected one of {STAGES}, got {stage!r}")
-    _registry[stage] = {backend: _Implementation(run, covers)} | _registry[stage]
+    _registry[stage] = {backend: (run, covers)} | _registry[stage]
 
 
 def available() -> tuple[str, ...]:
@@ -68,9 +61,8 @@ def choose(stage: str, backend: str, *arguments: Any) -> Callable[..., Any]:
     """
     check_backend(backend)
     there = _registry[stage]
-    if backend != "auto" and backend in there:
-        if not there[backend].covers(*arguments):
-            raise ValueError(f'backend: {backend!r} does not cover this call of {stage}, expected "auto" or "torch"')
-        return there[backend].run
-    names = there if backend == "auto" else ("torch",)
-    return next(there[name].run for name in names if there[name].covers(*arguments))
+    names = list(there) if backend == "auto" else [backend if backend in there else "torch"]
+    for run, covers in (there[name] for name in names):
+        if covers(*arguments):
+            return run
+    raise ValueError(f'backend: {backend!r} does not cover this call of {stage}, expected "auto" or "torch"')

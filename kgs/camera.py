@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -124,27 +125,25 @@ def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers
     for name, value in (("viewmats", viewmats), ("Ks", Ks)):
         if not isinstance(value, Tensor):
             raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
-    if (Ks.dtype, Ks.device) != (viewmats.dtype, viewmats.device):
-        raise TypeError(
-            f"Ks: expected {viewmats.dtype} on {viewmats.device} as viewmats, got {Ks.dtype} on {Ks.device}"
-        )
+    want, got = (viewmats.dtype, viewmats.device), (Ks.dtype, Ks.device)
+    if want != got:
+        raise TypeError(f"Ks: expected {want[0]} on {want[1]} as viewmats, got {got[0]} on {got[1]}")
     if viewmats.ndim not in (2, 3) or viewmats.shape[-2:] != (4, 4):
         raise ValueError(f"viewmats: expected shape (C, 4, 4) or (4, 4), got {tuple(viewmats.shape)}")
     poses = viewmats.reshape(-1, 4, 4)
-    count, side = poses.shape[0], Ks.shape[-1] if Ks.ndim else 0
-    if side not in (3, 4) or tuple(Ks.shape) not in ((side, side), (1, side, side), (count, side, side)):
-        raise ValueError(f"Ks: expected shape ({count}, 3, 3), ({count}, 4, 4) or one matrix, got {tuple(Ks.shape)}")
+    count, shape = poses.shape[0], tuple(Ks.shape)
+    if shape[-2:] not in ((3, 3), (4, 4)) or shape[:-2] not in ((), (1,), (count,)):
+        raise ValueError(f"Ks: expected shape ({count}, 3, 3), ({count}, 4, 4) or one matrix, got {shape}")
     if pixel_centers not in ("integer", "half"):
         raise ValueError(f'pixel_centers: expected "integer" or "half", got {pixel_centers!r}')
     for name, size in (("width", width), ("height", height)):
         if not (isinstance(size, int | np.integer) and size >= 1):
             raise ValueError(f"{name}: expected an integer >= 1, got {size!r}")
-    shift = torch.zeros(4, 4, dtype=Ks.dtype, device=Ks.device)
-    shift[:2, 2] = 0.5 if pixel_centers == "half" else 0.0
-    full = torch.zeros_like(shift).fill_diagonal_(1.0).repeat(count, 1, 1)
+    full = torch.eye(4, dtype=Ks.dtype, device=Ks.device).repeat(count, 1, 1)
     full[:, :3, :3] = Ks[..., :3, :3]
+    full[:, :2, 2] -= 0.5 if pixel_centers == "half" else 0.0
     sizes = (torch.full((count,), int(size), device=poses.device) for size in (height, width))
-    return PinholeCamera(full - shift, poses, *sizes)
+    return PinholeCamera(full, poses, *sizes)
 
 
 def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
@@ -160,14 +159,14 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
         ValueError: the cameras differ in size or have none.
     """
     if isinstance(cameras, PosedCamera):
-        heights, widths = {int(cameras.model.height)}, {int(cameras.model.width)}
+        sizes = {(int(cameras.model.height), int(cameras.model.width))}
     elif isinstance(cameras, PinholeCamera):
-        heights, widths = set(map(int, cameras.height.tolist())), set(map(int, cameras.width.tolist()))
+        sizes = set(zip(map(int, cameras.height.tolist()), map(int, cameras.width.tolist()), strict=True))
     else:
         raise TypeError(f"cameras: expected a kornia PinholeCamera or a kgs.PosedCamera, got {type(cameras).__name__}")
-    if len(heights) != 1 or len(widths) != 1:
-        raise ValueError(f"cameras: expected one image size, got heights {sorted(heights)} and widths {sorted(widths)}")
-    height, width = heights.pop(), widths.pop()
+    if len(sizes) != 1:
+        raise ValueError(f"cameras: expected one image size (height, width), got {sorted(sizes)}")
+    ((height, width),) = sizes
     if height < 1 or width < 1:
         raise ValueError(f"cameras: expected a positive image size, got {height}x{width}")
     return height, width
@@ -277,10 +276,8 @@ def _clamp_tangents(points: Tensor, limits: list[Tensor]) -> Tensor:
 
 def _perspective_jacobian(k: Tensor, points: Tensor, limits: list[Tensor]) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
-    x, y, z = points.unbind(1)
-    inverse = 1.0 / z
-    tx = (x * inverse).clamp(limits[0], limits[1])
-    ty = (y * inverse).clamp(limits[2], limits[3])
+    inverse = 1.0 / points[:, 2]
+    tx, ty = (points[:, 0] * inverse).clamp(*limits[:2]), (points[:, 1] * inverse).clamp(*limits[2:])
     last = -inverse[:, None] * in_full_precision(torch.matmul, torch.stack([tx, ty], 1), k.T)
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
@@ -290,10 +287,7 @@ def _reverse_jacobian(pixels: Pixels, points: Tensor) -> Tensor:
     with torch.inference_mode(False), torch.enable_grad():
         if not (differentiable and points.requires_grad):
             points = points.detach().clone().requires_grad_()
-        uv = pixels(points)
-        rows = [
-            torch.autograd.grad(uv[:, i].sum(), points, create_graph=differentiable, retain_graph=True)[0]
-            for i in (0, 1)
-        ]
+        options: Any = {"create_graph": differentiable, "retain_graph": True}
+        rows = [torch.autograd.grad(part.sum(), points, **options)[0] for part in pixels(points).unbind(1)]
     jacobian = torch.stack(rows, 1)
     return jacobian if differentiable else jacobian.detach()

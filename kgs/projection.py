@@ -62,16 +62,11 @@ def project(
     size, means = image_size(cameras), gaussians.means
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
         if matrix.dtype != means.dtype or matrix.device != means.device:
-            raise TypeError(
-                f"cameras: expected {means.dtype} on {means.device} as the Gaussians, "
-                f"got {matrix.dtype} on {matrix.device}"
-            )
-    rows, count, n = gaussians.opacities.shape[:-1], cameras.extrinsics.shape[0], len(gaussians)
-    if rows not in ((), (count,)):
-        raise ValueError(
-            f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, "
-            f"got {tuple(gaussians.opacities.shape)}"
-        )
+            want, got = f"{means.dtype} on {means.device}", f"{matrix.dtype} on {matrix.device}"
+            raise TypeError(f"cameras: expected {want} as the Gaussians, got {got}")
+    shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
+    if shape[:-1] not in ((), (count,)):
+        raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
     run = choose("projection", backend, gaussians, cameras, size, options, colors)
     projected: ProjectedGaussians = run(gaussians, cameras, size, options, colors)
     return projected
@@ -81,17 +76,15 @@ def project_torch(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`project` in torch, for every camera, device and dtype; trusts its arguments."""
-    means = gaussians.means
-    views = lenses(cameras)
-    finite = _finite(gaussians)
+    device, views, finite = gaussians.means.device, lenses(cameras), _finite(gaussians)
     reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
-    with full_precision(means.device):
+    with full_precision(device):
         parts = [_project_one(gaussians, c, lens, size, finite, options, reach, colors) for c, lens in enumerate(views)]
     fields = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
+    counts = torch.tensor([part[0].shape[0] for part in parts], device=device)
     ids, means2d, factors, depths, radii, opacities, rgb = fields
-    counts = torch.tensor([part[0].shape[0] for part in parts], device=means.device)
     return ProjectedGaussians(
-        camera_ids=torch.repeat_interleave(torch.arange(len(parts), device=means.device), counts),
+        camera_ids=torch.repeat_interleave(torch.arange(len(parts), device=device), counts),
         gaussian_ids=ids,
         means2d=means2d,
         factors=factors,
@@ -174,21 +167,11 @@ def _project_one(
         kept = seen.nonzero()[:, 0]
     all_opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
     ids, radii = _rows(ids, kept), _rows(radii, kept)
-    if colors:
-        rgb = _rows(gaussians.colors, ids)
-        if rgb.ndim == 3:
-            rgb = evaluate_harmonics(rgb, _directions(_rows(means, kept), lens))
-    else:
-        rgb = means.new_zeros(ids.shape[0], 0)
-    return (
-        ids,
-        _rows(means2d, kept),
-        _rows(factors, kept),
-        _rows(points[:, 2], kept),
-        radii,
-        _rows(all_opacities, ids),
-        rgb,
-    )
+    rgb = _rows(gaussians.colors, ids) if colors else means.new_zeros(ids.shape[0], 0)
+    if rgb.ndim == 3:
+        rgb = evaluate_harmonics(rgb, _directions(_rows(means, kept), lens))
+    projected = (_rows(x, kept) for x in (means2d, factors, points[:, 2]))
+    return ids, *projected, radii, _rows(all_opacities, ids), rgb
 
 
 def _reach(opacities: Tensor, alpha_threshold: float) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -147,8 +148,8 @@ class GaussianRenderer(nn.Module):
             backend=self.backend,
         )
         alpha = 1.0 - result.transmittance
-        sums = result.features.split([x.shape[1] for x in features.values()], 1)
-        found = dict(zip(features, sums, strict=True))
+        ends = accumulate((x.shape[1] for x in features.values()), initial=0)
+        found = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
         if "depth" in wanted:
             covered = alpha >= 1e-6
             found["depth"] = torch.where(covered, found["depth"] / torch.where(covered, alpha, 1.0), 0.0)

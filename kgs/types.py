@@ -57,12 +57,8 @@ class RasterOptions:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
-        for name, most in (
-            ("near_plane", math.inf),
-            ("eps2d", math.inf),
-            ("alpha_threshold", 1),
-            ("transmittance_stop", 1),
-        ):
+        ends = {"near_plane": math.inf, "eps2d": math.inf, "alpha_threshold": 1, "transmittance_stop": 1}
+        for name, most in ends.items():
             value = getattr(self, name)
             if not isinstance(value, int | float) or not 0.0 <= value < most:
                 raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
@@ -92,31 +88,24 @@ class Gaussians:
     colors: Tensor
 
     def __post_init__(self) -> None:
-        for name in ("means", "quats", "scales", "opacities", "colors"):
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             if not isinstance(value, Tensor):
                 raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
             if value.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
             if value.dtype != self.means.dtype or value.device != self.means.device:
-                raise TypeError(
-                    f"{name}: expected {self.means.dtype} on {self.means.device} as means, "
-                    f"got {value.dtype} on {value.device}"
-                )
+                want = f"{self.means.dtype} on {self.means.device}"
+                raise TypeError(f"{name}: expected {want} as means, got {value.dtype} on {value.device}")
         n = self.means.shape[0] if self.means.ndim else 0
         _check_shape("means", self.means, (n, 3))
         _check_shape("quats", self.quats, (n, 4))
         _check_shape("scales", self.scales, (n, 3))
         if self.opacities.ndim not in (1, 2) or self.opacities.shape[-1] != n:
             raise ValueError(f"opacities: expected shape ({n},) or (C, {n}), got {tuple(self.opacities.shape)}")
-        if self.colors.ndim == 2:
-            _check_shape("colors", self.colors, (n, self.colors.shape[1]))
-        elif self.colors.ndim != 3 or self.colors.shape[1] not in SH_SIZES:
-            raise ValueError(
-                f"colors: expected shape ({n}, D) or ({n}, K, 3) with K in {SH_SIZES}, got {tuple(self.colors.shape)}"
-            )
-        else:
-            _check_shape("colors", self.colors, (n, self.colors.shape[1], 3))
+        shape = tuple(self.colors.shape)
+        fits = len(shape) == 2 or (len(shape) == 3 and shape[1] in SH_SIZES and shape[2] == 3)
+        if not fits or shape[0] != n:
+            raise ValueError(f"colors: expected shape ({n}, D) or ({n}, K, 3) with K in {SH_SIZES}, got {shape}")
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -11,10 +11,12 @@ import kgs.reference
 from kgs import GaussianRenderer, rasterization
 
 SIZE = (24, 32)
-POSITIONAL = (  # gsplat's, in its order
-    "means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree packed "
-    "tile_size backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed camera_model"
-).split()
+POSITIONAL = [  # gsplat's, in its order
+    *("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"),
+    *("width", "height", "near_plane", "far_plane", "radius_clip", "eps2d", "sh_degree"),
+    *("packed", "tile_size", "backgrounds", "render_mode", "sparse_grad", "absgrad"),
+    *("rasterize_mode", "channel_chunk", "distributed", "camera_model"),
+]
 
 
 def scene(sh_degree=None, dtype=torch.float64, cameras=2):

@@ -1,52 +1,12 @@
-"""Binning against brute force: every tile with a pixel whose alpha reaches the threshold, and hardly another."""
-
-import functools
+"""Lists of tiles against brute force: every tile with a pixel whose alpha reaches the threshold, and hardly another."""
 
 import pytest
 import torch
 from oracles import random_camera, random_gaussians
+from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, packed, scene
 
-from kgs import Gaussians, ProjectedGaussians, project
+from kgs import Gaussians, project
 from kgs.raster.tiles import Reach, bin_to_tiles
-
-THRESHOLD = 1 / 255
-INTEGERS = ("offsets", "entries", "ids", "by_gaussian", "gaussian_offsets")
-
-
-def packed(means2d, factors, opacities, size, camera_ids=None, depths=None, cameras=1, eps2d=0.3):
-    """What `project` would have returned."""
-    m = len(means2d)
-    return ProjectedGaussians(
-        camera_ids=torch.zeros(m, dtype=torch.int64) if camera_ids is None else camera_ids,
-        gaussian_ids=torch.arange(m),
-        means2d=means2d,
-        factors=factors,
-        depths=torch.arange(1, m + 1).to(means2d) if depths is None else depths,
-        radii=torch.ones(m).to(means2d),
-        opacities=opacities,
-        colors=torch.ones(m, 3).to(means2d),
-        image_size=size,
-        num_cameras=cameras,
-        num_gaussians=m,
-        num_nonfinite=torch.tensor(0),
-        eps2d=eps2d,
-    )
-
-
-def dots(means2d, size, opacity=0.9, **options):
-    """Round footprints of variance 0.3 px^2."""
-    means2d = torch.as_tensor(means2d, dtype=torch.float32).reshape(-1, 2)
-    return packed(means2d, torch.zeros(len(means2d), 2, 3), torch.full((len(means2d),), opacity), size, **options)
-
-
-@functools.cache
-def scene(seed, dtype=torch.float32, size=(45, 67), n=150, cameras=1):
-    gaussians = random_gaussians(n, seed, dtype, None, max(size))
-    parts = [project(gaussians, random_camera(*size, seed + c, dtype)) for c in range(cameras)]
-    names = ("means2d", "factors", "opacities", "depths")
-    fields = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    camera_ids = torch.cat([torch.full((len(part),), c) for c, part in enumerate(parts)])
-    return packed(size=size, camera_ids=camera_ids, cameras=cameras, **fields)
 
 
 def needles(seed, ratio, size=(45, 67)):
@@ -77,43 +37,6 @@ def strengths(projected, tile_size):
     everywhere = torch.zeros(len(projected), projected.num_cameras, rows * columns, dtype=torch.float64)
     everywhere[torch.arange(len(projected)), projected.camera_ids] = largest
     return everywhere.flatten(1)
-
-
-def tiles_of_entries(bins):
-    return torch.repeat_interleave(torch.arange(bins.num_tiles), bins.offsets.diff())
-
-
-def listed(projected, bins):
-    """(M, tiles) booleans from the lists; no pair may be listed twice."""
-    table = torch.zeros(len(projected), bins.num_tiles, dtype=torch.int64)
-    table.index_put_(
-        (bins.ids[bins.entries.long()], tiles_of_entries(bins)), torch.ones(len(bins.entries), dtype=torch.int64), True
-    )
-    assert table.max() <= 1
-    return table.bool()
-
-
-def check_structure(projected, bins):
-    """Everything that the docstring of TileLists promises of offsets, order and the inverse permutation."""
-    entries, n = bins.entries.long(), len(bins.ids)
-    assert bins.entries.dtype == torch.int32
-    assert all(getattr(bins, name).dtype == torch.int64 for name in INTEGERS if name != "entries")
-    assert bins.offsets[0] == 0
-    assert bins.offsets[-1] == len(entries)
-    assert (bins.offsets.diff() >= 0).all()
-    depths = projected.depths[bins.ids]
-    assert (depths.diff() >= 0).all()
-    assert (bins.ids.diff()[depths.diff() == 0] > 0).all(), "ties by index"
-    tile = tiles_of_entries(bins)
-    assert (entries.diff()[tile.diff() == 0] > 0).all(), "front to back, nobody twice"
-    rows_of_camera = bins.grid[0]
-    camera = (tile + bins.first_tile) // bins.grid[1] // rows_of_camera
-    assert torch.equal(projected.camera_ids[bins.ids[entries]], camera)
-    # by_gaussian lists the entries of ids[0], then of ids[1], ...; gaussian_offsets where each begins
-    assert torch.equal(bins.by_gaussian.sort().values, torch.arange(len(entries)))
-    assert torch.equal(entries[bins.by_gaussian], entries.sort().values)
-    counts = entries.bincount(minlength=n)
-    assert torch.equal(bins.gaussian_offsets, counts.cumsum(0) - counts)
 
 
 # -- which tiles ---------------------------------------------------------------------------------------------------
@@ -266,133 +189,6 @@ def test_the_lists_are_integers_without_gradient_and_repeatable():
     for name in INTEGERS:
         assert torch.equal(getattr(first, name), getattr(second, name))
         assert not getattr(first, name).is_floating_point()
-
-
-# -- many tiles ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("cameras", [1, 16])
-def test_tile_numbers_beyond_16_bits(cameras):
-    """16 cameras of 4096 px: a dot at the middle of a random tile is in that tile alone."""
-    height, width = 64, 4096
-    grid, generator = (16, 1024), torch.Generator().manual_seed(0)
-    m = 3000
-    camera, row, column = (torch.randint(0, high, (m,), generator=generator) for high in (cameras, *grid))
-    camera[:2], row[:2], column[:2] = torch.tensor([0, cameras - 1]), torch.tensor([0, 15]), torch.tensor([0, 1023])
-    camera, order = camera.sort(stable=True)
-    row, column = row[order], column[order]
-    means2d = torch.stack([column * 4 + 1.5, row * 4 + 1.5], 1)
-    depths = torch.rand(m, generator=generator)
-    projected = dots(means2d, (height, width), 0.2, camera_ids=camera, cameras=cameras, depths=depths)
-    bins = bin_to_tiles(projected, 4)
-    assert bins.num_tiles == cameras * 16 * 1024
-    check_structure(projected, bins)
-    tile = torch.empty(m, dtype=torch.int64)
-    tile[bins.ids[bins.entries.long()]] = tiles_of_entries(bins)
-    assert len(bins.entries) == m
-    assert torch.equal(tile, (camera * grid[0] + row) * grid[1] + column)
-
-
-@pytest.mark.parametrize("rows", [2**15 // 64 - 1, 2**15 // 64, 2**15 // 64 + 1])
-def test_tile_counts_around_the_border_of_16_bits(rows):
-    projected = dots([[2.0, 2.0], [2.0 + 63 * 4, 2.0 + 4 * (rows - 1)]], (4 * rows, 256), 0.1)
-    bins = bin_to_tiles(projected, 4)
-    assert bins.num_tiles == 64 * rows
-    assert tiles_of_entries(bins).tolist() == [0, 64 * rows - 1]
-
-
-def test_a_batch_of_cameras_is_its_cameras_one_by_one():
-    cameras = 16
-    together = scene(0, cameras=cameras, n=40)
-    bins = bin_to_tiles(together)
-    check_structure(together, bins)
-    table = listed(together, bins).reshape(len(together), cameras, -1)
-    for c in range(cameras):
-        own = together.camera_ids == c
-        single = packed(*(x[own] for x in (together.means2d, together.factors, together.opacities)), (45, 67))
-        assert torch.equal(table[own, c], listed(single, bin_to_tiles(single)))
-        assert not table[own][:, torch.arange(cameras) != c].any()
-
-
-# -- slices --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("max_spans", [2**40, 100, 1])
-@pytest.mark.parametrize("share", [1.0, 0.5, 0.1, 0.0])
-def test_row_slices_cover_all_rows_within_the_budget_and_together_are_the_whole(share, max_spans):
-    projected = scene(0, cameras=3)
-    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    needs = 5 * reach.spans_per_row + 7 * reach.entries_per_row
-    budget = max(int(share * needs.sum()), int(needs.max()))
-    slices = reach.row_slices(budget, 5, 7)
-    assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
-    assert slices[-1][1] == 3 * whole.grid[0]
-    assert all(begin < end for begin, end in slices)
-    assert len(slices) == 1 if share == 1 else len(slices) > 1
-    parts = []
-    for begin, end in slices:
-        spans = reach.spans(begin, end)
-        part = reach.lists(spans, begin, end)
-        check_structure(projected, part)
-        assert 5 * len(spans.ranks) + 7 * len(part.entries) <= budget
-        assert (part.first_tile, part.num_tiles) == (begin * whole.grid[1], (end - begin) * whole.grid[1])
-        assert (part.tile_size, part.grid) == (8, whole.grid)
-        parts.append(part)
-    entries = torch.cat([part.ids[part.entries.long()] for part in parts])
-    assert torch.equal(entries, whole.ids[whole.entries.long()])
-    assert torch.equal(torch.cat([part.offsets.diff() for part in parts]), whole.offsets.diff())
-
-
-@pytest.mark.parametrize("max_spans", [2**40, 100])
-@pytest.mark.parametrize("layers", [1, 3, 10, 1000])
-def test_depth_slices_cover_all_ranks_in_about_equal_parts(layers, max_spans):
-    projected = scene(0, cameras=2)
-    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    slices, rows = reach.depth_slices(layers), (0, 2 * whole.grid[0])
-    assert slices == Reach(projected, 8, THRESHOLD).depth_slices(layers)
-    assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
-    assert slices[-1][1] == len(whole.ids)
-    assert all(begin < end for begin, end in slices)
-    entries = [len(reach.lists(reach.spans(*rows), *rows, ranks).entries) for ranks in slices]
-    assert sum(entries) == len(whole.entries)
-    largest = int(torch.bincount(whole.entries).max())  # a slice ends between two Gaussians
-    assert max(entries) <= max(len(whole.entries) / len(slices), layers * whole.num_tiles) * 1.5 + 2 * largest
-
-
-@pytest.mark.parametrize("rows", [(0, 12), (3, 7)])
-@pytest.mark.parametrize("ranks", [None, (0, 40), (25, 31)])
-@pytest.mark.parametrize("share", [None, 0.0, 0.4, 1.0])
-def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, ranks, share):
-    projected = scene(0, cameras=2)
-    reach = Reach(projected, 8, THRESHOLD)
-    spans = reach.spans(*rows)
-    whole, low, high = reach.lists(spans, *rows), *(ranks or (0, len(reach.ids)))
-    live = None if share is None else torch.rand(whole.num_tiles) < share
-    part = reach.lists(spans, *rows, ranks, live)
-    check_structure(projected, part)
-    assert torch.equal(part.ids, whole.ids[low:high])
-    for t in range(whole.num_tiles):
-        expected = whole.entries[whole.offsets[t] : whole.offsets[t + 1]]
-        expected = expected[(expected >= low) & (expected < high)] - low
-        if live is not None and not live[t]:
-            expected = expected[:0]
-        assert torch.equal(part.entries[part.offsets[t] : part.offsets[t + 1]], expected)
-
-
-@pytest.mark.parametrize("max_spans", [2**40, 200, 1])
-def test_spans_and_entries_per_row_are_what_the_rows_hold(max_spans):
-    projected = scene(0, cameras=2)
-    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    assert torch.equal(reach.entries_per_row, whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1))
-    assert reach.num_entries == len(whole.entries)
-    assert reach.spans_per_row.tolist() == [len(reach.spans(row, row + 1).ranks) for row in range(12)]
-
-
-def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
-    reach = Reach(scene(0), 8, THRESHOLD)
-    most = int(reach.entries_per_row.max())
-    with pytest.raises(ValueError, match=rf"max_bytes: one row of tiles needs {most} bytes, .* got {most - 1}"):
-        reach.row_slices(most - 1, 0, 1)
 
 
 # -- nothing to do -------------------------------------------------------------------------------------------------

@@ -82,10 +82,7 @@ def composite(
         torch.Size([1, 8, 24, 32])
     """
     options = RasterOptions(
-        tile_size=tile_size,
-        alpha_threshold=alpha_threshold,
-        transmittance_stop=transmittance_stop,
-        max_bytes=max_bytes,
+        tile_size=tile_size, alpha_threshold=alpha_threshold, transmittance_stop=transmittance_stop, max_bytes=max_bytes
     )
     if chunk_size is not None and (not isinstance(chunk_size, int) or chunk_size < 1):
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")

@@ -103,7 +103,7 @@ class Reach:
         total_rows: R, rows of tiles of all cameras.
         spans_per_row: `(R,)` int64.
         entries_per_row: `(R,)` int64.
-        num_entries: of all tiles.
+        num_spans, num_entries: of all rows.
     """
 
     @torch.no_grad()
@@ -132,31 +132,24 @@ class Reach:
         self._count(max_spans)
 
     def _count(self, max_spans: int) -> None:
-        """Count spans and entries; keep the spans where there is room for all."""
-        ends = torch.cumsum(self._num_rows, 0)
-        zeros = self.ids.new_zeros(self.total_rows + 1)
-        first = (self._camera_row + self._first_row).long()
-        steps = zeros.index_add(0, first, torch.ones_like(first)).index_add_(
-            0, first + self._num_rows, -torch.ones_like(first)
-        )
-        self.spans_per_row, self.entries_per_row = torch.cumsum(steps, 0)[:-1], zeros[:-1].clone()
-        self._entries_up_to, self._all = torch.empty_like(ends), None
-        bounds, total = [0], int(ends[-1]) if ends.shape[0] else 0
-        most = max(max_spans, self.grid[0])  # a Gaussian is never divided
-        while bounds[-1] < ends.shape[0]:
-            before = int(ends[bounds[-1] - 1]) if bounds[-1] else 0
-            limit = ends.new_tensor(before + most if total > max_spans else total)
-            bounds.append(int(torch.searchsorted(ends, limit, right=True)))
-        counted = 0
+        """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
+        ends, n = torch.cumsum(self._num_rows, 0), self.ids.shape[0]
+        self.num_spans = int(ends[-1]) if n else 0
+        cuts = range(max_spans, self.num_spans, max_spans)
+        bounds = [0, *(torch.searchsorted(ends, ends.new_tensor(cuts)).unique().tolist() if cuts else []), n]
+        self.entries_per_row, self._all, up_to = self.ids.new_zeros(self.total_rows), None, []
+        self.spans_per_row, self.num_entries = self.entries_per_row, 0
         for low, high in pairwise(bounds):
             spans = self.spans(0, self.total_rows, low, high)
+            self.spans_per_row = self.spans_per_row + torch.bincount(spans.rows, minlength=self.total_rows)
             self.entries_per_row.index_add_(0, spans.rows, spans.counts.long())
-            places = (ends[low:high] - (ends[low] - self._num_rows[low])) - 1
-            entries = torch.cumsum(spans.counts, 0).add_(counted).index_select(0, places)
-            self._entries_up_to[low:high] = entries
-            counted = int(entries[-1])
+            last = ends[low:high] - 1  # span of each Gaussian
+            up_to.append(torch.cumsum(spans.counts, 0).index_select(0, last - ends[low - 1] if low else last))
+            if low:
+                up_to[-1] += self.num_entries
+            self.num_entries = int(self.entries_per_row.sum())
             self._all = spans if len(bounds) == 2 else None
-        self.num_entries = counted
+        self._entries_up_to = torch.cat(up_to) if len(up_to) > 1 else up_to[0]
 
     def row_slices(self, max_bytes: int, per_span: int, per_entry: int) -> list[tuple[int, int]]:
         """Consecutive rows whose spans and entries take at most `max_bytes` together.

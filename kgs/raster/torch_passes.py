@@ -41,11 +41,11 @@ def composite_torch(
     dtype, buffers = features.dtype, buffer_bytes(options.max_bytes, features)
     budget = options.max_bytes - buffers * (4 if features.device.type == "cpu" else 1)  # some threads, one GPU
     per_span, per_entry = bytes_per_span(dtype), bytes_per_entry(features.shape[1], options.tile_size, dtype)
-    reach = Reach(projected, options.tile_size, options.alpha_threshold, budget // (2 * per_span))
+    reach = Reach(projected, options.tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span)))
     slices = reach.row_slices(budget, per_span, per_entry)
     size = chunk_size or choose_chunk_size(reach)
     rules = Rules(options.alpha_threshold, options.transmittance_stop, median_depth, size, buffers)
-    spare = budget - per_entry * reach.num_entries - per_span * int(reach.spans_per_row.sum()) // 4
+    spare = budget - per_entry * reach.num_entries - per_span * reach.num_spans // 4
     passes = _Passes(projected, reach, slices, rules, spare if len(slices) == 1 else 0)
     sums, transmittance, median = _Composite.apply(*inputs, passes, keep)
     return Composited(sums, transmittance, median if median_depth else None)
@@ -74,11 +74,7 @@ class _Passes:
             sums = sums or part.blank()
             keep_alphas = keep and part.alpha_bytes <= spare
             spare -= part.alpha_bytes * keep_alphas
-            run_all(
-                part.groups,
-                partial(Forward, part, sums, keep, keep_alphas),
-                spans.rows.device,
-            )
+            run_all(part.groups, partial(Forward, part, sums, keep, keep_alphas), spans.rows.device)
             if keep:
                 done.append((ranks, part))
             live = sums[0].amax((1, 2)) > 0

@@ -1,0 +1,55 @@
+"""What tests of compositing have in common."""
+
+import dataclasses
+
+import torch
+from oracles import random_camera, random_gaussians
+
+from kgs import ProjectedGaussians, project
+
+TH, STOP = 1 / 255, 1e-4
+
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def footprints(opacities, centres=None, factors=None, depths=None, size=(3, 4), dtype=torch.float64, eps2d=0.0):
+    """Hand-made projected Gaussians, front to back; without `factors` so wide that alpha is the same everywhere."""
+    opacities = torch.as_tensor(opacities, dtype=dtype)
+    n = opacities.shape[0]
+    if factors is None:
+        factors = torch.eye(2, 3, dtype=dtype).mul(1e9).expand(n, 2, 3)
+    return ProjectedGaussians(
+        camera_ids=torch.zeros(n, dtype=torch.int64),
+        gaussian_ids=torch.arange(n),
+        means2d=torch.zeros(n, 2, dtype=dtype) if centres is None else torch.as_tensor(centres, dtype=dtype),
+        factors=torch.as_tensor(factors, dtype=dtype),
+        depths=torch.arange(1, n + 1).to(dtype) if depths is None else torch.as_tensor(depths, dtype=dtype),
+        radii=torch.ones(n, dtype=dtype),
+        opacities=opacities,
+        colors=torch.zeros(n, 3, dtype=dtype),
+        image_size=size,
+        num_cameras=1,
+        num_gaussians=n,
+        num_nonfinite=torch.tensor(0),
+        eps2d=eps2d,
+    )
+
+
+def leaves(projected, features):
+    """The same footprints with leaves for inputs."""
+    names = ("means2d", "factors", "opacities")
+    inputs = [getattr(projected, name).detach().clone().requires_grad_() for name in names]
+    inputs.append(features.detach().clone().requires_grad_())
+    return dataclasses.replace(projected, **dict(zip(names, inputs[:3], strict=True))), inputs
+
+
+def scene_footprints(n, seed, dtype, size=(40, 56), **kwargs):
+    """Footprints and colours of an ordinary scene, and two fixed weights for a loss."""
+    with torch.no_grad():
+        projected = project(
+            random_gaussians(n, seed, dtype, **kwargs), random_camera(*size, seed, dtype), alpha_threshold=0.0
+        )
+    generator = torch.Generator().manual_seed(seed)
+    weights = torch.randn(1, 4, *size, generator=generator, dtype=torch.float64).to(dtype)
+    return projected, projected.colors, weights

@@ -1,0 +1,89 @@
+"""What tests of projection have in common."""
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
+from oracles import random_camera, random_gaussians
+
+from kgs import Gaussians, PosedCamera, project
+
+HEIGHT, WIDTH = 48, 64
+
+
+FIELDS = ("means", "quats", "scales", "opacities", "colors")
+
+
+LENGTHS = {kind: 0 for kind in CameraModelType} | {  # of the distortion
+    CameraModelType.BROWN_CONRADY: 8,
+    CameraModelType.KANNALA_BRANDT_K3: 4,
+}
+
+
+PACKED = ("means2d", "factors", "depths", "radii", "opacities", "colors")
+
+
+def replace(gaussians, **changes):
+    return Gaussians(**{name: getattr(gaussians, name) for name in FIELDS} | changes)
+
+
+def batch(*cameras):
+    return PinholeCamera(
+        *(torch.cat([getattr(c, name) for c in cameras]) for name in ("intrinsics", "extrinsics", "height", "width"))
+    )
+
+
+def scene(n=60, degree=1, dtype=torch.float64, cameras=1):
+    views = [random_camera(HEIGHT, WIDTH, seed, dtype) for seed in range(cameras)]
+    return random_gaussians(n, 0, dtype, degree, WIDTH), batch(*views)
+
+
+def posed(kind, params, extrinsics):
+    return PosedCamera(CameraModel(ImageSize(HEIGHT, WIDTH), kind, params), extrinsics)
+
+
+def assert_same(first, second):
+    """Bitwise the same list, Gaussian numbers aside."""
+    for name in ("camera_ids", *PACKED):
+        assert torch.equal(getattr(first, name), getattr(second, name)), name
+
+
+def covariances(gaussians):
+    """R S S R^T in float64 with R v = q v q* / |q|^2."""
+    w, x, y, z = gaussians.quats.double().unbind(1)
+    turn = (
+        torch.stack(
+            [
+                *(w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+                *(2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+                *(2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+            ],
+            1,
+        ).reshape(-1, 3, 3)
+        / (w * w + x * x + y * y + z * z)[:, None, None]
+    )
+    return turn @ torch.diag_embed(gaussians.scales.double() ** 2) @ turn.mT
+
+
+def sigma_route(gaussians, camera, eps2d=0.3):
+    """All Gaussians of one pinhole camera in float64: means2d, covariances J W Sigma W^T J^T + eps I, depths."""
+    k, pose = camera.intrinsics[0, :3, :3].double(), camera.extrinsics[0].double()
+    at = gaussians.means.double() @ pose[:3, :3].T + pose[:3, 3]
+    z = at[:, 2:]
+    pixels = (at @ k.T)[:, :2] / z
+    size = torch.tensor([WIDTH, HEIGHT], dtype=torch.float64)
+    focal, centre = k.diagonal()[:2], k[:2, 2]
+    tangents = ((focal * at[:, :2] / z + centre).clamp(-0.5 - 0.15 * size, 1.15 * size - 0.5) - centre) / focal
+    eye = torch.eye(2, dtype=torch.float64)
+    jacobian = k[:2, :2] @ torch.cat([eye.expand(len(z), 2, 2), -tangents[:, :, None]], 2) / z[:, :, None]
+    rows = jacobian @ pose[:3, :3]
+    return pixels, rows @ covariances(gaussians) @ rows.mT + eps2d * eye, at[:, 2]
+
+
+def values_and_gradients(gaussians, cameras):
+    leaves = {name: getattr(gaussians, name).clone().requires_grad_() for name in FIELDS}
+    got = project(Gaussians(**leaves), cameras)
+    (
+        got.means2d.sum() + got.factors.square().sum() + got.depths.sum() + (got.opacities[:, None] * got.colors).sum()
+    ).backward()
+    return got, {name: leaf.grad for name, leaf in leaves.items()}

@@ -1,0 +1,58 @@
+"""What tests of the reference have in common."""
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from oracles import (
+    pinhole,
+)
+from torch import Tensor
+
+from kgs import Gaussians
+
+EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
+
+
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+
+def tensor(*values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def fields(gaussians: Gaussians) -> dict[str, Tensor]:
+    return {name: getattr(gaussians, name) for name in NAMES}
+
+
+def replace(gaussians: Gaussians, **changes: Tensor) -> Gaussians:
+    return Gaussians(**{**fields(gaussians), **changes})
+
+
+def posed(camera: PinholeCamera, **changes: Tensor) -> PinholeCamera:
+    values = {"intrinsics": camera.intrinsics[0], "extrinsics": camera.extrinsics[0], **changes}
+    return PinholeCamera(values["intrinsics"][None], values["extrinsics"][None], camera.height, camera.width)
+
+
+def stack(opacities: list[float], colors: list[list[float]], scale: float = 1e6) -> Gaussians:
+    """Layers on the optical axis at depths 1, 2, 3, ...; by default so wide that alpha is constant over the image."""
+    n = len(opacities)
+    means = torch.zeros(n, 3, dtype=torch.float64)
+    means[:, 2] = torch.arange(1, n + 1)
+    quats = tensor([1, 0, 0, 0]).expand(n, 4)
+    return Gaussians(means, quats, torch.full((n, 3), scale).to(means), tensor(*opacities), tensor(*colors))
+
+
+def one(
+    mean: list[float], scale: list[float], opacity: float = 0.8, quat: tuple[float, ...] = (1, 0, 0, 0)
+) -> Gaussians:
+    return Gaussians(tensor(mean), tensor(quat), tensor(scale), tensor(opacity), tensor([1.0, 0.5, 0.25]))
+
+
+def grid(height: int, width: int) -> tuple[Tensor, Tensor]:
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return x, y
+
+
+SMALL = pinhole(4, 5, 10)
+
+
+RED, GREEN, BLUE = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]

@@ -1,0 +1,53 @@
+"""The promise of `max_bytes`, measured: the resident memory of a process of its own."""
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import sys
+import torch
+import kgs
+
+torch.set_num_threads(1)
+generator = torch.Generator().manual_seed(0)
+
+
+def status(name):
+    for line in open("/proc/self/status"):
+        if line.startswith(name):
+            return int(line.split()[1]) / 1024
+
+
+def gaussians(n):  # lines of 2 px as tall as the image
+    means = torch.cat([2 * torch.rand(n, 2, generator=generator) - 1, 4 + torch.rand(n, 1, generator=generator)], 1)
+    scales, quats = torch.tensor([[0.004, 2.0, 0.004]]).repeat(n, 1), torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    values = (means, quats, scales, 0.005 + 0.02 * torch.rand(n, generator=generator), torch.rand(n, 3))
+    return kgs.Gaussians(*(value.requires_grad_() for value in values))
+
+
+def run(n, height, max_bytes):
+    k = torch.tensor([[500.0, 0, 127.5], [0, 500.0, (height - 1) / 2], [0, 0, 1]])
+    camera = kgs.cameras(torch.eye(4), k, 256, height)
+    kgs.GaussianRenderer(max_bytes=max_bytes)(gaussians(n), camera).image.sum().backward()
+
+
+mebibytes = int(sys.argv[1])
+run(10, 32, 2**30)
+few = gaussians(15000)
+open("/proc/self/clear_refs", "w").write("5")
+before = status("VmRSS")
+run(15000, 1024, mebibytes * 2**20)
+print(status("VmHWM") - before)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+@pytest.mark.parametrize("mebibytes", [24, 64])
+def test_a_call_stays_within_max_bytes_for_tall_gaussians(mebibytes):
+    """15 000 lines in 128 rows of tiles: 2 million spans, which took 170 MiB whatever the bound was."""
+    run = [sys.executable, "-c", PROGRAM, str(mebibytes)]
+    done = subprocess.run(run, capture_output=True, text=True, check=True)
+    beside = 15000 * 4 * (14 + 2 * 14 + 40) / 2**20 + 256 * 1024 * 4 * 20 / 2**20  # numbers per Gaussian, per pixel
+    assert float(done.stdout) <= mebibytes + beside

@@ -1,0 +1,202 @@
+"""The rules of compositing: thresholds, the clamp of alpha, many layers."""
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
+from oracles import random_camera, random_gaussians
+
+import kgs
+import kgs.reference
+from kgs import GaussianRenderer, composite, project
+
+# -- thresholds ----------------------------------------------------------------------------------------------------
+
+
+def test_stop_is_inclusive():
+    # T behind two layers of 0.99 is 9.99998e-5 in float32 and 1.0000000000000002e-4 in float64: both must count them
+    white = {}
+    for dtype in DTYPES:
+        out = composite(footprints([0.99, 0.99], dtype=dtype), torch.eye(2, 3, dtype=dtype))
+        assert (out.features[0, :2, 0, 0].double() - torch.tensor([0.99, 0.0099])).abs().max() <= 1e-6
+        white[dtype] = (out.features[:, :2].sum(1) + out.transmittance[:, 0]).double()
+    assert (white[torch.float32] - white[torch.float64]).abs().max() <= STOP + 1e-6
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nothing_counts_behind_the_stop(dtype):
+    opacities = [0.9, 0.9, 0.9, 0.9, 0.9]  # T: 1, .1, .01, .001, 1e-4 (just above or below), ...
+    out = composite(footprints(opacities, dtype=dtype), torch.eye(5, dtype=dtype), transmittance_stop=0.005)
+    expected = torch.tensor([0.9, 0.09, 0.009, 0.0, 0.0], dtype=dtype)
+    assert (out.features[0, :, 0, 0] - expected).abs().max() <= 1e-7
+    assert not out.transmittance.any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("stop", [0.02, 0.05, 0.5])
+def test_light_of_exactly_the_stop_is_the_border(stop, dtype):
+    for left, counts in ((stop * (1 - 1e-4), False), (stop * (1 + 1e-4), True)):
+        out = composite(footprints([1 - left, 0.5], dtype=dtype), torch.eye(2, dtype=dtype), transmittance_stop=stop)
+        assert (out.features[0, 1] - 0.5 * left * counts).abs().max() <= 1e-6
+        assert not out.transmittance.any()
+
+
+@pytest.mark.parametrize("stop", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_error_of_the_stop_is_at_most_the_stop(seed, stop):
+    projected, colors, _ = scene_footprints(300, seed, torch.float64, image_size=20, opacities=(0.3, 0.95))
+    exact = composite(projected, colors, alpha_threshold=0.0, transmittance_stop=0.0)
+    got = composite(projected, colors, alpha_threshold=0.0, transmittance_stop=stop)
+    scale = colors.max()
+    assert (got.transmittance == 0).double().mean() > 0.1  # otherwise there is nothing to test
+    assert (got.features - exact.features).abs().max() <= stop * scale
+    assert (got.transmittance - exact.transmittance).abs().max() <= stop
+
+
+@pytest.mark.parametrize("threshold", [1 / 64, 1 / 255, 1e-4])
+def test_error_of_the_threshold_is_at_most_layers_times_it(threshold):
+    gaussians, camera = random_gaussians(200, 3, image_size=40, sh_degree=None), random_camera(40, 40, 3)
+    options = {"alpha_threshold": threshold, "transmittance_stop": STOP}
+    exact = GaussianRenderer(alpha_threshold=0, transmittance_stop=0)(gaussians, camera, torch.ones(3).double()).image
+    got = GaussianRenderer(**options)(gaussians, camera, torch.ones(3).double()).image
+    alphas = kgs.reference.layers(gaussians, camera, 0.0, 0.0).responses
+    skipped = (alphas * (alphas < threshold)).sum(0)
+    error = (got - exact).abs().amax(1)[0]
+    assert (error <= skipped + STOP + 1e-12).all()
+    assert (skipped <= 200 * threshold).all()
+    assert error.max() > threshold / 20  # the threshold acts
+
+
+def test_light_grows_with_the_threshold_and_falls_with_the_stop():
+    projected, colors, _ = scene_footprints(200, 4, torch.float64, image_size=30)
+
+    def light(threshold, stop):
+        return composite(projected, colors, alpha_threshold=threshold, transmittance_stop=stop).transmittance
+
+    by_threshold = [light(threshold, 0.0) for threshold in (0.0, 1e-4, 1 / 1024, 1 / 255, 1 / 64, 0.3)]
+    by_stop = [light(0.0, stop) for stop in (0.0, 1e-6, 1e-4, 1e-2, 0.5)]
+    for less, more in itertools.pairwise(by_threshold):
+        assert (more - less).min() >= -1e-14
+    for more, less in itertools.pairwise(by_stop):
+        assert (more - less).min() >= -1e-14
+    assert (by_threshold[-1] - by_threshold[0]).max() > 0.01
+    assert (by_stop[0] - by_stop[-1]).max() > 0.01
+
+
+def test_a_layer_counts_from_the_threshold_on():
+    for opacity, drawn in ((TH * (1 - 1e-5), False), (TH * (1 + 1e-5), True)):
+        layer = footprints([opacity], dtype=torch.float32)
+        assert bool((composite(layer, layer.colors).transmittance < 1).all()) is drawn
+
+
+# -- the clamp of alpha --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("opacity", [0.98, 0.995, 1.3])
+def test_clamp_of_alpha_and_its_exact_gradient(opacity, dtype):
+    alpha, slope = min(opacity, 0.99), float(opacity < 0.99)
+    projected, inputs = leaves(footprints([opacity, 0.5], dtype=dtype), torch.tensor([[1.0], [3.0]], dtype=dtype))
+    out = composite(projected, inputs[-1])
+    assert (out.features - (alpha + 3 * 0.5 * (1 - alpha))).abs().max() <= 1e-6
+    (out.features.sum() + 7 * out.transmittance.sum()).backward()
+    pixels = 12
+    # d/da of  a + 3 (1 - a) / 2 + 7 (1 - a) / 2,  and of the layer behind
+    expected = [slope * pixels * (1 - 1.5 - 3.5), pixels * (1 - alpha) * (3 - 7)]
+    assert (inputs[2].grad - torch.tensor(expected, dtype=dtype)).abs().max() <= 1e-4
+    assert (inputs[3].grad[:, 0] - torch.tensor([alpha, 0.5 * (1 - alpha)]) * pixels).abs().max() <= 1e-5
+
+
+@pytest.mark.parametrize("opacity", [0.98, 0.995, 1.3])
+def test_clamp_holds_pixel_by_pixel_in_the_gradient(opacity):
+    generator = torch.Generator().manual_seed(3)
+    start = footprints(
+        [opacity, 0.6], [[5.2, 4.1], [7.0, 3.0]], 4 * torch.randn(2, 2, 3, generator=generator), size=(9, 12), eps2d=0.3
+    )
+    colors = torch.rand(2, 3, generator=generator, dtype=torch.float64)
+
+    def image(means2d, factors, opacities, features):
+        made = dataclasses.replace(start, means2d=means2d, factors=factors, opacities=opacities)
+        out = composite(made, features, alpha_threshold=0.0, transmittance_stop=0.0)
+        return torch.cat([out.features, out.transmittance], 1)
+
+    weights = torch.randn(1, 4, 9, 12, generator=generator, dtype=torch.float64)
+    _, inputs = leaves(start, colors)
+    assert torch.autograd.gradcheck(lambda *x: (image(*x) * weights).sum((2, 3)), inputs, eps=1e-6, atol=1e-6)
+
+
+# -- many layers ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("alpha", [1 / 250, 0.05])
+def test_twenty_thousand_layers(alpha):
+    n = 20000
+    generator = torch.Generator().manual_seed(0)
+    opacities = alpha * (1 + torch.rand(n, generator=generator))
+    colors = torch.rand(n, 3, generator=generator)
+    projected, inputs = leaves(footprints(opacities, size=(2, 2), dtype=torch.float32), colors)
+    out = composite(projected, inputs[-1], tile_size=2, transmittance_stop=0.0)
+    got = torch.autograd.grad(out.features.mean((2, 3)).sum() + out.transmittance.mean(), inputs)
+
+    a, c = (x.double().requires_grad_() for x in (opacities, colors))
+    light = torch.cumprod(torch.cat([torch.ones(1), 1 - a]), 0)
+    expected = ((a * light[:-1])[:, None] * c).sum(0)
+    d_opacities, d_colors = torch.autograd.grad(expected.sum() + light[-1], (a, c))
+    assert ((out.features[0, :, 0, 0] - expected) / expected).abs().max() <= 1e-5
+    assert (out.transmittance - light[-1].detach()).abs().max() <= 1e-6
+    assert all(gradient.isfinite().all() for gradient in got)
+    seen = light[:-1] > 1e-6
+    assert ((got[3] - d_colors) / d_colors)[seen].abs().max() <= 1e-5
+    assert (got[2] - d_opacities).abs().max() <= 1e-5 * d_opacities.abs().max()
+    dark = light[:-1] < 1e-46
+    assert not got[2][dark].any()
+    assert not got[3][dark].any()
+
+
+@pytest.mark.parametrize("n", [1000, 20000])
+def test_transmittance_of_many_layers_is_accurate(n):
+    out = composite(footprints([1 / 250] * n, size=(2, 2), dtype=torch.float32), torch.ones(n, 1), tile_size=2)
+    exact = (1 - 1 / 250) ** n
+    if exact > 1e-4:
+        assert ((out.transmittance - exact) / exact).abs().max() <= 1e-5
+    else:
+        assert not out.transmittance.any()
+    assert (out.features - (1 - exact)).abs().max() <= STOP + 1e-5
+
+
+# -- what it takes -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [0, 1, 4, 30])
+def test_features_need_a_row_for_each_projected_gaussian(rows):
+    layers = footprints([0.5, 0.5])
+    with pytest.raises(ValueError, match=rf"features: expected shape \(2, F\), .* got \({rows}, 3\)"):
+        composite(layers, torch.zeros(rows, 3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"features: expected shape \(2, F\)"):
+        composite(layers, torch.zeros(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("name", ["projected", "features", "opacities", "factors"])
+def test_other_types_and_dtypes_are_named(name):
+    layers = footprints([0.5, 0.5])
+    given = {"projected": layers, "features": layers.colors}
+    if name in given:
+        with pytest.raises(TypeError, match=f"^{name}: expected"):
+            composite(**given | {name: [1.0]})
+    else:
+        given["projected"] = dataclasses.replace(layers, **{name: getattr(layers, name).float()})
+        with pytest.raises(TypeError, match=f"^{name}: expected 2 rows of torch.float64"):
+            composite(**given)
+    with pytest.raises(TypeError, match="^features: expected 2 rows of torch.float64"):
+        composite(layers, layers.colors.float())
+
+
+def test_projection_checks_its_options():
+    gaussians, camera = random_gaussians(3, 0), random_camera(8, 8, 0)
+    for name, value in (("alpha_threshold", -1.0), ("near_plane", -0.1), ("eps2d", float("nan")), ("backend", "cuda")):
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            project(gaussians, camera, **{name: value})
+    with pytest.raises(TypeError, match="^gaussians: expected kgs.Gaussians, got list"):
+        project([gaussians], camera)

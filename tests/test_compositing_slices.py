@@ -1,0 +1,287 @@
+"""How compositing is cut up: tiles, chunks, row slices and depth slices change nothing."""
+
+import dataclasses
+
+import pytest
+import torch
+from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
+from oracles import near_threshold, random_camera, random_gaussians
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from kgs import composite, project
+from kgs.raster.tasks import Slice
+from kgs.raster.tiles import bin_to_tiles
+
+
+def loss_and_gradients(projected, features, weights, **options):
+    projected, inputs = leaves(projected, features)
+    result = composite(projected, inputs[-1], **options)
+    image = torch.cat([result.features, result.transmittance], 1)
+    return image.detach(), torch.autograd.grad((image * weights).sum(), inputs)
+
+
+def assert_gradients_close(got, expected, bound):
+    for a, b in zip(got, expected, strict=True):
+        assert (a.double() - b.double()).abs().max() <= bound * b.abs().max()
+
+
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP)])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    gaussians = random_gaussians(300, 5, dtype, image_size=40)
+    camera = random_camera(40, 56, 5, dtype)
+    certain = ~near_threshold(gaussians, camera, *thresholds)
+    with torch.no_grad():
+        projected = project(gaussians, camera, alpha_threshold=thresholds[0])
+    weights = torch.randn(1, 4, 40, 56, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = (weights * certain).to(dtype)
+    first, first_gradients = loss_and_gradients(
+        projected, projected.colors, weights, tile_size=4, chunk_size=1, **options
+    )
+    for tile_size, chunk_size in [
+        (4, None),
+        (5, 3),
+        (8, 1),
+        (8, 3),
+        (8, 8),
+        (8, 32),
+        (16, 8),
+        (32, 32),
+        (64, 3),
+        (64, None),
+    ]:
+        image, gradients = loss_and_gradients(
+            projected, projected.colors, weights, tile_size=tile_size, chunk_size=chunk_size, **options
+        )
+        # the exponent is a polynomial about the tile's centre: its rounding grows with the tile's area
+        bound = 1e-6 * max(1.0, (tile_size / 16) ** 2) if dtype == torch.float32 else 1e-12
+        assert ((image - first).abs() * certain).max() <= bound
+        assert_gradients_close(gradients, first_gradients, 5 * bound)
+
+
+def dense(means2d, factors, opacities, features, depths, size, eps2d):
+    """Every footprint at every pixel, with the default thresholds: sums of features and light, by autograd."""
+    order = depths.argsort(stable=True)
+    covariances = factors @ factors.mT + eps2d * torch.eye(2, dtype=factors.dtype)
+    d = torch.cartesian_prod(*map(torch.arange, size)).flip(1) - means2d[:, None]
+    squared = torch.einsum("npi,nij,npj->np", d, torch.linalg.inv(covariances), d)
+    alphas = (opacities[:, None] * torch.exp(-0.5 * squared)).clamp(max=0.99)[order]
+    alphas = torch.where(alphas >= TH, alphas, 0.0)
+    light = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
+    light = torch.where(light >= STOP, light, 0.0)
+    sums = torch.einsum("np,nf->fp", alphas * light[:-1], features[order])
+    return torch.cat([sums, light[-1:]]).view(1, -1, *size)
+
+
+@pytest.mark.parametrize("chunk_size", [1, 3, None])
+@pytest.mark.parametrize("max_bytes", [2**30, 2**19])
+def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
+    # veils over all, and an opaque curtain for each column of tiles at another depth: tiles end one after the other
+    size, columns, veils = (20, 72), 9, 120
+    generator = torch.Generator().manual_seed(0)
+    walls = [(8 * c + 3.5, 10.0, 12.0 * (c * 4 % columns) + 0.5) for c in range(columns - 1)] * 8
+    centres = [(72 * x, 20 * y) for x, y in torch.rand(veils, 2, generator=generator).tolist()]
+    centres += [(x, y) for x, y, _ in walls]
+    curtain = torch.tensor([[5.0, 0, 0], [0, 60, 0]])
+    factors = torch.cat([25 * torch.eye(2, 3).expand(veils, 2, 3), curtain.expand(len(walls), 2, 3)])
+    factors = factors + torch.randn(factors.shape, generator=generator)
+    opacities = torch.cat([0.01 + 0.02 * torch.rand(veils, generator=generator), torch.full((len(walls),), 0.98)])
+    depths = torch.cat([torch.arange(veils), torch.tensor([z for *_, z in walls])])
+    projected = footprints(opacities, centres, factors, depths, size, eps2d=0.3)
+    colors = torch.rand(len(depths), 3, generator=generator, dtype=torch.float64)
+    weights = torch.randn(1, 4, *size, generator=generator, dtype=torch.float64)
+    image, gradients = loss_and_gradients(projected, colors, weights, chunk_size=chunk_size, max_bytes=max_bytes)
+    _, inputs = leaves(projected, colors)
+    expected = dense(*inputs, projected.depths, size, 0.3)
+    assert (expected[:, 3] == 0).double().mean() > 0.3
+    assert (expected[:, 3] > 0.05).double().mean() > 0.05
+    assert (image - expected).abs().max() <= 1e-12
+    assert_gradients_close(gradients, torch.autograd.grad((expected * weights).sum(), inputs), 1e-10)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The slices that are made from here on."""
+    found, init = [], Slice.__init__
+
+    def noted(part, *arguments):
+        init(part, *arguments)
+        found.append(part)
+
+    monkeypatch.setattr(Slice, "__init__", noted)
+    return found
+
+
+def tightest(projected, features, threshold=TH, **options):
+    """The smallest `max_bytes`, up to a tenth, with which one row of tiles fits."""
+    low, high = 1, 2**30
+    while high > 1.1 * low:
+        middle = (low + high) // 2 if high < 4 * low else int((low * high) ** 0.5)
+        try:
+            with torch.no_grad():
+                composite(projected, features, alpha_threshold=threshold, max_bytes=middle, **options)
+            high = middle
+        except ValueError:
+            low = middle
+    return high
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_byte_budget_changes_nothing(dtype, made):
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+    free, free_gradients = loss_and_gradients(projected, colors, weights)
+    assert len(made) == 1
+    budget = tightest(projected, colors)
+    made.clear()
+    tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
+    assert len(made) >= 2 * 3, "row slices, forward and again backward"
+    assert torch.equal(tight, free)
+    assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_alphas_made_again_are_those_that_were_kept(dtype, made, monkeypatch):
+    monkeypatch.setattr("kgs.raster.torch_passes.buffer_bytes", lambda *_: 2**20)  # so that groups stay the same
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+
+    def steps():
+        return [step for part in made for group in part.groups for step in group.steps]
+
+    kept, kept_gradients = loss_and_gradients(projected, colors, weights)
+    assert len(steps()) > 0
+    assert all(step.alpha is not None for step in steps())
+    budget = 2**30
+    while any(step.alpha is not None for step in steps()):  # until there is room for the lists alone
+        made.clear()
+        budget = int(0.9 * budget)
+        lean, lean_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
+    assert len(made) == 1
+    assert torch.equal(lean, kept)
+    assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP), (TH, 0.1)])
+@pytest.mark.parametrize("tight", [False, True])
+def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, made, monkeypatch):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+    opacities = projected.opacities.sqrt()  # some tiles get dark before the last layer
+    projected = dataclasses.replace(projected, opacities=opacities)
+    image, gradients = loss_and_gradients(projected, colors, weights, **options)
+    median = composite(projected, colors, median_depth=True, **options).median_depth
+    if tight:  # and in row slices
+        options["max_bytes"] = tightest(projected, colors, thresholds[0])
+    made.clear()
+    monkeypatch.setattr("kgs.raster.torch_passes._LAYERS", 6)
+    layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
+    entries = [len(part.lists.entries) for part in made]
+    assert len(entries) > (6 if tight else 3)
+    if thresholds[1] == 0.1:  # what lies behind the end of the light is not listed
+        assert sum(entries) < 0.9 * (2 if tight else 1) * len(bin_to_tiles(projected).entries)
+    assert (layered - image).abs().max() <= bound
+    assert_gradients_close(layered_gradients, gradients, bound)
+    assert torch.equal(composite(projected, colors, median_depth=True, **options).median_depth, median)
+
+
+@pytest.fixture
+def as_on_a_gpu(monkeypatch):
+    """Scans and sizes of steps as a GPU gets them."""
+    made = Slice.__init__
+
+    def init(part, *arguments):
+        made(part, *arguments)
+        part.by_layer = False
+
+    monkeypatch.setattr(Slice, "__init__", init)
+    monkeypatch.setattr("kgs.raster.tasks._STEP_PAIRS", {"cpu": 2**24})
+    monkeypatch.setattr("kgs.raster.tasks._PAIRS_TO_SHARE", 2**60)
+    monkeypatch.setattr("kgs.raster.torch_passes.choose_chunk_size", lambda _: 32)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP), (TH, 0.1)])
+def test_the_scans_of_a_gpu_give_the_same(dtype, bound, thresholds, request):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
+    image, gradients = loss_and_gradients(projected, colors, weights, **options)
+    request.getfixturevalue("as_on_a_gpu")
+    other, other_gradients = loss_and_gradients(projected, colors, weights, **options)
+    assert (other - image).abs().max() <= bound
+    assert_gradients_close(other_gradients, gradients, bound)
+
+
+class _Launches(TorchDispatchMode):
+    """Counts the operators that would be kernels on a GPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        self.count += not func.is_view
+        return result
+
+
+def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)  # the counter sees this thread alone
+
+    def launches(n, size):
+        projected, colors, weights = scene_footprints(n, 1, torch.float32, size, image_size=80)
+        with _Launches() as mode:
+            loss_and_gradients(projected, colors, weights)
+        return mode.count
+
+    few = launches(100, (40, 56))
+    assert few <= 500
+    assert launches(100, (160, 224)) <= few
+    assert launches(800, (160, 224)) <= few + 300  # lists longer than 32 take a second and a third step
+
+
+@pytest.mark.parametrize("size", [(8, 8), (8, 24), (24, 8), (11, 5)])
+def test_incoming_gradients_are_left_alone(size):
+    projected, inputs = leaves(*scene_footprints(40, 1, torch.float64, size=size)[:2])
+    out = composite(projected, inputs[-1])
+    grads = [torch.ones_like(out.features), torch.full_like(out.transmittance, 2.0)]
+    torch.autograd.backward([out.features, out.transmittance], grads, retain_graph=True)
+    first = [x.grad.clone() for x in inputs]
+    torch.autograd.backward([out.features, out.transmittance], grads)
+    assert (grads[0] == 1).all()
+    assert (grads[1] == 2).all()
+    assert all(torch.equal(x.grad, 2 * g) for x, g in zip(inputs, first, strict=True))
+
+
+def test_too_small_a_budget_is_an_error_with_the_numbers():
+    projected, colors, _ = scene_footprints(50, 1, torch.float32)
+    with pytest.raises(ValueError, match=r"max_bytes.*\d+ bytes"):
+        composite(projected, colors, max_bytes=160)
+
+
+@pytest.mark.slow
+def test_many_screen_filling_gaussians_under_a_budget():
+    n, size = 2000, (256, 256)
+    generator = torch.Generator().manual_seed(0)
+    centres = 256 * torch.rand(n, 2, generator=generator)
+    factors = 150 * torch.eye(2, 3) + 10 * torch.randn(n, 2, 3, generator=generator)
+    projected = footprints(torch.full((n,), 0.01), centres, factors, size=size, dtype=torch.float32, eps2d=0.3)
+    colors = torch.rand(n, 3, generator=generator)
+    weights = torch.randn(1, 4, *size, generator=generator)
+    free, free_gradients = loss_and_gradients(projected, colors, weights)
+    tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=64 * 2**20)
+    assert torch.equal(tight, free)
+    assert_gradients_close(tight_gradients, free_gradients, 1e-5)
+
+
+def test_cameras_in_one_call_do_not_mix():
+    projected, colors, weights = scene_footprints(60, 2, torch.float64)
+    n = len(projected)
+    names = ("gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
+    twice = {name: torch.cat([getattr(projected, name)] * 2) for name in names}
+    both = dataclasses.replace(projected, **twice, camera_ids=torch.arange(2).repeat_interleave(n), num_cameras=2)
+    single, single_gradients = loss_and_gradients(projected, colors, weights)
+    double, gradients = loss_and_gradients(both, torch.cat([colors, colors]), torch.cat([weights, 3 * weights]))
+    assert torch.equal(double, torch.cat([single, single]))
+    for got, expected in zip(gradients, single_gradients, strict=True):
+        assert_gradients_close([got[:n], got[n:]], [expected, 3 * expected], 1e-13)

@@ -1,0 +1,221 @@
+"""What `project` lists: what can be seen, and nothing that is not finite."""
+
+import math
+
+import pytest
+import torch
+from oracles import pinhole, random_camera, random_gaussians
+from projection_checks import (
+    FIELDS,
+    HEIGHT,
+    PACKED,
+    WIDTH,
+    assert_same,
+    replace,
+    scene,
+    sigma_route,
+    values_and_gradients,
+)
+
+from kgs import DropGaussian, Gaussians, project
+
+
+def select(gaussians, ids):
+    return Gaussians(
+        *(
+            getattr(gaussians, name)[..., ids] if name == "opacities" else getattr(gaussians, name)[ids]
+            for name in FIELDS
+        )
+    )
+
+
+def join(*parts):
+    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in FIELDS))
+
+
+def wide_scene(dtype=torch.float64):
+    """Gaussians in, partly in and far outside the image, before and behind the camera, faint and dense."""
+    gaussians = random_gaussians(600, 3, dtype, 0, WIDTH, opacities=(0.0, 1.0))
+    means = gaussians.means * torch.tensor([3.0, 3.0, 1.0], dtype=dtype)
+    means[::5, 2] *= -1
+    return replace(gaussians, means=means)
+
+
+REACH = math.sqrt(2 * math.log(2 * 255))  # standard deviations within which a footprint of opacity 2 is drawn
+
+
+# -- what is listed ------------------------------------------------------------------------------------------------
+
+
+def test_the_list_is_everything_in_front_that_would_be_drawn_at_opacity_two():
+    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
+    got = project(gaussians, cameras)
+    pixels, sigma, depths = sigma_route(gaussians, cameras)
+    reach = REACH * sigma.diagonal(dim1=1, dim2=2).sqrt()
+    size = torch.tensor([WIDTH, HEIGHT], dtype=torch.float64)
+    distance = (torch.maximum(-0.5 - pixels, pixels - size + 0.5) - reach).amax(1)  # below 0: the image is touched
+    clear = distance.abs() > 0.05
+    expected = (distance < 0) & (depths > 0.01)
+    listed = torch.zeros(len(gaussians), dtype=torch.bool)
+    listed[got.gaussian_ids] = True
+    assert torch.equal(listed[clear], expected[clear])
+    assert 50 < len(got) < 400
+    assert clear.sum() > 580
+
+
+def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
+    reach = REACH * math.sqrt(0.3) + 0.5
+    places = []
+    for off in (-0.01, 0.01):
+        far = reach + off
+        places += [(-far, 20), (WIDTH - 1 + far, 20), (30, -far), (30, HEIGHT - 1 + far)]
+    camera = pinhole(HEIGHT, WIDTH, 1.0, (0.0, 0.0))
+    means = torch.cat([torch.tensor(places), torch.ones(8, 1)], 1).double()
+    quats, scales = torch.eye(4)[:1].expand(8, 4).double(), torch.full((8, 3), 1e-9).double()
+    got = project(Gaussians(means, quats, scales, torch.full((8,), 0.5).double(), means), camera)
+    assert got.gaussian_ids.tolist() == [0, 1, 2, 3]
+    assert got.radii.tolist() == [2.0] * 4
+
+
+def test_nothing_that_could_be_drawn_is_left_out():
+    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
+    listed = torch.zeros(len(gaussians), dtype=torch.bool)
+    listed[project(gaussians, cameras).gaussian_ids] = True
+    pixels, sigma, depths = sigma_route(gaussians, cameras)
+    y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
+    d = torch.stack([x.flatten(), y.flatten()], 1)[None] - pixels[:, None]
+    alphas = gaussians.opacities[:, None] * torch.exp(-0.5 * ((d @ torch.linalg.inv(sigma)) * d).sum(2))
+    drawn = (alphas.amax(1) >= 1 / 255) & (depths > 0.01)
+    assert drawn.sum() > 40
+    assert listed[drawn].all()
+
+
+def test_the_list_is_ordered_by_camera_and_then_by_gaussian():
+    gaussians, cameras = scene(cameras=3)
+    got = project(gaussians, cameras)
+    key = got.camera_ids * len(gaussians) + got.gaussian_ids
+    assert (key.diff() > 0).all()
+    assert got.camera_ids.unique().tolist() == [0, 1, 2]
+    assert got.camera_ids.dtype == got.gaussian_ids.dtype == torch.int64
+
+
+@pytest.mark.parametrize("threshold", [1 / 255, 0.0])
+def test_dropped_gaussians_stay_listed_and_only_the_opacities_tell_them(threshold):
+    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
+    opacities = DropGaussian(p=0.45, schedule="constant", seed=0)(gaussians.opacities)
+    assert opacities.max() > 1
+    full = project(gaussians, cameras, alpha_threshold=threshold)
+    dropped = project(replace(gaussians, opacities=opacities), cameras, alpha_threshold=threshold)
+    assert (dropped.opacities == 0).sum() > 20
+    for name in ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "colors"):
+        assert torch.equal(getattr(full, name), getattr(dropped, name))
+
+
+def test_with_threshold_0_every_gaussian_in_front_is_listed():
+    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
+    depths = sigma_route(gaussians, cameras)[2]
+    listed = project(gaussians, cameras, alpha_threshold=0.0).gaussian_ids
+    assert torch.equal(listed, (depths > 0.01).nonzero()[:, 0])
+
+
+@pytest.mark.parametrize(("beyond", "listed"), [(3.2, [True] * 5), (3.5, [True] * 5), (3.6, [False] * 4 + [True])])
+def test_visibility_is_free_of_opacity(beyond, listed):
+    """A dot of variance 1 beside the image: the same for every opacity up to 2; above, the list only grows."""
+    mean = torch.tensor([[0.0, 0.0, 4.0]], dtype=torch.float64)
+    one = Gaussians(mean, torch.eye(4)[:1].double(), torch.full((1, 3), 1e-9).double(), torch.ones(1).double(), mean)
+    camera = pinhole(HEIGHT, WIDTH, 4.0, centre=(-0.5 - beyond, 24.0))
+    seen = [
+        len(project(replace(one, opacities=torch.tensor([opacity]).double()), camera, eps2d=1.0)) == 1
+        for opacity in (0.0, 0.2, 1.0, 1.25, 4.0)
+    ]
+    assert seen == listed
+
+
+@pytest.mark.parametrize("near", [0.01, 0.2, 1.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_near_plane_is_exclusive_and_nothing_behind_it_has_a_gradient(near, dtype):
+    plane = torch.tensor(near, dtype=dtype).item()
+    above = torch.nextafter(torch.tensor(near, dtype=dtype), torch.tensor(torch.inf, dtype=dtype)).item()
+    base = random_gaussians(1, 0, dtype, 1)
+    for z in (-5.0, -1e-30, 0.0, plane, above):
+        mean = torch.tensor([[0.0, 0.0, z]], dtype=dtype)
+        leaves = {name: getattr(base, name).clone().requires_grad_() for name in FIELDS} | {
+            "means": mean.requires_grad_()
+        }
+        got = project(Gaussians(**leaves), pinhole(HEIGHT, WIDTH, 50.0, dtype=dtype), near_plane=plane)
+        assert len(got) == int(z == above)
+        sum(getattr(got, name).sum() for name in PACKED).backward()
+        for leaf in leaves.values():
+            assert leaf.grad.isfinite().all()
+            assert len(got) or (leaf.grad == 0).all()
+
+
+def test_a_thousand_gaussians_behind_the_camera_change_nothing():
+    gaussians, cameras = scene(dtype=torch.float32)
+    behind = random_gaussians(1000, 9, torch.float32, 1)
+    behind = replace(behind, means=-behind.means)
+    first = project(gaussians, cameras)
+    for joined, shift in ((join(gaussians, behind), 0), (join(behind, gaussians), 1000)):
+        second = project(joined, cameras)
+        assert_same(first, second)
+        assert torch.equal(second.gaussian_ids, first.gaussian_ids + shift)
+
+
+# -- parameters that are not finite --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_gaussian_that_is_not_finite_is_left_out_counted_and_harms_no_other(name, poison):
+    gaussians, cameras = scene(40, dtype=torch.float32)
+    victim = 7
+    others = torch.arange(40) != victim
+    expected, expected_grads = values_and_gradients(select(gaussians, others), cameras)
+    values = getattr(gaussians, name).clone()
+    values[victim].view(-1)[-1] = poison
+    got, grads = values_and_gradients(replace(gaussians, **{name: values}), cameras)
+    assert got.num_nonfinite.item() == 1
+    assert expected.num_nonfinite.item() == 0
+    assert victim not in got.gaussian_ids.tolist()
+    assert_same(got, expected)
+    for field in FIELDS:
+        assert torch.equal(grads[field][others], expected_grads[field])
+        assert (grads[field][victim] == 0).all()
+
+
+def test_infinities_of_both_signs_do_not_cancel_and_large_finite_values_do_not_count():
+    gaussians, cameras = scene(10, dtype=torch.float32)
+    colors = gaussians.colors.clone()
+    colors[2, 0], colors[3, 0, 0], colors[3, 1, 1] = 3e38, torch.inf, -torch.inf
+    got = project(replace(gaussians, colors=colors), cameras)
+    assert got.num_nonfinite.item() == 1
+    assert 2 in got.gaussian_ids.tolist()
+    assert 3 not in got.gaussian_ids.tolist()
+
+
+def test_an_opacity_that_is_not_finite_for_one_camera_counts_once():
+    gaussians, cameras = scene(10, cameras=3)
+    opacities = gaussians.opacities.repeat(3, 1)
+    opacities[1, 4] = torch.nan
+    got = project(replace(gaussians, opacities=opacities), cameras)
+    assert got.num_nonfinite.item() == 1
+    assert 4 not in got.gaussian_ids.tolist()
+
+
+@pytest.mark.parametrize("log_scale", [-100.0, 44.0, 60.0, 88.0])
+def test_finite_scales_of_any_size_give_finite_values_and_gradients_and_harm_no_other(log_scale):
+    gaussians, cameras = scene(40, dtype=torch.float32)
+    victim = 7
+    others = torch.arange(40) != victim
+    expected, expected_grads = values_and_gradients(select(gaussians, others), cameras)
+    scales = gaussians.scales.clone()
+    scales[victim, 2] = math.exp(log_scale)
+    got, grads = values_and_gradients(replace(gaussians, scales=scales), cameras)
+    assert got.num_nonfinite.item() == 0
+    rest = got.gaussian_ids != victim
+    for name in PACKED:
+        assert torch.equal(getattr(got, name)[rest], getattr(expected, name))
+        assert getattr(got, name).isfinite().all()
+    for field in FIELDS:
+        torch.testing.assert_close(grads[field][others], expected_grads[field], rtol=1e-6, atol=0)
+        assert grads[field].isfinite().all()

@@ -1,0 +1,228 @@
+"""Cameras of all kinds, batches of them, images of any size, tensors of any layout."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.sensors.camera import CameraModelType
+from oracles import pinhole, random_camera, random_gaussians
+from renderer_checks import DTYPES, FIELDS, OUTPUTS, batch, largest, posed, with_grad
+
+import kgs.reference
+from kgs import GaussianRenderer, Gaussians
+
+# -- cameras -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sixteen_cameras_at_once_are_sixteen_single_ones(dtype):
+    singles = [random_camera(24, 30, seed, dtype) for seed in range(16)]
+    gaussians, inputs = with_grad(random_gaussians(50, 0, dtype, 2))
+    renderer = GaussianRenderer()
+    together = renderer(gaussians, batch(singles), outputs=OUTPUTS)
+    apart = [renderer(gaussians, camera, outputs=OUTPUTS) for camera in singles]
+    for name in OUTPUTS:
+        assert torch.equal(getattr(together, name), torch.cat([getattr(one, name) for one in apart])), name
+    assert torch.equal(together.projected.camera_ids.bincount(), torch.tensor([len(one.projected) for one in apart]))
+    gradients = torch.autograd.grad(together.image.square().sum(), inputs)
+    expected = torch.autograd.grad(sum(one.image.square().sum() for one in apart), inputs)
+    for a, b in zip(gradients, expected, strict=True):
+        assert largest(a, b) <= (1e-5 if dtype == torch.float32 else 1e-13) * b.abs().max()
+
+
+# 512 tiles in a row; 2^15 tiles and a few more, with the last of them lit; far more than 16 bits can number
+@pytest.mark.parametrize(("size", "views"), [((16, 4096), 1), ((8, 131080), 2), ((64, 4096), 9)])
+def test_many_tiles_keep_their_numbers(size, views):
+    height, width = size
+    columns = torch.linspace(3, width - 4, 41, dtype=torch.float64).round()
+    means = torch.stack([(columns - (width - 1) / 2) / 2000, torch.zeros(41), torch.ones(41)], 1) * 2
+    dots = Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(41, 1),
+        scales=torch.full((41, 3), 1e-9, dtype=torch.float64),
+        opacities=torch.full((41,), 0.5, dtype=torch.float64),
+        colors=torch.rand(41, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1,
+    )
+    image = GaussianRenderer()(dots, batch([pinhole(height, width, (2000.0, 2000.0))] * views)).image
+    lit = image[:, :, (height - 1) // 2 : height // 2 + 1].sum(2)  # the two middle rows share each dot
+    scale = 2 * 0.5 * math.exp(-0.5 * 0.25 / 0.3)
+    assert (lit[:, :, columns.long()] - scale * dots.colors.T).abs().max() <= 1e-6
+    dark = torch.ones(width, dtype=torch.bool)
+    for shift in (-3, -2, -1, 0, 1, 2, 3):
+        dark[columns.long() + shift] = False
+    assert not image[..., dark].any()
+
+
+def test_orthographic_camera_is_the_marginal_of_each_gaussian():
+    # B2: parallel rays integrate along z, so the footprint is the upper left block of R Sigma R^T, scaled
+    gaussians = dataclasses.replace(
+        random_gaussians(1, 3, sh_degree=None), means=torch.tensor([[0.3, -0.2, 5.0]]).double()
+    )
+    fx, fy, cx, cy = 9.0, 7.0, 15.0, 11.5
+    turn = random_camera(24, 32, 8).extrinsics
+    camera = posed(CameraModelType.ORTHOGRAPHIC, [fx, fy, cx, cy], extrinsics=turn)
+    alpha = GaussianRenderer(alpha_threshold=0)(gaussians, camera, outputs=("alpha",)).alpha[0, 0]
+    w, x, y, z = (gaussians.quats[0] / gaussians.quats[0].norm()).tolist()
+    local = torch.linalg.matrix_exp(  # of the rotation vector of the quaternion
+        2
+        * math.atan2(math.hypot(x, y, z), w)
+        / math.hypot(x, y, z)
+        * torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    )
+    covariance = local @ torch.diag(gaussians.scales[0] ** 2) @ local.T
+    rotation, translation = turn[0, :3, :3], turn[0, :3, 3]
+    view = torch.diag(torch.tensor([fx, fy])).double() @ (rotation @ covariance @ rotation.T)[:2, :2]
+    marginal = view @ torch.diag(torch.tensor([fx, fy])).double() + 0.3 * torch.eye(2, dtype=torch.float64)
+    centre = (rotation @ gaussians.means[0] + translation)[:2] * torch.tensor([fx, fy]) + torch.tensor([cx, cy])
+    d = torch.cartesian_prod(torch.arange(24), torch.arange(32)).flip(1) - centre
+    expected = gaussians.opacities[0] * torch.exp(-0.5 * (d * torch.linalg.solve(marginal, d.T).T).sum(1))
+    assert largest(alpha.reshape(-1), expected) <= 1e-12
+
+
+def test_pinhole_of_both_kinds_is_one_image():
+    gaussians, camera = random_gaussians(40, 0, sh_degree=3), random_camera(24, 32, 0)
+    k = camera.intrinsics[0]
+    params = [k[0, 0].item(), k[1, 1].item(), k[0, 2].item(), k[1, 2].item()]
+    other = posed(CameraModelType.PINHOLE, params, extrinsics=camera.extrinsics)
+    assert largest(GaussianRenderer()(gaussians, camera).image, GaussianRenderer()(gaussians, other).image) <= 1e-12
+
+
+def test_brown_conrady_without_distortion_is_the_pinhole():
+    gaussians, camera = random_gaussians(40, 0, sh_degree=3), random_camera(24, 32, 0)
+    k = camera.intrinsics[0]
+    params = [k[0, 0].item(), k[1, 1].item(), k[0, 2].item(), k[1, 2].item()]
+    lens = posed(CameraModelType.BROWN_CONRADY, params + [0.0] * 8, extrinsics=camera.extrinsics)
+    expected = GaussianRenderer()(gaussians, camera, outputs=("image", "depth"))
+    out = GaussianRenderer()(gaussians, lens, outputs=("image", "depth"))
+    assert largest(out.image, expected.image) <= 1e-10
+    assert largest(out.depth, expected.depth) <= 1e-10
+    bent = posed(CameraModelType.BROWN_CONRADY, [*params, 0.2, *[0.0] * 7], extrinsics=camera.extrinsics)
+    assert largest(GaussianRenderer()(gaussians, bent).image, expected.image) > 1e-3
+
+
+def test_fisheye_puts_a_dot_where_the_angle_says():
+    # Kannala-Brandt without higher terms is the equidistant projection: radius = f times the angle off the axis
+    f, angle = 20.0, 0.6
+    camera = posed(CameraModelType.KANNALA_BRANDT_K3, [f, f, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0], 25, 33)
+    dot = Gaussians(
+        means=torch.tensor([[math.sin(angle), 0.0, math.cos(angle)]]).double() * 3,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).double(),
+        scales=torch.full((1, 3), 1e-6).double(),
+        opacities=torch.tensor([0.9]).double(),
+        colors=torch.ones(1, 3).double(),
+    )
+    mass = GaussianRenderer(alpha_threshold=0)(dot, camera, outputs=("alpha",)).alpha[0, 0]
+    x = (mass.sum(0) * torch.arange(33)).sum() / mass.sum()
+    y = (mass.sum(1) * torch.arange(25)).sum() / mass.sum()
+    assert x.item() == pytest.approx(16 + f * angle, abs=0.02)
+    assert y.item() == pytest.approx(12, abs=1e-6)
+    gaussians, inputs = with_grad(random_gaussians(30, 0, sh_degree=1))
+    image = GaussianRenderer()(gaussians, camera).image
+    assert image.isfinite().all()
+    assert (image > 0).any()
+    image.sum().backward()
+    assert all(x.grad.isfinite().all() and x.grad.any() for x in inputs)
+
+
+def test_one_lens_for_several_poses_and_one_lens_each():
+    kind = CameraModelType.BROWN_CONRADY
+    params = [30.0, 31.0, 15.5, 11.5, 0.05, -0.02, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0]
+    poses = torch.cat([random_camera(24, 32, seed).extrinsics for seed in (0, 1)])
+    gaussians, renderer = random_gaussians(30, 1), GaussianRenderer()
+    shared = renderer(gaussians, posed(kind, params, extrinsics=poses)).image
+    apart = [renderer(gaussians, posed(kind, params, extrinsics=poses[i : i + 1])).image for i in (0, 1)]
+    assert torch.equal(shared, torch.cat(apart))
+    wide = [20.0, *params[1:]]
+    each = renderer(gaussians, posed(kind, [params, wide], extrinsics=poses)).image
+    assert torch.equal(each[:1], apart[0])
+    assert torch.equal(each[1:], renderer(gaussians, posed(kind, wide, extrinsics=poses[1:])).image)
+
+
+def test_opacities_a_camera():
+    cameras = batch([random_camera(24, 32, seed) for seed in (0, 1)])
+    gaussians = random_gaussians(30, 0)
+    mine = torch.stack([gaussians.opacities, gaussians.opacities.flip(0)]).requires_grad_()
+    out = GaussianRenderer()(dataclasses.replace(gaussians, opacities=mine), cameras).image
+    for c in (0, 1):
+        one = dataclasses.replace(gaussians, opacities=mine[c].detach())
+        single = random_camera(24, 32, c)
+        assert torch.equal(out[c : c + 1], GaussianRenderer()(one, single).image)
+    out[0].sum().backward()
+    assert mine.grad[0].any()
+    assert not mine.grad[1].any()
+
+
+# -- degenerate sizes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [0, 3])
+@pytest.mark.parametrize("views", [1, 3])
+def test_nothing_to_see(n, views):
+    gaussians = random_gaussians(n, 0, torch.float32, 1)
+    gaussians = dataclasses.replace(gaussians, means=gaussians.means * torch.tensor([1.0, 1.0, -1.0]))
+    gaussians, inputs = with_grad(gaussians)
+    background = torch.rand(3, requires_grad=True)
+    cameras = batch([pinhole(9, 13, (20.0, 20.0), dtype=torch.float32)] * views)
+    out = GaussianRenderer()(gaussians, cameras, background, OUTPUTS)
+    assert torch.equal(out.image, background[None, :, None, None].expand(views, 3, 9, 13))
+    for name in OUTPUTS[1:]:
+        assert torch.equal(getattr(out, name), torch.zeros(views, 1, 9, 13))
+    assert len(out.projected) == 0
+    (out.image.sum() + out.alpha.sum() + out.depth.sum()).backward()
+    for x in inputs:
+        assert torch.equal(x.grad, torch.zeros_like(x))
+    assert torch.equal(background.grad, torch.full((3,), views * 9.0 * 13.0))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (15, 17), (16, 16), (17, 33)])
+def test_images_of_any_size(size):
+    gaussians, camera = random_gaussians(20, 1, image_size=12), random_camera(*size, 1)
+    image = GaussianRenderer()(gaussians, camera).image
+    assert image.shape == (1, 3, *size)
+    assert largest(image, kgs.reference.render(gaussians, camera)) <= 1e-12
+
+
+@pytest.mark.parametrize("size", [(8, 8), (16, 24), (15, 17)])
+def test_the_image_is_the_users_own_to_edit(size):
+    gaussians, inputs = with_grad(random_gaussians(20, 1))
+    camera = random_camera(*size, 1)
+    expected = torch.autograd.grad(GaussianRenderer()(gaussians, camera).image.clamp(0, 0.5).sum(), inputs)
+    image = GaussianRenderer()(gaussians, camera).image
+    image.clamp_(0, 0.5)
+    for a, b in zip(torch.autograd.grad(image.sum(), inputs), expected, strict=True):
+        assert torch.equal(a, b)
+
+
+def strided(x):
+    """The same values with every second element of the memory."""
+    return torch.stack([x, x + 1], -1)[..., 0]
+
+
+def transposed(x):
+    return x.transpose(0, -1).contiguous().transpose(0, -1)
+
+
+@pytest.mark.parametrize("layout", [strided, transposed])
+def test_layout_in_memory_does_not_matter(layout):
+    gaussians, camera = random_gaussians(40, 0, torch.float32, 3), random_camera(24, 32, 0, torch.float32)
+    background = torch.rand(1, 3, 24, 32)
+    results = []
+    for change in (torch.Tensor.contiguous, layout):
+        inputs = [change(getattr(gaussians, name)).requires_grad_() for name in FIELDS]
+        image = GaussianRenderer()(Gaussians(*inputs), camera, change(background)).image
+        results.append([image.detach(), *torch.autograd.grad(image.square().sum(), inputs)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    camera = PinholeCamera(layout(camera.intrinsics), layout(camera.extrinsics), camera.height, camera.width)
+    assert largest(GaussianRenderer()(gaussians, camera, background).image, results[0][0]) <= 1e-6
+
+
+def test_expanded_inputs():
+    gaussians, camera = random_gaussians(40, 0, torch.float32, None), random_camera(24, 32, 0, torch.float32)
+    one = {name: getattr(gaussians, name)[:1].expand_as(getattr(gaussians, name)) for name in FIELDS[1:]}
+    stride_0 = Gaussians(gaussians.means, **one)
+    copied = Gaussians(gaussians.means, **{name: value.contiguous() for name, value in one.items()})
+    background = torch.rand(1, 1, 1, 1).expand(1, 3, 24, 32)
+    images = [GaussianRenderer()(g, camera, b).image for g, b in ((stride_0, background), (copied, background.clone()))]
+    assert torch.equal(*images)
