@@ -10,6 +10,7 @@ import inspect
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
@@ -43,7 +44,8 @@ def main(arguments: list[str] | None = None) -> None:
             os.fstat(descriptor)
         except OSError:  # closed: the next file that is opened would be taken for it
             os.open(os.devnull, os.O_RDWR)
-    code = _exit_code(list(sys.argv[1:] if arguments is None else arguments))
+    with warnings.catch_warnings():
+        code = _exit_code(list(sys.argv[1:] if arguments is None else arguments))
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -54,7 +56,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _exit_code(words: list[str]) -> int:
+    """Run one command; what goes wrong, and what its code warns of, is a line each."""
     message, code, names = "", 2, dict[str, str]()
+    warnings.showwarning = lambda text, *_: say(f"kgs: {text}", sys.stderr)
     try:
         command, prog, words = _find(words)
         names = _flags(command)

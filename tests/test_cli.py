@@ -137,7 +137,7 @@ def test_bare_photos_need_poses(tmp_path, capsys):
         (["fit", "{scene}", "-o", "{out}", "--downscale", "0"], "--downscale: expected"),
         (["demo", "-o", "{out}", "--steps", "0"], "--steps: expected"),
         (["demo", "-o", "{out}", "--device", "foo"], "--device: expected"),
-        (["demo", "-o", "{out}", "--size", "0", "0"], "--size: expected"),
+        (["demo", "-o", "{out}", "--size", "11", "40"], "--size: expected"),
         (["demo", "-o", "{scene}"], "holds files of a scene"),
         (["eval", "{scene}"], "config.json"),
         (["eval", "{out}", "--device", "foo"], "--device: expected"),
@@ -209,3 +209,10 @@ def test_help_without_a_command(words, capsys):
     said = capsys.readouterr().out
     assert "usage: kgs" in said
     assert ("speed" in said) == ("bench" in words)
+
+
+def test_a_warning_is_one_line_without_code(folder, tmp_path, capsys):
+    assert run("fit", folder, "-o", tmp_path, "--steps", 1, "--init", "sift", "--init-points", 30) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "SIFT" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("kgs: first points: SIFT found")

@@ -21,6 +21,7 @@ from .progress import say
 __all__ = ["demo", "evaluate", "fit", "render"]
 
 _VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
+_SMALLEST = 12  # pixels a side: the window of SSIM
 _RESULTS = ("splat.ply", "config.json", "metrics.json", "curve.png")
 
 
@@ -50,6 +51,8 @@ def demo(
     from .demo import DEMO, run_demo
 
     config = replace(DEMO, seed=seed, steps=steps, device=device)
+    if min(size) < _SMALLEST:
+        raise ValueError(f"size: expected at least {_SMALLEST} pixels a side, got {size[0]} {size[1]}")
     _prepare(device, "matplotlib")
     runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), out, config)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")

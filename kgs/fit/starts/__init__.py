@@ -60,14 +60,12 @@ def first_points(
         views: the training views, and only these.
         kind: "dense": points of depth maps that at least two views agree on, drawn at random; where fewer than 1000
             come out, those of "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated
-            with the given poses; where fewer than 20 such points come out, "random" ones with a warning. "random":
-            points spread evenly over the space that at least two of the views see (one, if there is only one), in the
-            images' mean colours there; its depths are those of the SIFT points, or else follow from where the cameras
-            are and look. "file": a point cloud or the vertices of a mesh, in any format of trimesh, in the frame of the
-            views; grey if it has no colours.
+            with the given poses; where fewer than 20 come out, "random" ones with a warning. "random": spread evenly
+            over the space that at least two of the views see (one, if there is only one), in the images' mean colours
+            there, at the depths of the SIFT points or else where the cameras look. "file": see :func:`read_points`.
         seed: of what is drawn at random.
         count: how many points "random" gives, and "dense" at most; >= 1.
-        file: the file of the kind "file", not compressed; a splat gives the colours of its harmonics of degree 0.
+        file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
         stage: shows how far the work is: :func:`kgs.fit.progress.each`, or nothing.
 
@@ -76,7 +74,7 @@ def first_points(
 
     Raises:
         ValueError: another kind, `count` below 1, or no file for "file".
-        DataError: the file is missing, broken, or has no points.
+        DataError: the file is missing, broken, compressed, or has no points.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
@@ -87,11 +85,11 @@ def first_points(
             raise ValueError("file: expected a path for the kind 'file', got None")
         return FirstPoints(*read_points(Path(file), origin), kind="file")
     points, tracks = triangulate_certain(find_tracks(views, stage), views.cameras)
-    inside = _within_typical_depths(points, tracks.seen, views.cameras)
-    points, pixels, seen = points[inside], tracks.pixels[inside], tracks.seen[inside]
+    good = _within_typical_depths(points, tracks.seen, views.cameras)
+    points, tracks = points[good], tracks.select(good)
     if len(points) >= FEWEST_POINTS:
-        together = _in_company(points, seen, views.cameras)
-        points, pixels, seen = points[together], pixels[together], seen[together]
+        good = _in_company(points, tracks.seen, views.cameras)
+        points, tracks = points[good], tracks.select(good)
     near, far = _depth_range(points, views.cameras)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
@@ -99,18 +97,13 @@ def first_points(
         dense, colors = dense_points(views, near, far, count, generator, stage)
         if len(dense) >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind="dense")
-        warnings.warn(
-            f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead",
-            stacklevel=2,
-        )
+        message = f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead"
+        warnings.warn(message, stacklevel=2)
     if kind in ("dense", "sift"):
         if len(points) >= FEWEST_POINTS:
-            return FirstPoints(points.float(), _mean_colors(views, pixels, seen), kind="sift")
-        warnings.warn(
-            f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
-            f"the fit starts from {count} random points instead",
-            stacklevel=2,
-        )
+            return FirstPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), kind="sift")
+        message = f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
+        warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
     pixels, depths = project_all(points, views.cameras)
     colors = _mean_colors(views, pixels, _inside(pixels, depths, views, near, far))

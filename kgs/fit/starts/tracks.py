@@ -43,6 +43,10 @@ class Tracks:
     pixels: Tensor
     seen: Tensor
 
+    def select(self, rows: Tensor) -> Tracks:
+        """Some of the points, by a mask or by numbers."""
+        return Tracks(self.pixels[rows], self.seen[rows])
+
 
 def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
     """Find points that at least two of the views see.

@@ -69,7 +69,7 @@ def triangulate_certain(
         points, agreeing = points[enough], agreeing[enough]
         tracks = Tracks(tracks.pixels[enough], kept[enough])
     certain = agreeing & (_widest_angles(points, tracks.seen, cameras) >= min_angle)
-    return points[certain], Tracks(tracks.pixels[certain], tracks.seen[certain])
+    return points[certain], tracks.select(certain)
 
 
 def project_all(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
