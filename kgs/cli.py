@@ -111,12 +111,7 @@ def _find(words: list[str]) -> tuple[Callable[..., Any], str, list[str]]:
         raise SystemExit(f"expected a command of {prog}, one of {', '.join(summaries)}, got {name!r}")
     if prog == "kgs":
         return commands[name], f"kgs {name}", rest
-    try:
-        return getattr(import_module(f"kgs.bench.{name}"), name), f"{prog} {name}", rest
-    except (AttributeError, ModuleNotFoundError):
-        from .bench.command import bench
-
-        return bench, "kgs bench", ["sparse" if name == "study" else name, *rest]
+    return getattr(import_module(f"kgs.bench.{name}"), name), f"{prog} {name}", rest
 
 
 def _flags(function: Callable[..., Any]) -> dict[str, str]:

@@ -216,3 +216,12 @@ def test_a_warning_is_one_line_without_code(folder, tmp_path, capsys):
     lines = [line for line in capsys.readouterr().err.splitlines() if "SIFT" in line]
     assert len(lines) == 1
     assert lines[0].startswith("kgs: first points: SIFT found")
+
+
+@pytest.mark.parametrize("name", ["speed", "precision", "extremes", "starts", "study", "training"])
+def test_each_bench_has_its_own_help(name, capsys):
+    assert run("bench", name, "--help") == 0
+    said = capsys.readouterr().out
+    assert f"usage: kgs bench {name} " in said
+    assert "-o PATH, --out PATH" in said
+    assert f"kgs bench {name} -o" in said

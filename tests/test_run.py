@@ -32,7 +32,7 @@ def scene() -> Any:
 def _few_points(monkeypatch: Any) -> None:
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     first = FirstPoints(points, torch.full((150, 3), 0.5), "random")
-    monkeypatch.setattr(run, "choose_points", lambda scene, config: first)
+    monkeypatch.setattr(run, "choose_points", lambda *_: first)
 
 
 @pytest.fixture

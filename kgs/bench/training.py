@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-from kgs.options import alias
 
 __all__ = ["training"]
 
 
 def training(
     *,
-    out: Annotated[Path, alias("-o")],
+    out: Path,
     quick: bool = False,
     processes: int | None = None,
     scheduler: str | None = None,
 ) -> int:
     """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
+
+    For example:
+      kgs bench training -o training
+      KGS_DATA=SCENES kgs bench training -o training --processes 2
 
     Writes training.jsonl, training.csv, training.md and training.png. With KGS_DATA, a folder of scenes, also on fern.
 

@@ -22,7 +22,6 @@ __all__ = ["demo", "evaluate", "fit", "render"]
 
 _VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
 _SMALLEST = 12  # pixels a side: the window of SSIM
-_RESULTS = ("splat.ply", "config.json", "metrics.json", "curve.png")
 
 
 def demo(
@@ -96,13 +95,14 @@ def fit(
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
+    from .folder import RESULTS
     from .outputs import check_folder
     from .run import fit_scene
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
     lpips = _prepare(config.device, "matplotlib", "safetensors", lpips=lpips_weights)
-    check_folder(out, _RESULTS, scene, make=False)
+    check_folder(out, RESULTS, scene, make=False)
     request = {
         "scene": os.path.abspath(scene),
         "train_views": views,

@@ -14,7 +14,7 @@ from kgs.ply import save_ply
 from .config import FitConfig, Recipe
 from .figures import side_by_side, write_curve
 from .outputs import check_folder, write_json, write_png
-from .progress import say
+from .progress import each, say
 from .run import choose_points, measure, train
 from .trainer import Trainer
 
@@ -50,7 +50,7 @@ def run_demo(scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable
         What metrics.json holds: `{"without": run, "with": run}`.
     """
     check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
-    points = choose_points(scene, config)
+    points = choose_points(scene, config, each)
     height, width = scene.train.images.shape[-2:]
     say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
     say(f"first points: {len(points.points)} ({points.kind})")

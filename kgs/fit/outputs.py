@@ -11,7 +11,7 @@ import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,49 +20,13 @@ from torch import Tensor
 from kgs.datasets.images import list_images
 from kgs.errors import DataError
 
-from .machine import peak_rss_mb, versions
-
-if TYPE_CHECKING:
-    from .trainer import Trainer
-
-__all__ = [
-    "check_folder",
-    "is_own",
-    "peak_rss_mb",
-    "png_names",
-    "remove_others",
-    "run_metrics",
-    "versions",
-    "write_json",
-    "write_png",
-    "write_whole",
-]
+__all__ = ["check_folder", "is_own", "png_names", "remove_others", "write_json", "write_png", "write_whole"]
 
 PNG_MARK = b"Software\0kgs"
 _MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
 _LONGEST = 120  # bytes of a picture's name
-
-
-def run_metrics(
-    trainer: Trainer, test: dict[str, Any] | None, train: dict[str, Any] | None, protocol: dict[str, Any]
-) -> dict[str, Any]:
-    """One run as it stands in metrics.json; measures that were not taken are None."""
-    return {
-        "test": test,
-        "train": train,
-        "curve": trainer.curve,
-        "seconds": round(trainer.seconds, 2),
-        "peak_rss_mb": peak_rss_mb() or None,
-        "gaussians": len(trainer.model),
-        "steps": trainer.step,
-        "seed": trainer.config.seed,
-        "drop": trainer.config.drop,
-        "init": trainer.init,
-        "protocol": protocol,
-        "versions": versions(),
-    }
 
 
 def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, make: bool = True) -> None:

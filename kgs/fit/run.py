@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from .config import FitConfig
 from .figures import write_curve
 from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, locked, publish
 from .lpips import Lpips
-from .machine import check_device
+from .machine import check_device, peak_rss_mb, versions
 from .metrics import evaluate
-from .outputs import check_folder, is_own, png_names, run_metrics, write_json, write_png
-from .progress import progress, say
+from .outputs import check_folder, is_own, png_names, write_json, write_png
+from .progress import Stage, each, progress, say, silent
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
@@ -88,7 +88,7 @@ def fit_scene(
         else:
             if is_own(out / "splat.ply"):
                 say(f"{out}: the fit there will be replaced when this one is done (--resume would go on with it)")
-            points = choose_points(scene, config)
+            points = choose_points(scene, config, each)
             say(f"first points: {len(points.points)} ({points.kind})")
             trainer = Trainer(scene, config, points)
             say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
@@ -150,7 +150,7 @@ def _write_results(trainer: Trainer, new: Path, names: dict[str, str], lpips: Lp
     save_ply(new / "splat.ply", trainer.model, offset=scene.offset)
     write_curve(new / "curve.png", {"": trainer.curve})
     (new / "test").mkdir(exist_ok=True)
-    for i, name in enumerate(scene.test.names):
+    for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
         write_png(new / "test" / names[name], trainer.render(scene.test.camera(i))[0])
     metrics = measure(trainer, lpips)
     write_json(new / "metrics.json", metrics)
@@ -158,13 +158,25 @@ def _write_results(trainer: Trainer, new: Path, names: dict[str, str], lpips: Lp
 
 
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
-    """What metrics.json holds of one run; "test" is None where no view is held out."""
+    """What metrics.json holds of one run; None stands for what was not measured."""
     scene = trainer.scene
-    test = evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None
-    return run_metrics(trainer, test, evaluate(trainer.render, scene.train, lpips), _protocol(scene, trainer.config))
+    return {
+        "test": evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None,
+        "train": evaluate(trainer.render, scene.train, lpips),
+        "curve": trainer.curve,
+        "seconds": round(trainer.seconds, 2),
+        "peak_rss_mb": peak_rss_mb() or None,
+        "gaussians": len(trainer.model),
+        "steps": trainer.step,
+        "seed": trainer.config.seed,
+        "drop": trainer.config.drop,
+        "init": trainer.init,
+        "protocol": _protocol(scene, trainer.config),
+        "versions": versions(),
+    }
 
 
-def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
+def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> FirstPoints:
     """First points as `config.init` asks for; from training views alone, unless "model-points" is asked for.
 
     Raises:
@@ -177,10 +189,8 @@ def choose_points(scene: Scene, config: FitConfig) -> FirstPoints:
             raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
-    found = first_points(views, kind, seed=config.seed, count=config.init_points, file=config.init_file)
-    if kind == "file":  # in the world's coordinates, as the files that kgs writes
-        found = replace(found, points=(found.points.double() - scene.offset).float())
-    return found
+    count, file = config.init_points, config.init_file  # in the world's coordinates, as the files that kgs writes
+    return first_points(views, kind, seed=config.seed, count=count, file=file, origin=scene.offset, stage=stage)
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:

@@ -5,23 +5,26 @@ from __future__ import annotations
 import os
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from kgs.errors import DataError
-from kgs.options import alias
 
 __all__ = ["study"]
 
 
 def study(
     *,
-    out: Annotated[Path, alias("-o")],
+    out: Path,
     preset: Literal["quick", "cpu", "paper"] = "quick",
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Path | None = None,
 ) -> int:
     """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
+
+    For example:
+      kgs bench study -o study
+      KGS_DATA=SCENES kgs bench study -o study-cpu --preset cpu
 
     Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. The scenes lie in the
     folder of the environment variable KGS_DATA. For many machines: `dask scheduler` on one,

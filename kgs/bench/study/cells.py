@@ -24,8 +24,8 @@ from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
 from kgs.fit.lpips import Lpips
+from kgs.fit.machine import peak_rss_mb
 from kgs.fit.metrics import MEASURES
-from kgs.fit.outputs import peak_rss_mb
 from kgs.fit.run import choose_points, measure
 from kgs.fit.starts import FirstPoints
 from kgs.fit.starts.triangulate import camera_centers
