@@ -11,7 +11,6 @@ import os
 import re
 import uuid
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -209,49 +208,27 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
 def _read_columns(
     path: Path, order: str, elements: list[_Element], place: int, file: BinaryIO
 ) -> dict[str, NDArray[np.generic]]:
-    """The properties of the element in that place; nothing is read before the file is known to be long enough."""
-    is_text, vertex = order == "ascii", elements[place]
+    """The properties of the element in that place; binary data are read after the file is known to be long enough."""
+    vertex, is_text = elements[place], order == "ascii"
     if any(element.has_list for element in elements[: place + 1]):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
     sizes = [element.size(order) for element in elements]
     start, end, total = sum(sizes[:place]), sum(sizes[: place + 1]), sum(sizes)
     begin = file.tell()
-    available, unit = os.fstat(file.fileno()).st_size - begin, "bytes"
+    available = os.fstat(file.fileno()).st_size - begin
     if is_text:
-        most, unit = (available + 1) // 2, "numbers"  # a digit and a space each
-        numbers, available = _numbers(path, file, start, end) if most >= end else (np.empty(0), most)
+        with warnings.catch_warnings(action="error"):
+            try:
+                numbers = np.fromfile(file, np.float64, sep=" ") if total else np.empty(0)
+            except (DeprecationWarning, ValueError) as error:
+                raise DataError(path, "vertex", "expected nothing but numbers after the header") from error
+        available = len(numbers)
     if available < end or (available != total and not any(element.has_list for element in elements)):
+        unit = "numbers" if is_text else "bytes"
         raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
     if is_text:
-        return dict(zip(vertex.properties, numbers.reshape(vertex.count, len(vertex.properties)).T, strict=True))
+        table = numbers[start:end].reshape(vertex.count, len(vertex.properties))
+        return dict(zip(vertex.properties, table.T, strict=True))
     file.seek(begin + start)
     rows = np.fromfile(file, vertex.dtype(order), vertex.count)
     return {name: rows[name] for name in vertex.properties}
-
-
-def _words(file: BinaryIO) -> Iterator[list[bytes]]:
-    """The words of a text, a part at a time: a list of all would take many times the memory of the text."""
-    rest = b""
-    while part := file.read(1 << 16):
-        words = (rest + part).split()
-        # the last word may go on in the next part, but no number is that long
-        rest = b"" if part[-1:].isspace() or len(words[-1]) > 1024 else words.pop()
-        yield words
-    yield rest.split()
-
-
-def _numbers(path: Path, file: BinaryIO, start: int, end: int) -> tuple[NDArray[np.float64], int]:
-    """The words from `start` to `end` as numbers, and how many words there are."""
-    numbers, at = np.empty(end - start), 0
-    for words in _words(file):
-        first, last = max(start, at), min(end, at + len(words))
-        if first < last:
-            chosen = words[first - at : last - at]
-            try:
-                if b"_" in b"".join(chosen):  # Python alone reads 1_0 as 10
-                    raise ValueError("expected numbers, got a word with an underscore")
-                numbers[first - start : last - start] = [float(word) for word in chosen]
-            except ValueError as error:
-                raise DataError(path, "vertex", str(error)[:200]) from error
-        at += len(words)
-    return numbers, at

@@ -128,12 +128,12 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade(FLOATS, [ROW]) + b"\0", "vertex", "expected 68 bytes after the header, got 69"),
         (handmade(FLOATS, [ROW], after=[(["element e 1", "property int i"], b"\0")]), "vertex", "expected 72 bytes"),
         (handmade(FLOATS, [ROW, ROW], "ascii")[:-5], "vertex", "expected 34 numbers after the header, got 33"),
-        (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "two"),
+        (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "nothing but numbers"),
         (handmade(FLOATS, [[*ROW[:9], math.inf, *ROW[10:]]]), "opacity", "got inf in row 0"),
         (handmade(FLOATS, [ROW, [*ROW[:16], math.nan]]), "rot_3", "got nan in row 1"),
         (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
-        (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "underscore"),
+        (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "nothing but numbers"),
         (handmade(FLOATS, [ROW], "ascii", count=10**17), "vertex", "numbers after the header, got"),
     ],
 )
@@ -178,6 +178,12 @@ def test_long_ascii_files_are_read_in_parts_that_cut_no_word(tmp_path):
         (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + body.replace(b"\n", newline.encode()))
         means = load_ply(tmp_path / "a.ply").means
         assert torch.equal(means, torch.tensor(rows, dtype=torch.float64)[:, :3].float())
+
+
+@pytest.mark.parametrize("order", ["binary_big_endian", "ascii"])
+def test_a_file_without_gaussians_is_an_empty_model(tmp_path, order):
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, [], order).rstrip(b"\n") + b"\n")
+    assert len(load_ply(tmp_path / "a.ply")) == 0
 
 
 def test_ascii_positions_are_read_in_double_precision(tmp_path):
