@@ -1,6 +1,7 @@
 """The documentation: its code runs, it names every public name, the site builds, the citation is sound."""
 
 import configparser
+import doctest
 import importlib
 import re
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 GIVEN = """
 import torch, kgs
@@ -37,6 +39,22 @@ def test_its_python_runs(path, tmp_path, monkeypatch):
     exec(GIVEN, names)
     for block in re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
         exec(compile(block, path.name, "exec"), names)
+
+
+WITH_EXAMPLES = [
+    ".".join([PACKAGES[path.parts[0]], *path.with_suffix("").parts[1:]]).removesuffix(".__init__")
+    for folder in PACKAGES
+    for path in (file.relative_to(ROOT) for file in sorted((ROOT / folder).rglob("*.py")))
+    if re.search(r">>> (?!.*\+SKIP)", (ROOT / path).read_text(encoding="utf-8"))
+]
+
+
+@pytest.mark.parametrize("module", WITH_EXAMPLES)
+def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = doctest.testmod(importlib.import_module(module))
+    assert found.attempted
+    assert not found.failed
 
 
 @pytest.mark.slow

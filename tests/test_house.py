@@ -143,6 +143,8 @@ def described(name, value):
                 yield f"{name}.{method_name}: no docstring"
         if issubclass(value, Exception):
             return
+    if re.search(r"^ *Example:$", text, re.M):
+        yield f"{name}: the site knows Examples, not Example"
     if "see there for arguments" in text:
         return
     signature = inspect.signature(value)
