@@ -112,7 +112,7 @@ def _jpeg(data: Buffer) -> tuple[int, ...]:
     raise ValueError
 
 
-_MARKER = re.compile(rb"\xff+([^\x00\xff])", re.DOTALL)
+_MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd7\xff])")  # those without length are passed over
 
 
 def _markers(data: Buffer) -> Iterator[tuple[int, int]]:
@@ -122,7 +122,7 @@ def _markers(data: Buffer) -> Iterator[tuple[int, int]]:
         marker, at = found[1][0], found.end()
         del found  # it would keep a mapped file open
         yield marker, at
-        if marker != 0x01 and not 0xD0 <= marker <= 0xD9:  # those have no length behind them
+        if marker not in (0xD8, 0xD9):  # they have no length behind them either
             at += struct.unpack_from(">H", data, at)[0]
 
 

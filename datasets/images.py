@@ -112,39 +112,38 @@ def read_image(path: Path) -> Image:
     """
     data = read_bytes(path)
     size = image_size(path, data)
-    data, premultiplied = _plain(path, data)
+    premultiplied = False
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(path, "", f"OpenCV cannot decode this image ({error.err})") from error
-    if image is None:
-        raise DataError(path, "", "OpenCV cannot decode this as an image (truncated, or no image?)")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise DataError(path, "", f"expected 8 or 16 bit integers, got {image.dtype}")
-    channels, got = image.shape[2] if image.ndim == 3 else 1, image.shape[1::-1]
-    if got != size or channels not in _TO_RGB:
-        raise DataError(path, "", f"expected {size} pixels of 1, 3 or 4 channels, got {got} of {channels}")
-    image = cv2.cvtColor(image, _TO_RGB[channels])
-    result = np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
-    if premultiplied and channels == 4:
-        result[..., :3] = np.minimum(result[..., :3] / np.maximum(result[..., 3:], 1 / 65535), 1)
-    return result
-
-
-def _plain(path: Path, data: bytes) -> tuple[bytes, bool]:
-    """The image's bytes for OpenCV, checked, and whether it stores colours that are multiplied by their alpha."""
-    try:
-        if data.startswith((b"II", b"MM")):
-            return plain_tiff(data)
-        if data.startswith(b"\xff\xd8"):
-            data = plain_jpeg(data)
-            # OpenCV only prints the decoder's warnings, and a damaged image comes in wrong colours
-            kornia_io.decode_image_jpegturbo(data, "mono")
+        if data.startswith(b"\xff\xd8"):  # OpenCV only prints what is wrong with a JPEG, and gives it in wrong colours
+            image = kornia_io.decode_image_jpegturbo(plain_jpeg(data), "rgb")
+        else:
+            if data.startswith((b"II", b"MM")):
+                data, premultiplied = plain_tiff(data)
+            image = _decode(np.frombuffer(data, np.uint8))
     except ValueError as error:
         raise DataError(path, "", str(error)) from error
     except Exception as error:  # kornia_rs has no error of its own
         raise DataError(path, "", "the JPEG is damaged, or has other colours than grey or RGB") from error
-    return data, False
+    if image.shape[1::-1] != size:
+        raise DataError(path, "", f"expected {size} pixels as its header says, got {image.shape[1::-1]}")
+    result = np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
+    if premultiplied and result.shape[2] == 4:
+        result[..., :3] = np.minimum(result[..., :3] / np.maximum(result[..., 3:], 1 / 65535), 1)
+    return result
+
+
+def _decode(data: NDArray[np.uint8]) -> NDArray[np.uint8 | np.uint16]:
+    """RGB or RGBA of the bytes of an image; a ValueError where OpenCV cannot decode them."""
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"OpenCV cannot decode this image ({error.err})") from error
+    if image is None:
+        raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
+    channels = image.shape[2] if image.ndim == 3 else 1
+    if image.dtype not in (np.uint8, np.uint16) or channels not in _TO_RGB:
+        raise ValueError(f"expected 8 or 16 bit integers in 1, 3 or 4 channels, got {image.dtype} in {channels}")
+    return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]))
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:

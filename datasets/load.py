@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -77,7 +78,7 @@ def load_scene(
     if downscale is not None and not (isinstance(downscale, (int, float)) and 1 <= downscale < math.inf):
         raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
     root = Path(path)
-    with torch.device("cpu"):  # whatever torch's default is
+    with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):  # which costs time
         found = find_layout(root)
         train, test = _split(root, found, train_views)
         cloud = found.points
