@@ -106,17 +106,13 @@ def _slowdown(case: Row) -> float:
 def _markdown(rows: list[Row]) -> str:
     lines = []
     for low, high in zip(rows[::2], rows[1::2], strict=True):  # float32, float64
-        cells = [
-            f"{row[part]:.0e} ({row[f'{part}_bound']:.0e})" for row in (low, high) for part in ("forward", "gradient")
-        ]
+        pairs = ((row, part) for row in (low, high) for part in ("forward", "gradient"))
+        cells = (f"{row[part]:.0e} ({row[f'{part}_bound']:.0e})" for row, part in pairs)
         verdict = "met" if low["verdict"] == high["verdict"] == "met" else "MISSED"
         time = "" if low["time"] is None else f"{low['time']:.1f}"
         lines.append([low["case"], low["stiff"], *cells, verdict, time, low["treatment"]])
     heads = ("what is stiff", "image, float32", "gradient, float32", "image, float64", "gradient, float64")
-    title = (
-        "Largest errors (bounds): absolute in the image, relative to the largest value in gradients; time over that "
-    )
-    title += "of an ordinary scene of the same size"
+    title = "Largest errors (bounds), in gradients over the largest value; time over that of an ordinary scene as large"
     return markdown_table(title, (*heads, "verdict", "time", "treatment"), lines, first="case")
 
 
@@ -128,10 +124,7 @@ def camera(size: tuple[int, int] = SIZE) -> PinholeCamera:
 def gaussians(count: int = COUNT, seed: int = 0, **changes: Tensor | float) -> Gaussians:
     """An ordinary cloud before `camera`: two to six units deep, one to five pixels wide, harmonics of degree 1."""
     generator = torch.Generator().manual_seed(seed)
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
-
+    uniform = partial(_uniform, generator=generator)
     depth = uniform(2.0, 6.0, count)
     place = uniform(-1.1, 1.1, count, 2) * (SIZE[1] / 2 / FOCAL)
     values: dict[str, Tensor] = {
@@ -151,8 +144,9 @@ def ordinary(count: int = COUNT, size: tuple[int, int] = SIZE) -> Scene:
     return gaussians(count), camera(size)
 
 
-def _uniform(low: float, high: float, *shape: int) -> Tensor:
-    return low + (high - low) * torch.rand(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+def _uniform(low: float, high: float, *shape: int, generator: torch.Generator | None = None) -> Tensor:
+    generator = generator or torch.Generator().manual_seed(1)
+    return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
 
 def _at_the_near_plane() -> Scene:

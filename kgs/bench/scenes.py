@@ -12,6 +12,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.camera import cameras
 from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
@@ -67,9 +68,8 @@ def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0)
 def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:
     """At the origin, float64; `size` is height and width."""
     height, width = size
-    matrix = torch.diag(torch.tensor([focal, focal, 1.0, 1.0], dtype=torch.float64))
-    matrix[:2, 2] = torch.tensor([(width - 1) / 2, (height - 1) / 2])
-    return PinholeCamera(matrix[None], torch.eye(4).double()[None], torch.tensor([height]), torch.tensor([width]))
+    matrix = [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    return cameras(torch.eye(4).double(), torch.tensor(matrix, dtype=torch.float64), width, height)
 
 
 def cast_camera(camera: PinholeCamera, dtype: torch.dtype) -> PinholeCamera:

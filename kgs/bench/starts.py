@@ -177,18 +177,11 @@ def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     seen = inside & (errors <= HIDDEN)
     usable = torch.where(seen.any(1, keepdim=True), seen, inside)
     distances = torch.cdist(points.double(), camera_centers(views.cameras)).masked_fill(~usable, torch.inf)
-    nearest = errors.gather(1, distances.argmin(1, keepdim=True))[:, 0]
-    return torch.where(inside.any(1), nearest, torch.inf)
+    return torch.where(inside.any(1), errors.gather(1, distances.argmin(1, keepdim=True))[:, 0], torch.inf)
 
 
 def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
-    """Which pixels have a point within 2 pixels whose depth is within 2 % of the pixel's exact depth, `(V, H, W)`.
-
-    Args:
-        points: `(P, 3)` in the frame of the views.
-        views: V of them.
-        truth: exact depths, `(V, H, W)` float64; 0 where there is no surface, which is never complete.
-    """
+    """Which pixels have a point within 2 pixels and 2 % of their exact depth, `(V, H, W)`; see `depth_errors`."""
     found = torch.zeros_like(truth, dtype=torch.bool)
     for view, exact in enumerate(truth):
         pixels, depths = _in_image(points, views, view)
@@ -205,22 +198,16 @@ def seen_twice(views: Views, truth: Tensor) -> Tensor:
         rows, columns = (exact > 0).nonzero().unbind(1)
         pixels = torch.stack([columns, rows], 1)
         points = unproject(pixels, exact[rows, columns], torch.full_like(rows, view), views.cameras)
-        for other in range(len(views)):
-            if other != view:
-                found[view, rows, columns] |= _view_errors(points, views, truth, other).abs() <= NEAR
+        for other in set(range(len(views))) - {view}:
+            found[view, rows, columns] |= _view_errors(points, views, truth, other).abs() <= NEAR
     return found
 
 
 def model_errors(points: Tensor, model: Tensor, views: Views) -> Tensor:
-    """Relative errors of the points' depths where a view has them within 1.5 pixels of a point of a COLMAP model.
+    """Relative depth errors where a view has points within 1.5 pixels of a point of a COLMAP model, `(M, 3)`.
 
     A pixel's depth is that of the first of the points in it, and a model's point is compared with the nearest pixel
     that has any. All views that a model's point projects into count, also those where something hides it.
-
-    Args:
-        points: `(P, 3)` in the frame of the views.
-        model: `(M, 3)`, taken as the truth.
-        views: of the pictures.
 
     Returns:
         Depth over the model's depth less 1, one number per pair of a model's point and a view, float64.
