@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 
 import mpmath
 import torch
-from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from mpmath import mpf
 from torch import Tensor
@@ -17,7 +16,6 @@ from kgs import Gaussians
 from kgs.reference import layers
 
 __all__ = ["enumerate_drops", "mpmath_pixels", "near_threshold", "quaternion_product", "real_harmonic", "theta_mass"]
-__all__ += ["pinhole", "random_camera", "random_gaussians"]  # of factories, until every test takes them from there
 
 
 def near_threshold(

@@ -1,10 +1,10 @@
 """What tests of projection have in common."""
 
 import torch
+from factories import random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
-from oracles import random_camera, random_gaussians
 
 from kgs import Gaussians, PosedCamera, project
 

@@ -1,10 +1,8 @@
 """What tests of the reference have in common."""
 
 import torch
+from factories import pinhole
 from kornia.geometry.camera import PinholeCamera
-from oracles import (
-    pinhole,
-)
 from torch import Tensor
 
 from kgs import Gaussians

@@ -4,12 +4,12 @@ import math
 
 import pytest
 import torch
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.vector import Vector3
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
-from oracles import pinhole, random_camera, random_gaussians
 
 import kgs
 import kgs.reference

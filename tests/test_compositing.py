@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
-from oracles import near_threshold, pinhole, random_camera, random_gaussians, theta_mass
+from oracles import near_threshold, theta_mass
 
 import kgs
 import kgs.reference

@@ -6,7 +6,7 @@ import itertools
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from oracles import random_camera, random_gaussians
+from factories import random_camera, random_gaussians
 
 import kgs
 import kgs.reference

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from oracles import near_threshold, random_camera, random_gaussians
+from factories import random_camera, random_gaussians
+from oracles import near_threshold
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kgs import composite, project

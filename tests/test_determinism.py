@@ -4,8 +4,8 @@ import threading
 
 import pytest
 import torch
+from factories import random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
-from oracles import random_camera, random_gaussians
 
 from kgs import DropGaussian, GaussianRenderer, Gaussians
 from kgs.raster.threads import run_all

@@ -5,10 +5,10 @@ import itertools
 
 import pytest
 import torch
+from factories import random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
-from oracles import random_camera, random_gaussians
 
 from kgs import GaussianRenderer, Gaussians, PosedCamera, composite, project
 

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 import torch
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
-from oracles import pinhole, random_camera, random_gaussians
 
 from kgs import GaussianRenderer, Gaussians
 

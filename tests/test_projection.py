@@ -5,9 +5,10 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
-from oracles import pinhole, random_camera, random_gaussians, real_harmonic
+from oracles import real_harmonic
 from projection_checks import FIELDS, HEIGHT, LENGTHS, PACKED, WIDTH, covariances, posed, replace, scene, sigma_route
 
 import kgs

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from factories import random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
-from oracles import random_camera, random_gaussians
 from projection_checks import (
     FIELDS,
     HEIGHT,

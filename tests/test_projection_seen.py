@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from oracles import pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians
 from projection_checks import (
     FIELDS,
     HEIGHT,

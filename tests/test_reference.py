@@ -6,14 +6,8 @@ import math
 import mpmath
 import pytest
 import torch
-from oracles import (
-    mpmath_pixels,
-    pinhole,
-    random_camera,
-    random_gaussians,
-    real_harmonic,
-    theta_mass,
-)
+from factories import pinhole, random_camera, random_gaussians
+from oracles import mpmath_pixels, real_harmonic, theta_mass
 from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, grid, one, replace, stack, tensor
 from torch import Tensor
 

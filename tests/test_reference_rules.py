@@ -4,12 +4,8 @@ import math
 
 import pytest
 import torch
-from oracles import (
-    near_threshold,
-    pinhole,
-    random_camera,
-    random_gaussians,
-)
+from factories import pinhole, random_camera, random_gaussians
+from oracles import near_threshold
 from reference_checks import BLUE, EXACT, GREEN, NAMES, RED, SMALL, fields, grid, one, posed, replace, stack, tensor
 
 from kgs import Gaussians

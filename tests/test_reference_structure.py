@@ -7,13 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
-from oracles import (
-    enumerate_drops,
-    pinhole,
-    random_camera,
-    random_gaussians,
-)
+from oracles import enumerate_drops
 from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, posed, replace, stack, tensor
 from torch import Tensor
 

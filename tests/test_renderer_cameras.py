@@ -5,9 +5,9 @@ import math
 
 import pytest
 import torch
+from factories import pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
-from oracles import pinhole, random_camera, random_gaussians
 from renderer_checks import DTYPES, FIELDS, OUTPUTS, batch, largest, posed, with_grad
 
 import kgs.reference

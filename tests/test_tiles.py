@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from oracles import random_camera, random_gaussians
+from factories import random_camera, random_gaussians
 from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, packed, scene
 
 from kgs import Gaussians, project

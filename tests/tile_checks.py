@@ -3,7 +3,7 @@
 import functools
 
 import torch
-from oracles import random_camera, random_gaussians
+from factories import random_camera, random_gaussians
 
 from kgs import ProjectedGaussians, project
 

@@ -5,7 +5,8 @@ import itertools
 
 import pytest
 import torch
-from oracles import mpmath_pixels, pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians
+from oracles import mpmath_pixels
 from stiff_checks import FIELDS, leaves, one
 
 from kgs import GaussianRenderer, Gaussians

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from oracles import pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians
 from stiff_checks import FIELDS, leaves, one
 
 from kgs import GaussianModel, GaussianRenderer, Gaussians

@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 import torch
-from oracles import enumerate_drops, near_threshold, pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians
+from oracles import enumerate_drops, near_threshold
 from stiff_checks import FIELDS, one
 
 import kgs.reference

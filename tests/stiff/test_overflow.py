@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from factories import pinhole, random_gaussians
 from kornia.geometry.camera import PinholeCamera
-from oracles import pinhole, random_gaussians
 
 from kgs import GaussianRenderer, Gaussians
 
