@@ -204,10 +204,9 @@ class Densifier:
 
     def _check(self) -> None:
         """Raise where the model, its statistics and the optimizer's state do not belong together."""
-        if len(self._counts) != len(self.model):
-            raise ValueError(
-                f"model: expected {len(self._counts)} Gaussians, got {len(self.model)}; load the state too"
-            )
+        count, expected = len(self.model), len(self._counts)
+        if count != expected:
+            raise ValueError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
         for name, parameter in self.model.named_parameters():
             if id(parameter) not in held:

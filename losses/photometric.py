@@ -88,17 +88,16 @@ def photometric_loss(
         moments = target
     _check_images(image, image)
     shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
-    if moments is not None:
-        if (moments.mean.shape, moments.mean.dtype, moments.mean.device) != (shape, image.dtype, image.device):
-            raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
+    known = None if moments is None else (tuple(moments.mean.shape), moments.mean.dtype, moments.mean.device)
+    if known not in (None, (shape, image.dtype, image.device)):
+        raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
     if isinstance(target, TargetMoments):
         target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
         raise ValueError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
-    outside = None
-    if mask is not None:
-        outside = _outside(mask, image)
+    outside = None if mask is None else _outside(mask, image)
+    if outside is not None:
         image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
     loss = _mean((image - target).abs(), outside)
     if dssim_weight == 0.0:
@@ -111,8 +110,7 @@ def photometric_loss(
             return loss
     if not fast or target.requires_grad or image.dtype != torch.float32 or min(shape[-2:]) < WINDOW:
         return loss + 2.0 * dssim_weight * _mean(ssim_loss(image, target, WINDOW, reduction="none"), outside)
-    if moments is None:
-        moments = target_moments(target)
+    moments = target_moments(target) if moments is None else moments
     if outside is not None:
         outside = outside.expand_as(image).reshape(shape)
     # the one place where another implementation of the loss would be chosen
