@@ -12,7 +12,7 @@ import torch
 
 from kgs import DataError
 from kgs.bench.study import cells as cells_module
-from kgs.bench.study import presets, study
+from kgs.bench.study import grid, presets, study
 from kgs.bench.study.cells import BINS, FULL, coadaptation, count_over_threshold, revision, sparse_cell
 from kgs.bench.study.presets import METHODS, SCENES, sparse_cells
 from kgs.datasets import load_scene, synthetic_scene
@@ -202,6 +202,17 @@ def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, 
     with pytest.raises(DataError, match="expected cells of --preset quick"):
         study(out=tmp_path, scheduler=threads)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_second_run_is_refused_and_writes_nothing(tmp_path, monkeypatch, threads):
+    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell()])
+    study(out=tmp_path, scheduler=threads)
+    for path in tmp_path.iterdir():
+        if path.suffix != ".jsonl":
+            path.unlink()
+    with grid._alone(tmp_path / "sparse.jsonl"), pytest.raises(ValueError, match="expected no other run"):
+        study(out=tmp_path, scheduler=threads)
+    assert [path.name for path in tmp_path.iterdir()] == ["sparse.jsonl"]
 
 
 def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch, threads):

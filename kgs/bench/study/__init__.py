@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -58,7 +59,8 @@ def study(
         work = partial(sparse_cell, data=data, lpips_weights=weights)
         run_grid(cells, work, path, scheduler=scheduler, processes=processes)
     finally:
-        if rows := finished_rows(cells, path):
+        rows = finished_rows(cells, path)
+        if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
             scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
             weighed = "" if lpips_weights is None else " --lpips-weights WEIGHTS"
             write_report(rows, out, f"{scenes}kgs bench study --preset {preset}{weighed} -o OUT", len(cells))

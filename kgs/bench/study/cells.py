@@ -9,13 +9,14 @@ from __future__ import annotations
 import subprocess
 import time
 import warnings
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import kgs
 from kgs.bench.scenes import SYNTHETIC
@@ -51,15 +52,12 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
             "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test views),
             "method" (a name, for the report), "seed", and "fit", the fields of FitConfig that are not the default's.
-        data: the folder of the scenes, where the cell runs.
+        data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
 
     Returns:
         Plain values: means of the measures under "test" and "train", "test_views" (PSNR of each), "init",
         "coadaptation", "thresholds", "protocol", and what `fit_and_measure` gives.
-
-    Raises:
-        DataError: the scene is not there or damaged.
     """
     scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
@@ -91,17 +89,11 @@ def fit_and_measure(
     trainer.fit()
     cpu_seconds = time.process_time() - start
     metrics = measure(trainer, lpips)
-    return trainer, metrics, {
-        "curve": trainer.curve,
-        "gaussians": len(trainer.model),
-        "wall_seconds": round(trainer.seconds, 2),
-        "cpu_seconds": round(cpu_seconds, 2),
-        "peak_rss_mb": peak_rss_mb(),
-        "config": config.to_dict(),
-        "versions": metrics["versions"],
-        "revision": revision(Path(kgs.__file__).parent),
-        "date": datetime.now(UTC).date().isoformat(),
-    }  # fmt: skip
+    stored = {"curve": trainer.curve, "gaussians": len(trainer.model), "config": config.to_dict()}
+    stored |= {"wall_seconds": round(trainer.seconds, 2), "cpu_seconds": round(cpu_seconds, 2)}
+    stored |= {"peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
+    stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
+    return trainer, metrics, stored
 
 
 def revision(path: Path) -> str | None:
@@ -138,7 +130,7 @@ def _start(
 
 
 def _config(start: str, seed: int, **fit: Any) -> FitConfig:
-    return FitConfig(init="model-points" if start == FULL else start, seed=seed, **fit)
+    return FitConfig(**{"init": "model-points" if start == FULL else start, "seed": seed, **fit})
 
 
 def _full_model(scene: Scene, seed: int) -> FirstPoints:
@@ -152,18 +144,6 @@ def _full_model(scene: Scene, seed: int) -> FirstPoints:
 @lru_cache(maxsize=1)
 def _lpips(weights: str) -> Lpips:
     return Lpips.load(weights)
-
-
-class _RandomHalf(nn.Module):
-    """Switches half of the Gaussians off, in `eval()` too, and leaves the others as they are."""
-
-    def __init__(self, seed: int) -> None:
-        super().__init__()
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def forward(self, opacities: Tensor) -> Tensor:
-        kept = torch.rand(opacities.shape, generator=self.generator) < 0.5
-        return opacities * kept.to(opacities)
 
 
 @torch.no_grad()
@@ -182,20 +162,21 @@ def coadaptation(
     Returns:
         The variance between subsets (of clamped renders, unbiased), mean over channels and over the pixels of all views
         that have an alpha above 0.8 in every subset; None where there are no such pixels.
-
-    Raises:
-        ValueError: fewer than two subsets.
     """
     if subsets < 2:
         raise ValueError(f"subsets: expected at least 2, got {subsets}")
-    renderer = GaussianRenderer(_RandomHalf(seed), near_plane=near_plane).eval()
-    total, pixels = 0.0, 0
-    gaussians = model()
+    renderer, generator = GaussianRenderer(near_plane=near_plane), torch.Generator().manual_seed(seed)
+    gaussians, total, pixels = model(), 0.0, 0
     for view in range(len(views)):
-        halves = [renderer(gaussians, views.camera(view), outputs=("image", "alpha")) for _ in range(subsets)]
-        covered = (torch.stack([half.alpha[0, 0] for half in halves]) > COVERED).all(0)
-        images = torch.stack([half.image[0].clamp(0, 1) for half in halves]).double()
-        total += float(images.var(0).mean(0)[covered].sum())
+        images, alphas = [], []
+        for _ in range(subsets):
+            kept = torch.rand(gaussians.opacities.shape, generator=generator) < 0.5
+            half = replace(gaussians, opacities=gaussians.opacities * kept)
+            out = renderer(half, views.camera(view), outputs=("image", "alpha"))
+            images.append(out.image[0].clamp(0, 1).double())
+            alphas.append(out.alpha[0, 0])
+        covered = (torch.stack(alphas) > COVERED).all(0)
+        total += float(torch.stack(images).var(0).mean(0)[covered].sum())
         pixels += int(covered.sum())
     return total / pixels if pixels else None
 
@@ -215,9 +196,8 @@ def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, An
         "distance": edges of the bins; "gaussians" and "over": a count for each bin.
     """
     centers = camera_centers(trainer.scene.train.cameras)
-    first, now = (
-        torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in (first_points, trainer.model.means)
-    )
+    clouds = (first_points, trainer.model.means)
+    first, now = (torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in clouds)
     edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
     bins = torch.bucketize(now, edges[1:-1])
     over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold

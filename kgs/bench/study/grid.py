@@ -2,7 +2,7 @@
 
 A cell is a dict of plain values: what to do and under which settings. Its result is appended to a JSONL file the moment
 it is there, so that a run that is killed loses no finished cell, and the next one goes on. Cells run on the workers of
-Dask, on this machine or on many; a worker that dies takes no other cell with it, and its own is done again.
+Dask, on this machine or on many.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -42,19 +42,17 @@ def run_grid(
     Args:
         cells: what to do, each different from the others.
         work: a function of a module (other processes import it); takes a cell, returns its result in plain values.
-        path: JSONL, one line `{"cell": ..., "result": ...}` per finished cell; made if it is not there. A last line
-            that was cut short is dropped.
-        processes: how many processes of this machine, None for one per core; they share the cores, and end with this
-            one. A cell whose process dies is tried once more.
-        scheduler: address of a Dask scheduler, as tcp://127.0.0.1:8786; its workers take the place of local processes,
-            and need the same packages and data. Workers may come and go; while there are none, the grid waits. Start
-            them with `dask worker ADDRESS --nthreads 1`: one cell at a time each, on as many cores as OMP_NUM_THREADS
-            says there (1 unless it is set). A cell whose worker dies goes to another one, and counts as failed when
-            the scheduler's `allowed-failures` are used up (the fourth time).
+        path: JSONL, one line `{"cell": ..., "result": ...}` per finished cell; a last line that was cut short is
+            dropped.
+        processes: how many processes of this machine, None for one per core; they share the cores.
+        scheduler: address of a Dask scheduler, as tcp://127.0.0.1:8786; its workers take the place of local processes
+            and need the same packages and data. They may come and go. Start them with
+            `dask worker ADDRESS --nthreads 1`: one cell at a time each, on as many cores as OMP_NUM_THREADS says there.
         say: where lines for the user go.
 
     Returns:
-        The lines of the given cells, in their order, without those that failed; `say` has their errors.
+        The lines of the given cells, in their order, without those that failed; `say` has their errors. A cell whose
+        worker dies is tried once more.
 
     Raises:
         ValueError: two cells are equal, `processes` is below 1, another run has the file, no scheduler answers, or it
@@ -71,7 +69,7 @@ def run_grid(
         missing = [cell for cell, key in zip(cells, keys, strict=True) if key not in done]
         say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
         if missing:
-            with _workers(processes or os.cpu_count() or 1, scheduler) as client:
+            with _workers(processes, scheduler) as client:
                 for count, (cell, outcome) in enumerate(_outcomes(client, work, missing), 1):
                     if isinstance(outcome, BaseException):
                         failed += 1
@@ -89,12 +87,12 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
 
     Args:
         path: the file.
-        repair: also take that line out of the file.
+        repair: also take that line out of the file, and end the last one.
 
     Raises:
         ValueError: another line than the last is damaged.
     """
-    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    lines = path.read_bytes().splitlines() if path.exists() else []
     rows = []
     for number, line in enumerate(lines, 1):
         try:
@@ -102,12 +100,11 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
         except ValueError as error:
             if number < len(lines):
                 raise ValueError(f"{path}: line {number} is no JSON ({error})") from error
-    whole = lines[: len(rows)]
-    if repair and len(whole) < len(lines):
-        os.truncate(path, sum(map(len, whole)))
-    elif repair and whole and not whole[-1].endswith(b"\n"):
-        with path.open("ab") as file:
-            file.write(b"\n")
+    if repair and lines:
+        with path.open("r+b") as file:
+            file.seek(max(0, sum(len(line) + 1 for line in lines[: len(rows)]) - 1))
+            file.write(b"\n" if rows else b"")
+            file.truncate()
     return rows
 
 
@@ -118,40 +115,23 @@ def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
 
 
 @contextmanager
-def _workers(processes: int, scheduler: str | None) -> Iterator[Any]:
+def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
     """A client of the scheduler at this address, or of one of our own; all that waits or runs there goes with it."""
-    import dask
     from distributed import Client, LocalCluster
 
+    cores = os.cpu_count() or 1
+    local = {
+        **{"n_workers": processes or cores, "threads_per_worker": 1, "processes": True},
+        "memory_limit": None,  # a cell may need any share of the memory; Dask would kill its process
+        "env": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // (processes or cores)))},
+        **{"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL},
+    }
     before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
     try:
         if scheduler is not None:
-            try:
-                with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
-                    thread.submit(asyncio.run, _identify(scheduler)).result()
-                client = Client(scheduler, timeout=PATIENCE)
-            except Exception as error:  # whatever Dask makes of what answers there
-                raise ValueError(
-                    "scheduler: expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786, "
-                    f"got {scheduler!r} ({error})"
-                ) from None
-            with client:
-                yield client
-            return
-        threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, (os.cpu_count() or 1) // processes))
-        with (
-            dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-            LocalCluster(
-                processes,
-                threads_per_worker=1,
-                processes=True,
-                memory_limit=None,  # a cell may need any share of the memory; Dask would kill its process
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,
-                env={"OMP_NUM_THREADS": threads},
-            ) as cluster,
-            Client(cluster) as client,
-        ):
+            with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
+                thread.submit(asyncio.run, _identify(scheduler)).result()
+        with nullcontext(scheduler) if scheduler else LocalCluster(**local) as place, Client(place) as client:
             yield client
     finally:
         for name in set(os.environ) - before:
@@ -163,10 +143,14 @@ async def _identify(address: str) -> None:
     from distributed.core import rpc
     from distributed.security import Security
 
-    async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
-        kind = (await asyncio.wait_for(server.identity(), PATIENCE))["type"]
+    try:
+        async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
+            kind = (await asyncio.wait_for(server.identity(), PATIENCE))["type"]
+    except Exception as error:  # whatever Dask makes of what answers there
+        kind = str(error) or "no answer"
     if kind != "Scheduler":
-        raise ValueError(f"this is a {kind}")
+        expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+        raise ValueError(f"scheduler: {expected}, got {address!r} ({kind})")
 
 
 def _outcomes(
@@ -179,19 +163,17 @@ def _outcomes(
     """
     from distributed import KilledWorker, wait
 
-    waiting, again = deque(cells), []
-    running: dict[Any, tuple[Cell, str]] = {}
+    waiting, running = deque(cells), dict[Any, tuple[Cell, str]]()
+    again: list[Cell] = []
     while waiting or running:
         try:
             workers = client.nthreads()
             busy = Counter(address for _, address in running.values())
             for address, threads in workers.items():
-                for _ in range(min(len(waiting), threads - busy[address])):
-                    cell = waiting.popleft()
+                for cell in [waiting.popleft() for _ in range(min(len(waiting), threads - busy[address]))]:
                     running[client.submit(work, cell, workers=[address], pure=False)] = cell, address
-            wait(list(running), timeout=1, return_when="FIRST_COMPLETED") if running else time.sleep(0.1)
-        except TimeoutError:
-            pass
+            with suppress(TimeoutError):
+                wait(list(running), timeout=1, return_when="FIRST_COMPLETED") if running else time.sleep(0.1)
         except OSError:
             raise ValueError(_LOST) from None
         for future in [future for future in running if future.done() or running[future][1] not in workers]:

@@ -17,23 +17,16 @@ from kgs.fit.run import choose_points
 
 from .cells import fit_and_measure
 from .grid import Cell
+from .tables import each
 
 __all__ = ["KNOBS", "fit_cell", "knob_cells", "write_knobs"]
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
-KNOBS: dict[str, tuple[Any, ...]] = {
-    "steps": (500, 1000),
-    "coarse": (0.5,),
-    "growth": (0.8,),
-    "sh_degree": (0, 1),
-    "max_gaussians": (5_000, 10_000),
-    "drop": (0.0, 0.1, 0.3),
-}
-# What the table shows: head and decimals.
-COLUMNS = {
-    "psnr": ("PSNR [dB]", 2),
-    "gain": ("over the default", 2),
-    "ssim": ("SSIM", 3),
+KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
+KNOBS |= {"max_gaussians": (5_000, 10_000), "drop": (0.0, 0.1, 0.3)}
+# What the table shows, under which head and with how many decimals.
+COLUMNS = {"psnr": ("PSNR [dB]", 2), "gain": ("over the default", 2), "ssim": ("SSIM", 3)}
+COLUMNS |= {
     "train_psnr": ("PSNR of training views", 1),
     "cpu_seconds": ("CPU seconds", 0),
     "gaussians": ("Gaussians", 0),
@@ -42,16 +35,12 @@ SIZE = (126, 168)  # of the synthetic pictures
 
 
 def knob_cells(quick: bool = False) -> list[Cell]:
-    """The default, `--fast`, and each other value of each knob, with three seeds, on the built-in scene and on fern.
+    """The default, `--fast`, and each other value of each knob, with three seeds; `quick`: two tiny cells instead.
 
-    Args:
-        quick: two tiny cells instead.
-
-    Raises:
-        DataError: the folder of KGS_DATA lacks fern. Where the variable is not set fern is left out.
+    On the built-in scene and, where KGS_DATA is set, on fern; DataError: the folder lacks it.
     """
     if quick:
-        return [{"scene": SYNTHETIC, "seed": 0, "steps": steps, "max_gaussians": 1000} for steps in (20, 40)]
+        return [{"scene": SYNTHETIC, "seed": 0, "steps": steps} for steps in (20, 40)]
     scenes = [SYNTHETIC]
     if "KGS_DATA" in os.environ:
         check_scenes(Path(os.environ["KGS_DATA"]), ["llff/fern"])
@@ -62,12 +51,9 @@ def knob_cells(quick: bool = False) -> list[Cell]:
 
 
 def fit_cell(cell: Cell) -> dict[str, Any]:
-    """One fit.
+    """One fit of "scene", "synthetic" or "fern" (found through KGS_DATA), from SIFT points.
 
-    Args:
-        cell: `scene`, "synthetic" or "fern" (found through KGS_DATA); `fast` where the fit starts from that setting and
-            not from the default; the rest are fields of FitConfig. The fit begins with SIFT points unless "init" says
-            otherwise.
+    "fast" says that the fit starts from that setting and not from the default; the rest are fields of FitConfig.
     """
     settings = FAST if cell.get("fast") else FitConfig()
     turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
@@ -93,15 +79,16 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     frame = pd.DataFrame([_knob(row["cell"]) | {key: row["result"].get(key) for key in COLUMNS} for row in rows])
     default = frame[frame.knob == "default"].set_index(["scene", "seed"]).psnr
     frame["gain"] = frame.psnr - default.reindex(pd.MultiIndex.from_frame(frame[["scene", "seed"]])).to_numpy()
-    groups = frame.groupby(["scene", "knob", "value"], sort=False)
-    table = groups[list(COLUMNS)].agg(["mean", "std"])
-    table.columns = [f"{name}_sd" if what == "std" else name for name, what in table.columns]
-    table = table.assign(n=groups.size()).reset_index()
+    keys = ["scene", "knob", "value"]
+    table = frame.groupby(keys, sort=False)[[*COLUMNS]].agg(["mean", "std"])
+    table.columns = [f"{column[0]}_sd" if column[1] == "std" else column[0] for column in table.columns]
+    table = table.assign(n=frame.groupby(keys, sort=False).size()).reset_index()
     table.to_csv(out / "training.csv", index=False)
     lines = [
         [scene, f"{knob} {value}".strip(), len(cells), *(mean_sd(cells[key], d) for key, (_, d) in COLUMNS.items())]
-        for (scene, knob, value), cells in sorted(groups, key=lambda g: (g[0][0], g[0][1] != "default", g[0][1]))
+        for (scene, knob, value), cells in each(frame, *keys)
     ]
+    lines.sort(key=lambda line: (line[0], line[1] != "default", str(line[1]).split()[0]))
     title = "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)"
     text = markdown_table(title, ["setting", "n", *(head for head, _ in COLUMNS.values())], lines, first="scene")
     (out / "training.md").write_text(text, encoding="utf-8")

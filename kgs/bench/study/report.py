@@ -18,37 +18,18 @@ from kgs.bench.output import markdown_table
 from .cells import revision
 from .plots import write_plots
 from .presets import OFF, PAPER
-from .tables import COLUMNS, KEYS, QUALITY, cells_frame, difference, findings, sparse_tables
+from .tables import COLUMNS, KEYS, QUALITY, cells_frame, difference, each, findings, sparse_tables
 
 __all__ = ["write_report"]
 
 TITLE = "Sparse views: DropGaussian on and off at equal first points"
-NOTES = (
-    "n counts seeds. The fits of a seed begin with the same points and see the views in the same order, so their "
-    "differences are paired: mean [95 % interval of Student's t] (pairs). One pair has no interval.",
-    "A mean over scenes weighs all scenes alike; its interval holds for these scenes and says nothing of others: it is "
-    "from the variance between seeds, pooled over the scenes.",
-    "Of many intervals one in twenty misses 0 by chance.",
-    "SSIM is zero padded, LPIPS (VGG) has inputs that are not scaled to [-1, 1], both as published; sparse.csv and "
-    "summary.csv have the usual variants too.",
-    "CPU seconds are those of the training with its curve of test views; wall clock leaves the curve out, and depends "
-    "on what else the machine did meanwhile. Peak memory is that of a process so far, which may have run other cells "
-    "before.",
-    "The paper's figures are means of 8 scenes after 10 000 steps, LLFF at 504x378 and Blender at 400x400, the best of "
-    "five runs. They compare with ours in direction, not in level. Its figures without dropping are those that other "
-    "papers print for 3DGS, so its differences are not at equal first points. It prints two values for the rate that "
-    f"grows to 0.2 ({PAPER}) with three views: 20.76 dB in its comparisons, 20.56 dB in its table of rates; both are "
-    "given.",
-    "The paper does not define selection by gradient and distance, nor the L1 penalties: near, far, high and low "
-    "gradient and the weights of L1 are our readings, and stand beside the same printed figure.",
-)
 
 
 def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int) -> str:
     """Write sparse.csv (a line per cell), summary.csv (a line per group), sparse.md, sparse.tex, plots and index.html.
 
     sparse.tex holds the tables, to be put into a document with the package booktabs. Plots and tables that have nothing
-    to show are left out.
+    to show are left out. How to read all this is in notes.txt of this package.
 
     Args:
         rows: dicts of "cell" and "result", any part of the study.
@@ -64,78 +45,61 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     """
     frame = cells_frame(rows)
     out.mkdir(parents=True, exist_ok=True)
-    plain = [*KEYS, "seed", *COLUMNS, "init.kind"]
-    lines = frame[plain].assign(fit=[json.dumps(fit, sort_keys=True) for fit in frame.fit])
-    lines.rename(columns=lambda name: name.replace(".", "_")).sort_index().to_csv(out / "sparse.csv", index=False)
-    _summary(frame).to_csv(out / "summary.csv", index=False)
-    tables, plots = sparse_tables(frame), write_plots(frame, out)
-    results = findings(frame)
-    origin = _origin(rows, out, command, planned)
-    text = "\n".join([f"# {TITLE}", "", *(f"- {finding}" for finding in (*results, *origin)), "", ""])
-    for title, lines in tables:
-        text += markdown_table(title, lines.columns[1:], lines.to_numpy().tolist(), lines.columns[0])
-    text += "\n".join(f"- {note}" for note in NOTES) + "\n"
-    (out / "sparse.md").write_text(text, encoding="utf-8")
-    (out / "sparse.tex").write_text(_latex([*results, *origin, *NOTES], tables), encoding="utf-8")
-    pictures = {caption: b64encode((out / name).read_bytes()).decode() for name, caption in plots.items()}
+    lines = frame.sort_index().assign(fit=frame.fit.map(lambda fit: json.dumps(fit, sort_keys=True)))
+    lines = lines[[*KEYS, "seed", *COLUMNS, "init.kind", "fit"]]
+    lines.rename(columns=lambda name: name.replace(".", "_")).to_csv(out / "sparse.csv", index=False)
+    _summary(frame.sort_index()).to_csv(out / "summary.csv", index=False)
+    tables, plots, results = sparse_tables(frame), write_plots(frame, out), findings(frame)
+    origin = _origin([row["result"] for row in rows], out / "sparse.jsonl", planned)
+    origin = [f"Command: {command}.", *origin]
     page = Environment(loader=PackageLoader("kgs.bench.study", ""), autoescape=True, trim_blocks=True)
-    page.filters["break"] = lambda text: re.split(r" (?=\[|or |\()", text)
-    content = {"title": TITLE, "findings": results, "origin": origin, "notes": NOTES, "tables": tables}
-    html = page.get_template("page.html.jinja").render(**content, pictures=pictures, version=__version__)
-    (out / "index.html").write_text(html, encoding="utf-8")
+    page.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
+    notes = page.get_template("notes.txt").render().splitlines()
+    text = "\n".join([f"# {TITLE}", "", *(f"- {finding}" for finding in (*results, *origin)), "", ""])
+    latex = "".join(f"% {sentence}\n" for sentence in (*results, *origin, *notes))
+    for title, table in tables:
+        text += markdown_table(title, table.columns[1:], table.to_numpy().tolist(), table.columns[0])
+        caption = re.sub(r"([%_])", r"\\\1", title)
+        body = table.to_latex(index=False, escape=True, caption=caption)
+        latex += f"{{\\scriptsize\n{re.sub(r'(?<![A-Za-z0-9_-])-(?=[0-9])', '$-$', body)}}}\n\n"
+    text += "\n".join(f"- {note}" for note in notes) + "\n"
+    content: dict[str, Any] = {"title": TITLE, "findings": results, "origin": origin, "notes": notes, "tables": tables}
+    content["pictures"] = {caption: b64encode((out / name).read_bytes()).decode() for name, caption in plots.items()}
+    html = page.get_template("page.html.jinja").render(**content, version=__version__)
+    for name, written in {"sparse.md": text, "sparse.tex": latex, "index.html": html}.items():
+        (out / name).write_text(written, encoding="utf-8")
     return text
 
 
 def _summary(frame: pd.DataFrame) -> pd.DataFrame:
     """The lines of summary.csv."""
     lines = []
-    for group, cells in frame.sort_index().groupby(KEYS, sort=False):
-        line = dict(zip(KEYS, group, strict=True)) | {"n": len(cells), "seeds": " ".join(map(str, sorted(cells.seed)))}
+    for (scene, views, start, method), cells in each(frame, *KEYS):
+        line = dict(zip(KEYS, (scene, views, start, method), strict=True))
+        line |= {"n": len(cells), "seeds": " ".join(map(str, sorted(cells.seed)))}
         for measure in COLUMNS:
             values, name = cells[measure], measure.replace(".", "_")
             line |= {f"{name}_mean": values.mean(), f"{name}_sd": values.std()}
             if measure.startswith("test."):
                 line[f"{name}_best"] = values.min() if "lpips" in measure else values.max()
-        same = frame[(frame.scene == line["scene"]) & (frame.views == line["views"])]
-        pairs = {"off": ("method", OFF), "paper": ("method", PAPER), "sift": ("start", "sift")}
-        for name, (key, base) in pairs.items():
-            other = "start" if key == "method" else "method"
+        same = frame[(frame.scene == scene) & (frame.views == views)]
+        for name, pair in {"off": (method, OFF), "paper": (method, PAPER), "sift": (start, "sift")}.items():
+            key, others = ("start", same.method == method) if name == "sift" else ("method", same.start == start)
             for measure in QUALITY:
-                gain = difference(same[same[other] == line[other]], measure, **{key: (line[key], base)})
-                found = gain._asdict() if gain.pairs else {}
-                for part in ("mean", "low", "high", "pairs"):
-                    line[f"{measure.removeprefix('test.')}_over_{name}_{part}"] = found.get(part)
+                gain = difference(same[others], key, *pair, measure)
+                found = gain._asdict() if gain.pairs else dict.fromkeys(gain._fields)
+                line |= {f"{measure[5:]}_over_{name}_{part}": found[part] for part in ("mean", "low", "high", "pairs")}
         lines.append(line)
     return pd.DataFrame(lines)
 
 
-def _origin(rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int) -> list[str]:
-    """Where the figures are from: the command, the cells, their dates and commits, and the versions they ran with."""
-    results = [row["result"] for row in rows]
-    versions = {json.dumps(result.get("versions", {}), sort_keys=True): None for result in results}
-    texts = [", ".join(f"{name} {version}" for name, version in json.loads(text).items()) for text in versions]
-    kept, dates = revision(out / "sparse.jsonl"), sorted({r["date"] for r in results if r.get("date")})
-    code = sorted({r["revision"] for r in results if r.get("revision")})
-    made = [f"{len(rows)} of {planned} cells"]
-    made += [f"sparse.jsonl at commit {kept}"] if kept else []
+def _origin(results: Sequence[Mapping[str, Any]], path: Path, planned: int) -> list[str]:
+    """Where the figures are from: how many cells, their commit and dates, and the versions that they ran with."""
+    found = {key: sorted({r[key] for r in results if r.get(key)}) for key in ("date", "revision")}
+    versions = {", ".join(f"{k} {v}" for k, v in sorted(r.get("versions", {}).items())): None for r in results}
+    commit, dates = revision(path), found["date"]
+    made = [f"{len(results)} of {planned} cells"]
+    made += [f"{path.name} at commit {commit}"] if commit else []
     made += [f"cells that say when they ran: {dates[0]} to {dates[-1]}"] if dates else []
-    made += [f"cells that say of which code: {', '.join(code)}"] if code else []
-    return [f"Command: {command}.", f"Figures: {'; '.join(made)}.", f"Versions: {'; '.join(texts)}."]
-
-
-def _latex(sentences: Sequence[str], tables: Sequence[Any]) -> str:
-    """The tables, the sentences as comments before them; a minus before a number is one."""
-    parts = [f"% {sentence}\n" for sentence in sentences]
-    for title, lines in tables:
-        columns = "l" + "r" * (len(lines.columns) - 1)
-        titles = {name: _escape(name) for name in lines.columns}
-        table = lines.map(_escape).rename(columns=titles)
-        text = table.style.hide(axis="index").to_latex(hrules=True, column_format=columns, caption=_escape(title))
-        parts.append(f"{{\\scriptsize\\setlength{{\\tabcolsep}}{{3pt}}\n{text}}}\n\n")
-    return "".join(parts)
-
-
-def _escape(text: str) -> str:
-    escaped = re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", "/")).replace("~", r"\textasciitilde{}")
-    escaped = re.sub(r"([<>])", r"$\1$", escaped).replace("^", r"\textasciicircum{}").replace("[", "{[}")
-    return re.sub(r"(?<![\w-])-(?=\d)", "$-$", escaped)
+    made += [f"cells that say of which code: {', '.join(found['revision'])}"] if found["revision"] else []
+    return [f"Figures: {'; '.join(made)}.", f"Versions: {'; '.join(versions)}."]

@@ -1,7 +1,6 @@
 """Statistics over seeds and scenes: paired differences with their intervals, and the noise between seeds.
 
-Every function takes a table of numbers with one row per seed and one column per group (a scene, or a setting of one).
-NaN stands where a group lacks a seed.
+Functions take a table with one row per seed and one column per group; NaN stands where a group lacks a seed.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class Noise(NamedTuple):
 def noise_floor(groups: pd.DataFrame) -> Noise:
     """The standard deviation within groups: the root mean of their variances, weighted by their degrees of freedom.
 
-    Groups of fewer than two numbers say nothing; NaN where all are such.
+    Groups of fewer than two numbers say nothing; NaN of nothing else.
     """
     freedom = (groups.count() - 1).clip(lower=0)
     total = int(freedom.sum())
@@ -73,8 +72,6 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     counts = differences.count()
     counts = counts[counts > 0]
     mean, noise = float(differences.mean().mean()), noise_floor(differences)
-    if not noise.freedom:
-        return Difference(int(counts.sum()), mean, math.nan, math.nan)
-    error = noise.sd * math.sqrt((1 / counts).sum()) / len(counts)
-    half = float(stats.t.ppf(0.975, noise.freedom)) * error
+    error = noise.sd * math.sqrt((1 / counts).sum()) / max(1, len(counts))
+    half = float(stats.t.ppf(0.975, noise.freedom)) * error  # NaN without any freedom
     return Difference(int(counts.sum()), mean, mean - half, mean + half)

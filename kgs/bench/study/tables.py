@@ -11,13 +11,13 @@ from kgs.bench.output import mean_sd
 from kgs.fit.metrics import MEASURES
 
 from .presets import EQUAL_MEAN_RATE, FAMILIES, FIXED, MAIN, METHODS, OFF, PAPER
-from .published import benchmark_of, published, published_differences
+from .published import benchmark_of, published, published_difference
 from .statistics import Difference, noise_floor, paired_difference
 
-__all__ = ["COLUMNS", "KEYS", "LPIPS", "QUALITY", "Table", "cells_frame", "difference", "findings", "main_cells",
-           "sparse_tables", "wide"]  # fmt: skip
+__all__ = ["COLUMNS", "KEYS", "LPIPS", "QUALITY", "Table", "cells_frame", "difference", "each", "findings"]
+__all__ += ["main_cells", "sparse_tables", "wide"]
 
-KEYS = ["scene", "views", "start", "method"]  # what cells have in common that differ in the seed alone
+KEYS = ("scene", "views", "start", "method")  # what cells have in common that differ in the seed alone
 COLUMNS = (
     *(f"{part}.{name}" for part in ("test", "train") for name in MEASURES),
     *("init.points", "init.seconds", "gaussians", "wall_seconds", "cpu_seconds", "peak_rss_mb", "coadaptation"),
@@ -25,6 +25,13 @@ COLUMNS = (
 STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
 LPIPS = "test.lpips_vgg_unscaled"
 QUALITY = {"test.psnr": 2, "test.ssim_zero_padded": 3, LPIPS: 3}  # and how many decimals
+_COMPARISONS = {
+    f"The paper's rule ({PAPER}) over no dropping (off)": ("method", PAPER, OFF),
+    f"A fixed rate of the same mean ({FIXED}) over no dropping (off)": ("method", FIXED, OFF),
+    f"The paper's rule over the fixed rate of the same mean ({FIXED})": ("method", PAPER, FIXED),
+    f"Dense first points over those of SIFT, both with {PAPER}": ("start", "dense", "sift"),
+}
+Lines = list[dict[str, str]]
 
 
 class Table(NamedTuple):
@@ -49,15 +56,20 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     cells = pd.DataFrame([dict(row["cell"]) for row in rows])[[*KEYS, "seed", "fit"]]
     results = pd.json_normalize([dict(row["result"]) for row in rows])
     numbers = results.reindex(columns=list(COLUMNS)).astype(float).replace([float("inf"), float("-inf")], float("nan"))
-    others = ["init.kind", "curve", *(f"thresholds.{key}" for key in ("distance", "gaussians", "over"))]
-    others += [f"protocol.{key}" for key in ("train", "test", "image_size")]
+    others = ["init.kind", "curve", "thresholds.distance", "thresholds.gaussians", "thresholds.over"]
+    others += ["protocol.train", "protocol.test", "protocol.image_size"]
     frame = pd.concat([cells, numbers, results.reindex(columns=others)], axis=1)
-    if (twice := frame.duplicated([*KEYS, "seed"])).any():
-        group = tuple(frame.loc[twice.idxmax(), [*KEYS, "seed"]])
-        raise ValueError(f"rows: expected one cell for each seed of {group[:-1]}, got two for {group[-1]}")
-    scenes, known = {name: k for k, name in enumerate(frame.scene.unique())}, dict.fromkeys([*STARTS, *METHODS])
-    order = {**scenes, **{name: k for k, name in enumerate(known)}}
-    return frame.sort_values(KEYS, key=lambda c: c if c.name == "views" else c.map(order).fillna(99), kind="stable")
+    for (*group, seed), some in each(frame, *KEYS, "seed"):
+        if len(some) > 1:
+            raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
+    order = {name: k for k, name in enumerate([*frame.scene.unique(), *STARTS, *METHODS])}
+    places = frame[["scene", "start", "method"]].apply(lambda column: column.map(order)).fillna(len(order))
+    return frame.iloc[places.assign(views=frame.views).sort_values(list(KEYS), kind="stable").index]
+
+
+def each(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
+    """The cells that share these fields, group by group in their order; the fields are a tuple."""
+    return frame.groupby(list(keys), sort=False)
 
 
 def wide(frame: pd.DataFrame, measure: str, **fixed: str) -> pd.DataFrame:
@@ -67,52 +79,49 @@ def wide(frame: pd.DataFrame, measure: str, **fixed: str) -> pd.DataFrame:
     return frame.pivot(index="seed", columns=[key for key in KEYS if key not in fixed], values=measure)
 
 
-def difference(frame: pd.DataFrame, measure: str = "test.psnr", **pair: tuple[str, str]) -> Difference:
-    """Of cells that differ in one field alone, as in `method=("far", "off")`: value less base, paired by seed."""
-    ((key, (value, base)),) = pair.items()
-    return paired_difference(_differences(frame, measure, key, value, base))
+def differences(frame: pd.DataFrame, key: str, value: str, base: str, measure: str = "test.psnr") -> pd.DataFrame:
+    """Of cells that differ in one field alone, the method or the start: value less base, as `wide`."""
+    if value == base or not {value, base} <= set(frame[key]):
+        return pd.DataFrame()
+    return wide(frame, measure, **{key: value}) - wide(frame, measure, **{key: base})
 
 
-def main_cells(frame: pd.DataFrame) -> pd.DataFrame:
-    """The cells of each scene's main protocol: its fewest views, dense first points. Other scenes are left out."""
-    dense = frame[frame.start == "dense"]
-    return dense[dense.views == dense.groupby("scene").views.transform("min")]
+def difference(frame: pd.DataFrame, key: str, value: str, base: str, measure: str = "test.psnr") -> Difference:
+    """The mean of `differences`, with its interval."""
+    return paired_difference(differences(frame, key, value, base, measure))
+
+
+def main_cells(frame: pd.DataFrame, starts: Sequence[str] = ("dense",)) -> pd.DataFrame:
+    """The cells of each scene's main protocol: the fewest views that it has from dense first points."""
+    fewest = frame[frame.start == "dense"].groupby("scene").views.min()
+    return frame[(frame.views == frame.scene.map(fewest)) & frame.start.isin(starts)]
 
 
 def findings(frame: pd.DataFrame) -> list[str]:
     """The results in sentences, each with its pairs, scenes, spread and interval; none of cells without pairs."""
-    main, sentences = main_cells(frame), []
-    paper = frame.merge(main[KEYS[:2]].drop_duplicates())
-    paper = paper[paper.method == PAPER]
-    names = {
-        PAPER: f"The paper's rule ({PAPER})",
-        OFF: "no dropping (off)",
-        FIXED: f"a fixed rate of the same mean ({FIXED})",
-    }
-    names |= {"dense": "Dense first points", "sift": f"those of SIFT, both with {PAPER}"}
-    for cells, key, value, base in (
-        (main, "method", PAPER, OFF),
-        (main, "method", FIXED, OFF),
-        (main, "method", PAPER, FIXED),
-        (paper, "start", "dense", "sift"),
-    ):
-        gain, cost = (difference(cells, measure, **{key: (value, base)}) for measure in ("test.psnr", LPIPS))
-        if not gain.pairs:
-            continue
-        by_scene = {name: difference(some, **{key: (value, base)}) for name, some in cells.groupby("scene", sort=False)}
-        scenes = [f"{name.rpartition('/')[2]} {found.text()}" for name, found in by_scene.items() if found.pairs]
-        noise = noise_floor(_differences(cells, "test.psnr", key, value, base))
-        spread = f", standard deviation of a pair: {noise.sd:.2f} dB" if noise.freedom else ""
-        lpips = f" LPIPS (less is better): {cost.text(3)}." if cost.pairs else ""
-        sentences.append(
-            f"{names[value][0].upper()}{names[value][1:]} over {names[base]}: {gain.text()} dB of test PSNR (mean [95 % "
-            f"interval]; pairs: {gain.pairs}, scenes: {len(scenes)}{spread}).{lpips} By scene: {'; '.join(scenes)} dB."
+    main, sentences = main_cells(frame, STARTS), []
+    for what, pair in _COMPARISONS.items():
+        cells = main[main.start == "dense"] if pair[0] == "method" else main[main.method == PAPER]
+        gain, cost, noise = (
+            difference(cells, *pair),
+            difference(cells, *pair, LPIPS),
+            noise_floor(differences(cells, *pair)),
         )
+        by_scene = {name.rpartition("/")[2]: difference(some, *pair) for (name,), some in each(cells, "scene")}
+        scenes = [f"{name} {found.text()}" for name, found in by_scene.items() if found.pairs]
+        if scenes:
+            spread = f", standard deviation of a pair: {noise.sd:.2f} dB" if noise.freedom else ""
+            lpips = f" LPIPS (less is better): {cost.text(3)}." if cost.pairs else ""
+            sentences.append(
+                f"{what}: {gain.text()} dB of test PSNR (mean [95 % interval]; pairs: {gain.pairs}, scenes: "
+                f"{len(scenes)}{spread}).{lpips} By scene: {'; '.join(scenes)} dB."
+            )
     noise = noise_floor(wide(frame, "test.psnr"))
     if noise.freedom:
+        single, three = (f"{noise.between_means(n):.2f} dB" for n in (1, 3))
+        what = f"two single runs differ by up to {single}, and two means of three by up to {three}"
         sentences.append(
-            f"Where nothing but the seed differs, two single runs differ by up to {noise.between_means(1):.2f} dB, and two "
-            f"means of three by up to {noise.between_means(3):.2f} dB, 95 times in 100 ({noise.groups} groups of runs)."
+            f"Where nothing but the seed differs, {what}, 95 times in 100 ({noise.groups} groups of runs)."
         )
     return sentences
 
@@ -120,7 +129,6 @@ def findings(frame: pd.DataFrame) -> list[str]:
 def sparse_tables(frame: pd.DataFrame) -> list[Table]:
     """All tables that have a line, the main one first."""
     main = main_cells(frame)
-    ablations = [table for _, cells in main.groupby(KEYS[:3], sort=False) for table in _ablations(cells)]
     tables = {
         "Test views: mean (sd) over n seeds; paired differences over off with their 95 % interval; the paper's figures "
         "are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction": (
@@ -128,209 +136,153 @@ def sparse_tables(frame: pd.DataFrame) -> list[Table]:
         ),
         "Numbers of views": _views(frame),
         "First points": _starts(frame),
-        **dict(ablations),
-        "Noise between seeds under identical settings, pooled, and the difference that it makes 1 time in 20": (
-            _noise(frame, main)
-        ),
-        "Cost, overfitting and co-adaptation: mean (sd) over n seeds": _cost(main),
-        "Scenes, splits and settings": _protocol(frame),
     }
+    for _, cells in each(main, *KEYS[:3]):
+        tables |= _ablations(cells) if set(cells.method) - set(MAIN) else {}
+    tables["Noise between seeds under identical settings, pooled, and the difference that it makes 1 time in 20"] = (
+        _noise(frame)
+    )
+    tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = _cost(main)
+    tables["Scenes, splits and settings"] = _protocol(frame)
     return [Table(title, pd.DataFrame(lines)) for title, lines in tables.items() if lines]
 
 
-Lines = list[dict[str, str]]
-
-
-def _differences(frame: pd.DataFrame, measure: str, key: str, value: str, base: str) -> pd.DataFrame:
-    if value == base or not {value, base} <= set(frame[key]):
-        return pd.DataFrame()
-    return wide(frame, measure, **{key: value}) - wide(frame, measure, **{key: base})
-
-
 def _methods(main: pd.DataFrame) -> Lines:
-    lines = [line for _, cells in main.groupby(KEYS[:3], sort=False) for line in _quality_lines(cells)]
-    is_llff = (main.views == 3) & main.scene.map(lambda scene: benchmark_of(scene, 3) == "LLFF").astype(bool)
-    means = {"LLFF scenes": main[is_llff]} | ({} if is_llff.all() else {"scenes": main})
-    for kind, cells in means.items():
-        found = cells[cells.method.isin(MAIN)].groupby("scene").method.nunique()
-        common = cells[cells.scene.isin(found.index[found == cells.method[cells.method.isin(MAIN)].nunique()])]
-        if common.scene.nunique() > 1:
-            lines += _quality_lines(common, kind)
+    lines = [line for _, cells in each(main, *KEYS[:3]) for line in _compared(cells, MAIN)]
+    found = main[main.method.isin(MAIN)]
+    common = found[found.groupby("scene").method.transform("nunique") == found.method.nunique()]
+    llff = common[(common.views == 3) & common.scene.map(lambda scene: benchmark_of(scene, 3) == "LLFF").astype(bool)]
+    for kind, cells in {"LLFF scenes": llff, "scenes": common if len(llff) < len(common) else llff[:0]}.items():
+        lines += _compared(cells, MAIN, kind) if cells.scene.nunique() > 1 else []
     return lines
 
 
 def _views(frame: pd.DataFrame) -> Lines:
     dense = frame[frame.start == "dense"]
     several = dense[dense.groupby("scene").views.transform("nunique") > 1]
-    lines = [line for _, cells in several.groupby(KEYS[:3], sort=False) for line in _quality_lines(cells)]
-    for views, cells in several.groupby("views"):
-        if cells.scene.nunique() > 1:
-            lines += _quality_lines(cells, "scenes", f", {views} views")
+    lines = [line for _, cells in each(several, *KEYS[:3]) for line in _compared(cells, MAIN)]
+    for (views,), cells in each(several.sort_values("views", kind="stable"), "views"):
+        lines += _compared(cells, MAIN, "scenes", f", {views} views") if cells.scene.nunique() > 1 else []
     return lines
 
 
-def _quality_lines(cells: pd.DataFrame, kind: str = "", more: str = "") -> Lines:
-    """One line per main method that all settings have: of one setting, or of the mean over several by seed."""
-    scenes = cells[KEYS[:2]].drop_duplicates()
-    names = ", ".join(scene.rpartition("/")[2] for scene in scenes.scene)
+def _ablations(cells: pd.DataFrame) -> dict[str, Lines]:
+    where, benchmark, views = _setting(cells), _benchmark(cells), cells.views.iloc[0]
+    tables = {
+        f"{title} ({where})": _compared(cells, (OFF, PAPER, *family), bases=(OFF, PAPER))
+        for title, family in FAMILIES.items()
+        if set(family) & set(cells.method)
+    }
+    tables[f"A growing rate against a fixed one of the same mean ({where})"] = [
+        {
+            "": f"{method} over {base}",
+            "PSNR [dB] (pairs)": _counted(difference(cells, "method", method, base)),
+            "paper": published_difference(benchmark, views, method, base),
+        }
+        for method, base in EQUAL_MEAN_RATE.items()
+        if {method, base} <= set(cells.method)
+    ]
+    return tables
+
+
+def _compared(
+    cells: pd.DataFrame, methods: Iterable[str], kind: str = "", more: str = "", bases: Sequence[str] = (OFF,)
+) -> Lines:
+    """One line per method that all scenes have: of one setting, or (`kind`) by seed of the mean over several."""
+    scenes, benchmark, views = cells.scene.unique(), _benchmark(cells), cells.views.iloc[0]
+    names = ", ".join(scene.rpartition("/")[2] for scene in scenes)
     name = f"mean of {len(scenes)} {kind} ({names}){more}" if kind else _setting(cells)
-    benchmarks = {(benchmark_of(*setting), setting[1]) for setting in scenes.itertuples(index=False, name=None)}
-    benchmark, views = benchmarks.pop() if len(benchmarks) == 1 else (None, 0)
     lines = []
-    for method in MAIN:
-        if cells[cells.method == method].scene.nunique() < len(scenes):
-            continue
-        quality = _quality(cells, method)
-        lines.append(
-            {
-                "scene": name,
-                "method": method,
-                **{key: quality[key] for key in ("n", "PSNR [dB]", "best")},
-                "over off [dB] (pairs)": _counted(difference(cells, method=(method, OFF))),
-                **{key: quality[key] for key in ("SSIM", "LPIPS")},
-                "LPIPS over off": difference(cells, LPIPS, method=(method, OFF)).text(3),
-                "paper, mean of its scenes: PSNR / SSIM / LPIPS": _figures(benchmark, views, method),
-                "paper: over off": _printed(benchmark, views, method, OFF),
-            }
-        )
+    for method in methods:
+        if cells[cells.method == method].scene.nunique() == len(scenes):
+            psnr, ssim, lpips = (wide(cells, measure, method=method).dropna().mean(axis=1) for measure in QUALITY)
+            line = ({"scene": name} if len(bases) == 1 else {}) | {"method": method} | _spread(psnr)
+            line |= {f"over {b} [dB] (pairs)": _counted(difference(cells, "method", method, b)) for b in bases}
+            line |= {"SSIM": mean_sd(ssim, 3), "LPIPS": mean_sd(lpips, 3)}
+            line["LPIPS over off"] = difference(cells, "method", method, OFF, LPIPS).text(3)
+            line["paper: PSNR / SSIM / LPIPS"] = published(benchmark, views, method)
+            line |= {f"paper: over {b}": published_difference(benchmark, views, method, b) for b in bases}
+            lines.append(line)
     return lines
-
-
-def _quality(cells: pd.DataFrame, method: str) -> dict[str, str]:
-    """By seed the mean over the settings, of the seeds that all have: of PSNR n, mean (sd) and best, of others mean."""
-    psnr, ssim, lpips = (wide(cells, measure, method=method).dropna().mean(axis=1) for measure in QUALITY)
-    return _spread(psnr) | {"SSIM": mean_sd(ssim, 3), "LPIPS": mean_sd(lpips, 3)}
 
 
 def _starts(frame: pd.DataFrame) -> Lines:
     lines = []
-    for (scene, views), setting in frame.groupby(KEYS[:2], sort=False):
-        for method in [method for method in MAIN if setting[setting.method == method].start.nunique() > 1]:
-            cells = setting[setting.method == method]
-            lines += [
-                {
-                    "scene": f"{scene}, {views} views",
-                    "method": method,
-                    "start": _start(start, set(some["init.kind"])),
-                    **_spread(some["test.psnr"]),
-                    "first points": mean_sd(some["init.points"], 0),
-                    "their CPU [s]": mean_sd(some["init.seconds"], 0),
-                    "over sift [dB] (pairs)": _counted(difference(cells, start=(start, "sift"))),
-                    "over off, same start [dB] (pairs)": _counted(
-                        difference(setting[setting.start == start], method=(method, OFF))
-                    ),
-                }
-                for start, some in cells.groupby("start", sort=False)
-            ]
+    for (scene, views, method), cells in each(frame[frame.method.isin(MAIN)], "scene", "views", "method"):
+        same = frame[(frame.scene == scene) & (frame.views == views)]
+        for (start,), some in each(cells, "start") if cells.start.nunique() > 1 else ():
+            gave = sorted({*some["init.kind"]} - {start}) if start in ("dense", "sift") else []
+            note = " (sees test views)" if start in ("model-points", "full-model") else ""
+            line = {"scene": f"{scene}, {views} views", "method": method}
+            line["start"] = f"{start} (gave {', '.join(gave)})" if gave else start + note
+            line |= _spread(some["test.psnr"])
+            line |= {"first points": mean_sd(some["init.points"], 0), "their CPU [s]": mean_sd(some["init.seconds"], 0)}
+            line["over sift [dB] (pairs)"] = _counted(difference(cells, "start", start, "sift"))
+            over_off = difference(same[same.start == start], "method", method, OFF)
+            lines.append(line | {"over off, same start [dB] (pairs)": _counted(over_off)})
     return lines
 
 
-def _start(start: str, gave: set[str]) -> str:
-    """The name of a start; with what it gave where that is something else, and a warning."""
-    if start in ("dense", "sift") and gave - {start}:
-        return f"{start} (gave {', '.join(sorted(gave - {start}))})"
-    return f"{start} (sees test views)" if start in ("model-points", "full-model") else start
-
-
-def _ablations(cells: pd.DataFrame) -> list[tuple[str, Lines]]:
-    there, where = set(cells.method), _setting(cells)
-    if there <= set(MAIN):
-        return []
-    views = cells.views.iloc[0]
-    benchmark, tables = benchmark_of(cells.scene.iloc[0], views), []
-    for title, family in FAMILIES.items():
-        lines = []
-        for method in [m for m in (OFF, PAPER, *family) if m in there] if there & set(family) else []:
-            quality = _quality(cells, method)
-            gains = {f"over {b} [dB] (pairs)": _counted(difference(cells, method=(method, b))) for b in (OFF, PAPER)}
-            line = {"method": method, **{key: quality[key] for key in ("n", "PSNR [dB]", "best")}, **gains}
-            line |= {key: quality[key] for key in ("SSIM", "LPIPS")}
-            line["paper: PSNR / SSIM / LPIPS"] = _figures(benchmark, views, method)
-            lines.append(line | {f"paper: over {b}": _printed(benchmark, views, method, b) for b in (OFF, PAPER)})
-        tables.append((f"{title} ({where})", lines))
-    lines = [
-        {
-            "": f"{method} over {base}",
-            "PSNR [dB] (pairs)": _counted(gain),
-            "paper": _printed(benchmark, views, method, base),
-        }
-        for method, base in EQUAL_MEAN_RATE.items()
-        if (gain := difference(cells, method=(method, base))).pairs
-    ]
-    return [*tables, (f"A growing rate against a fixed one of the same mean ({where})", lines)]
-
-
-def _noise(frame: pd.DataFrame, main: pd.DataFrame) -> Lines:
-    scenes = [(scene, "test.psnr", frame[frame.scene == scene]) for scene in main.scene.unique()]
+def _noise(frame: pd.DataFrame) -> Lines:
+    scenes = [(scene, "test.psnr", cells) for (scene,), cells in each(frame, "scene")]
     lines = []
-    for name, measure, cells in [*(scenes if len(scenes) > 1 else []), *(("all cells", m, frame) for m in QUALITY)]:
+    for name, measure, cells in [
+        *scenes[: len(scenes) if len(scenes) > 1 else 0],
+        *(("all cells", m, frame) for m in QUALITY),
+    ]:
         noise = noise_floor(wide(cells, measure))
-        numbers = {
-            "sd between seeds": noise.sd,
-            "two single runs": noise.between_means(1),
-            "two means of 3": noise.between_means(3),
-            "two means of 5": noise.between_means(5),
-            "best of 5 over the mean": noise.best_of_five_gain(),
-        }
         label = {"test.psnr": "PSNR [dB]", LPIPS: "LPIPS"}.get(measure, "SSIM")
         line = {"scene": name, "measure": label, "groups": str(noise.groups), "degrees of freedom": str(noise.freedom)}
+        numbers = {"sd between seeds": noise.sd, "two single runs": noise.between_means(1)}
+        numbers |= {f"two means of {n}": noise.between_means(n) for n in (3, 5)}
+        numbers["best of 5 over the mean"] = noise.best_of_five_gain()
         if noise.freedom:
             lines.append(line | {key: f"{value:.{QUALITY[measure] + 1}f}" for key, value in numbers.items()})
     return lines
 
 
 def _cost(main: pd.DataFrame) -> Lines:
+    measures = {"wall clock [s]": "wall_seconds", "CPU [s]": "cpu_seconds", "Gaussians": "gaussians"}
+    measures["peak memory [MiB]"] = "peak_rss_mb"
     return [
         {
-            "scene": _setting(cells),
-            "method": str(cells.method.iloc[0]),
-            "n": str(len(cells)),
+            **{"scene": _setting(cells), "method": method, "n": str(len(cells))},
             "PSNR, training less test views [dB]": mean_sd(cells["train.psnr"] - cells["test.psnr"], 2),
-            "wall clock [s]": mean_sd(cells.wall_seconds, 0),
-            "CPU [s]": mean_sd(cells.cpu_seconds, 0),
-            "Gaussians": mean_sd(cells.gaussians, 0),
-            "peak memory [MiB]": mean_sd(cells.peak_rss_mb, 0),
+            **{head: mean_sd(cells[measure], 0) for head, measure in measures.items()},
             "co-adaptation [1e-3]": mean_sd(1e3 * cells.coadaptation, 2),
         }
-        for _, cells in main.groupby(KEYS, sort=False)
+        for (*_, method), cells in each(main, *KEYS)
     ]
 
 
 def _protocol(frame: pd.DataFrame) -> Lines:
     """Sizes, splits, and the settings that all fits of a scene and number of views share."""
     lines = []
-    for (scene, views), cells in frame.groupby(KEYS[:2]):
+    for (scene, views), cells in each(frame.sort_values(["scene", "views"]), "scene", "views"):
         train, test, (height, width) = (cells[f"protocol.{key}"].iloc[0] for key in ("train", "test", "image_size"))
-        shared = set.intersection(*(set(fit.items()) for fit in cells.fit))
+        shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
         counts = {"training views": len(train), "test views": len(test), "cells": len(cells)}
-        fit = ", ".join(f"{key} {value}" for key, value in sorted(shared)) or "-"
         line = {"scene": f"{scene}, {views} views", **{key: str(value) for key, value in counts.items()}}
+        fit = ", ".join(f"{key} {value}" for key, value in shared) or "-"
         lines.append(line | {"size": f"{width}x{height}", "what all fits share": fit})
     return lines
 
 
 def _setting(cells: pd.DataFrame) -> str:
-    return "{}, {} views, {}".format(*cells[KEYS[:3]].iloc[0])
+    return "{}, {} views, {}".format(*cells[[*KEYS[:3]]].iloc[0])
 
 
-def _spread(psnr: pd.Series) -> dict[str, str]:
+def _benchmark(cells: pd.DataFrame) -> str | None:
+    """The paper's benchmark that all these cells are from."""
+    found = {(benchmark_of(scene, views), views) for (scene, views), _ in each(cells, "scene", "views")}
+    return found.pop()[0] if len(found) == 1 else None
+
+
+def _spread(psnr: pd.Series[float]) -> dict[str, str]:
     """How many, mean (sd) and best, in dB."""
-    psnr = psnr.dropna()
-    return {"n": str(len(psnr)), "PSNR [dB]": mean_sd(psnr, 2), "best": f"{psnr.max():.2f}" if len(psnr) else "-"}
+    best = f"{psnr.max():.2f}" if psnr.count() else "-"
+    return {"n": str(psnr.count()), "PSNR [dB]": mean_sd(psnr, 2), "best": best}
 
 
 def _counted(gain: Difference) -> str:
     return f"{gain.text()} ({gain.pairs})" if gain.pairs else "-"
-
-
-def _figures(benchmark: str | None, views: int, method: str) -> str:
-    return _either("{:.2f} / {:.3f} / {:.3f}".format(*figures) for figures in published(benchmark, views, method))
-
-
-def _printed(benchmark: str | None, views: int, method: str, base: str) -> str:
-    found = published_differences(benchmark, views, method, base) if method != base else []
-    return _either(f"{value:+.2f}" for value in found)
-
-
-def _either(texts: Iterable[str]) -> str:
-    return " or ".join(texts) or "-"
