@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import sys
 from dataclasses import replace
 
 import cv2
@@ -225,3 +226,21 @@ def test_each_bench_has_its_own_help(name, capsys):
     assert f"usage: kgs bench {name} " in said
     assert "-o PATH, --out PATH" in said
     assert f"kgs bench {name} -o" in said
+
+
+def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, capsys):
+    assert run("fit", folder, "-o", tmp_path, "--steps", 40, "--init", "random", "--init-points", 50) == 0
+    said = capsys.readouterr()
+    assert len([line for line in said.err.splitlines() if line.startswith("fit: ")]) == 10
+    assert "\r" not in said.err
+    assert f"kgs render {tmp_path}/splat.ply --cameras {folder}" in said.out
+    assert f"kgs eval {tmp_path}" in said.out
+
+
+@pytest.mark.parametrize("package", ["tyro", "matplotlib", "safetensors"])
+def test_a_missing_extra_is_one_line_before_any_work(folder, tmp_path, package, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert run("fit", folder, "-o", tmp_path / "out") == 2
+    said = one_line(capsys)
+    assert f'{package} is missing: run pip install -e ".[app]" in a clone of kgs' in said
+    assert not (tmp_path / "out").exists()

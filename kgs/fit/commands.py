@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from kgs.errors import DataError
 
-from .config import FitConfig
+from .config import DEMO, FitConfig
 from .progress import say
 
 __all__ = ["demo", "evaluate", "fit", "render"]
@@ -27,7 +27,7 @@ _SMALLEST = 12  # pixels a side: the window of SSIM
 def demo(
     *,
     out: Path = Path("demo"),
-    steps: int = 1200,
+    steps: int = DEMO.steps,
     size: tuple[int, int] = (54, 72),
     seed: int = 0,
     device: str = "cpu",
@@ -47,7 +47,7 @@ def demo(
     """
     from kgs.datasets import synthetic_scene
 
-    from .demo import DEMO, run_demo
+    from .demo import run_demo
 
     config = replace(DEMO, seed=seed, steps=steps, device=device)
     if min(size) < _SMALLEST:

@@ -14,7 +14,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-__all__ = ["FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
+__all__ = ["DEMO", "FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
 
 _MIN_DENSIFICATIONS = 20
 
@@ -250,4 +250,15 @@ FAST = FitConfig(
     max_gaussians=14_000,
     growth=0.8,
     recipe=Recipe(lr_means=3e-4, lr_scales=0.01, lr_sh_dc=0.005, lr_sh_rest=2.5e-4),
+)
+
+# Small pictures, many Gaussians and raised rates: a minute is then enough to overfit, which is what is to be shown.
+DEMO = FitConfig(
+    steps=1200,
+    drop=0.2,
+    init="sift",
+    max_gaussians=3000,
+    recipe=Recipe(
+        lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4
+    ),
 )

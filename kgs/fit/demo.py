@@ -11,26 +11,14 @@ from typing import Any
 from kgs.datasets.scene import Scene
 from kgs.ply import save_ply
 
-from .config import FitConfig, Recipe
-from .figures import side_by_side, write_curve
-from .outputs import check_folder, write_json, write_png
+from .config import DEMO, FitConfig
+from .figures import write_curve, write_sheet
+from .outputs import check_folder, write_json
 from .progress import each, say
 from .run import choose_points, measure, train
 from .trainer import Trainer
 
-__all__ = ["DEMO", "run_demo"]
-
-
-# Small pictures, many Gaussians and raised rates: a minute is then enough to overfit, which is what is to be shown.
-DEMO = FitConfig(
-    steps=1200,
-    drop=0.2,
-    init="sift",
-    max_gaussians=3000,
-    recipe=Recipe(
-        lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4
-    ),
-)
+__all__ = ["run_demo"]
 
 
 def run_demo(scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable[[str], None] = say) -> dict[str, Any]:
@@ -66,5 +54,5 @@ def run_demo(scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable
     write_curve(out / "curve.png", curves)
     levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs["without"]["test"]["views"]]
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
-    write_png(out / "demo.png", side_by_side(scene.test, renders, sorted(worst)))
+    write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
     return runs

@@ -1,4 +1,4 @@
-"""Pictures about a fit: renders beside their photos, and the curve of a training."""
+"""Pictures about a fit: renders beside their photos, and the curve of a training. The caller's pyplot is left alone."""
 
 from __future__ import annotations
 
@@ -6,57 +6,49 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Views
 
 from .outputs import write_whole
 
-__all__ = ["side_by_side", "write_curve"]
+__all__ = ["write_curve", "write_sheet"]
 
-LEGIBLE = 200  # pixels; narrower pictures are enlarged on a sheet
+_DPI = 120
 
 
-def side_by_side(views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> Tensor:
-    """Pictures of some views, one row per view: the photo, then one column per method, each with its title.
+def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:
+    """Write pictures of some views, one row per view: the photo, then one column per method, each with its title.
 
     Args:
+        path: the PNG to write.
         views: where the photos are.
         columns: title to renders `(3, H, W)` of all views.
         indices: the views to show.
 
-    Returns:
-        `(3, H', W')`; small pictures are enlarged by a whole factor.
+    Raises:
+        ImportError: matplotlib is missing.
     """
-    gap, header, rows = 4, 18, []
-    enlarge = max(1, -(-LEGIBLE // views.images.shape[-1]))
-    for i in indices:
-        pictures = torch.stack([views.images[i], *(renders[i].cpu().clamp(0, 1) for renders in columns.values())])
-        pictures = torch.nn.functional.interpolate(pictures, scale_factor=enlarge, mode="bicubic").clamp(0, 1)
-        rows.append(torch.cat([torch.nn.functional.pad(p, (0, gap, 0, gap), value=1.0) for p in pictures], 2))
-    sheet = torch.nn.functional.pad(torch.cat(rows, 1)[:, :-gap, :-gap], (0, 0, header, 0), value=1.0)
-    canvas = np.ascontiguousarray((sheet.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
-    width = views.images.shape[-1] * enlarge + gap
-    for k, title in enumerate(["photo, not used in training", *columns]):
-        cv2.putText(canvas, title, (k * width + 2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
-    return torch.from_numpy(canvas).permute(2, 0, 1) / 255
+    height, width = views.images.shape[-2:]
+    pictures = {"photo, not used in training": list(views.images), **columns}
+    figure = _figure(3 * len(pictures), 3 * height / width * len(indices) + 0.3)
+    for row, axes in zip(indices, figure.subplots(len(indices), len(pictures), squeeze=False), strict=True):
+        for cell, (title, images) in zip(axes, pictures.items(), strict=True):
+            cell.imshow(images[row].cpu().clamp(0, 1).permute(1, 2, 0).numpy(), interpolation="bicubic")
+            cell.set_axis_off()
+            if row == indices[0]:
+                cell.set_title(title, fontsize="medium")
+    _write(path, figure)
 
 
 def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
     """Plot test and training PSNR against seconds of training, one colour per run.
 
-    The caller's pyplot and its backend are left alone.
-
     Raises:
         ImportError: matplotlib is missing.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
+    figure = _figure(6, 4)
     axes = figure.subplots()
     for k, (name, curve) in enumerate(runs.items()):
         seconds = [point["seconds"] for point in curve]
@@ -68,7 +60,17 @@ def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
     axes.set_ylabel("PSNR [dB]")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
+    _write(path, figure)
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    return FigureCanvasAgg(Figure((width, height), layout="constrained")).figure
+
+
+def _write(path: Path, figure: Any) -> None:
     content = BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(content, format="png", dpi=120, metadata={"Software": "kgs"})
+    figure.savefig(content, format="png", dpi=_DPI, metadata={"Software": "kgs"})
     write_whole(path, content.getvalue())

@@ -102,10 +102,9 @@ def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse
     back = torch.linalg.inv(intrinsics[view])
     image, target = grey[view, 0], grey[other, 0]
     mean, variance = _moments(image)
-    found = torch.empty(len(inverse), height, width)
+    found, turn = torch.empty(len(inverse), height, width), rotation.clone()
     for plane, value in enumerate(inverse.tolist()):
-        turn = rotation.clone()
-        turn[:, 2] += value * shift
+        turn[:, 2] = rotation[:, 2] + value * shift
         homography = intrinsics[other] @ turn @ back
         warped, inside = (_warp(layer, homography) for layer in (target, torch.ones_like(target)))
         there, spread = _moments(warped)
