@@ -114,16 +114,11 @@ def read_image(path: Path) -> Image:
     size = image_size(path, data)
     premultiplied = False
     try:
-        if data.startswith(b"\xff\xd8"):  # OpenCV only prints what is wrong with a JPEG, and gives it in wrong colours
-            image = kornia_io.decode_image_jpegturbo(plain_jpeg(data), "rgb")
-        else:
-            if data.startswith((b"II", b"MM")):
-                data, premultiplied = plain_tiff(data)
-            image = _decode(np.frombuffer(data, np.uint8))
+        if data.startswith((b"II", b"MM")):
+            data, premultiplied = plain_tiff(data)
+        image = _decode(data)
     except ValueError as error:
         raise DataError(path, "", str(error)) from error
-    except Exception as error:  # kornia_rs has no error of its own
-        raise DataError(path, "", "the JPEG is damaged, or has other colours than grey or RGB") from error
     if image.shape[1::-1] != size:
         raise DataError(path, "", f"expected {size} pixels as its header says, got {image.shape[1::-1]}")
     result = np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
@@ -132,12 +127,16 @@ def read_image(path: Path) -> Image:
     return result
 
 
-def _decode(data: NDArray[np.uint8]) -> NDArray[np.uint8 | np.uint16]:
-    """RGB or RGBA of the bytes of an image; a ValueError where OpenCV cannot decode them."""
+def _decode(data: bytes) -> NDArray[np.uint8 | np.uint16]:
+    """RGB or RGBA of the bytes of an image; a ValueError where they cannot be decoded."""
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise ValueError(f"OpenCV cannot decode this image ({error.err})") from error
+        if data.startswith(b"\xff\xd8"):  # OpenCV only prints what is wrong with a JPEG, and gives it in wrong colours
+            return np.asarray(kornia_io.decode_image_jpegturbo(plain_jpeg(data), "rgb"))
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (ValueError, MemoryError):
+        raise
+    except Exception as error:  # cv2.error; kornia_rs has no error of its own
+        raise ValueError("the image is damaged, or has other colours than grey or RGB") from error
     if image is None:
         raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
     channels = image.shape[2] if image.ndim == 3 else 1

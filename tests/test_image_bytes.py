@@ -86,7 +86,7 @@ def test_jpegs_that_libjpeg_warns_of_are_refused(
         cv2.imdecode(np.frombuffer(damaged, np.uint8), cv2.IMREAD_UNCHANGED)
         if capfd.readouterr().err:
             warned += 1
-            with pytest.raises(DataError, match=r"a\.jpg: the JPEG"):
+            with pytest.raises(DataError, match=r"a\.jpg: the (image is damaged|JPEG ends)"):
                 read_image(stored(tmp_path / "a.jpg", damaged))
     assert warned >= 8
 
