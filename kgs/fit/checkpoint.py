@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,10 @@ from kgs.json_files import parse_json
 from .config import FitConfig
 
 __all__ = [
+    "PLAIN",
     "check_state",
     "fingerprint",
     "load_checkpoint",
-    "load_moments",
     "newest_checkpoint",
     "previous",
     "save_checkpoint",
@@ -151,8 +151,8 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
     return {"training": of(scene.train), "test": of(scene.test), "background": _digest(scene.background)}
 
 
-def check_state(state: dict[str, Any], scene: Scene, config: FitConfig) -> list[str]:
-    """Make sure that a state belongs to this fit and that its plain values can be used.
+def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
+    """Make sure that a state belongs to the fit of this fingerprint and configuration, and can be used.
 
     Returns:
         Notes for the user: what it means that the fit goes on for more steps than it was begun with, if it does.
@@ -160,24 +160,14 @@ def check_state(state: dict[str, Any], scene: Scene, config: FitConfig) -> list[
     Raises:
         ValueError: an entry is missing or wrong, or the scene or the configuration is another.
     """
-    views = len(scene.train)
-    for name, expected, is_right in (
-        ("config", "settings", lambda v: isinstance(v, dict) and _is_int(v.get("steps"), 1, 2**48)),
-        ("init", "a kind and a number of points", _is_init),
-        ("step", "a number of steps", lambda v: _is_int(v, 0, state["config"]["steps"])),
-        ("seconds", "a number, not negative", lambda v: _is_number(v) and v >= 0),
-        ("curve", "a list of measurements", lambda v: isinstance(v, list) and all(map(_is_point, v))),
-        ("notes", "a list of texts", lambda v: isinstance(v, list) and all(isinstance(x, str) for x in v)),
-        ("extent", "a number above 0", lambda v: _is_number(v) and v > 0),
-        ("near_plane", "a number above 0", lambda v: _is_number(v) and v > 0),
-        ("sh_degree", "a degree of the harmonics", lambda v: _is_int(v, 0, config.sh_degree)),
-        ("stack", "views", lambda v: isinstance(v, list) and all(_is_int(x, 0, views - 1) for x in v)),
-    ):
+    for name, (expected, is_right) in PLAIN.items():
         if name not in state or not is_right(state[name]):
             got = f"{str(state[name])[:80]!r}" if name in state else "none"
             raise ValueError(f"{name}: expected {expected}, got {got}")
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
+    if not _is_int(steps, done):
+        raise ValueError(f"step: expected at most the {steps!r} of the configuration, got {done}")
     if steps == done < config.steps:
         asked["steps"] = steps
         notes.append(
@@ -189,27 +179,10 @@ def check_state(state: dict[str, Any], scene: Scene, config: FitConfig) -> list[
         wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
         raise ValueError(f"--steps: expected {wanted} got {config.steps}")
     _compare_settings(state["config"], asked)
-    _compare_scenes(state.get("scene"), fingerprint(scene))
+    _compare_scenes(state["scene"], scene)
+    if max(state["stack"], default=0) >= len(scene["training"]["names"]):
+        raise ValueError(f"stack: expected views of the scene, got {state['stack']!s:.80}")
     return notes
-
-
-def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Put Adam's steps and moments in place, by the names of the groups; shapes and signs are checked.
-
-    Raises:
-        ValueError: they are not those of the optimiser's parameters.
-    """
-    groups, found = optimizer.state_dict()["param_groups"], {}
-    for group, held in zip(groups, optimizer.param_groups, strict=True):
-        shape, moments = held["params"][0].shape, state[group["name"]]
-        if moments:
-            shapes = {"step": torch.Size(()), "exp_avg": shape, "exp_avg_sq": shape}
-            if {key: value.shape for key, value in moments.items()} != shapes or any(
-                bool((moments[key] < 0).any()) for key in ("step", "exp_avg_sq")
-            ):
-                raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
-            found[group["params"][0]] = moments
-    optimizer.load_state_dict({"state": found, "param_groups": groups})
 
 
 def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], flag: str = "--") -> None:
@@ -275,18 +248,31 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+def _is_int(value: Any, least: int) -> bool:
+    return type(value) is int and least <= value < 2**48
 
 
-def _is_int(value: Any, least: int, most: int) -> bool:
-    return type(value) is int and least <= value <= most
+def _is_number(value: Any, least: float = -1e300) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value < 1e300
 
 
-def _is_init(value: Any) -> bool:
-    return isinstance(value, dict) and value.keys() == {"kind", "points"} and _is_int(value["points"], 1, 2**48)
+def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(map(is_right, value))
 
 
 def _is_point(value: Any) -> bool:
     keys = {"step", "seconds", "test_psnr", "train_psnr"}
     return isinstance(value, dict) and value.keys() == keys and all(x is None or _is_number(x) for x in value.values())
+
+
+# The plain values of a fit's state, what is expected of each, and whether it is so.
+PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "init": ("kind and number of first points", lambda v: v.keys() == {"kind", "points"} and _is_int(v["points"], 1)),
+    "step": ("a number of steps", lambda v: _is_int(v, 0)),
+    "seconds": ("a number, not negative", lambda v: _is_number(v, 0)),
+    "curve": ("a list of measurements", lambda v: _is_list(v, _is_point)),
+    "notes": ("a list of texts", lambda v: _is_list(v, lambda x: isinstance(x, str))),
+    "extent": ("a number above 0", lambda v: _is_number(v, 1e-300)),
+    "near_plane": ("a number above 0", lambda v: _is_number(v, 1e-300)),
+    "stack": ("a list of views", lambda v: _is_list(v, lambda x: _is_int(x, 0))),
+}

@@ -98,7 +98,7 @@ def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
     path = out / CHECKPOINT
     state, _ = newest_checkpoint(path)
     try:
-        model = GaussianModel(**state["model"], sh_degree=state["sh_degree"]).to(device)
+        model = GaussianModel(**state["model"]).to(device)
         return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]))
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error

@@ -26,7 +26,8 @@ from kgs.losses import TargetMoments, opacity_l1, photometric_loss, target_momen
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .checkpoint import check_state, fingerprint, load_moments, newest_checkpoint, save_checkpoint
+from .adam import adam, load_moments, moments_of
+from .checkpoint import PLAIN, check_state, fingerprint, newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
 from .machine import check_device
@@ -35,23 +36,12 @@ from .starts import FirstPoints, typical_depths
 
 __all__ = ["Trainer"]
 
-_GROUPS = {
-    "means": "lr_means",
-    "quats": "lr_quats",
-    "log_scales": "lr_scales",
-    "opacity_logits": "lr_opacity",
-    "sh_dc": "lr_sh_dc",
-    "sh_rest": "lr_sh_rest",
-}
 # Measured, with some room; the first is what libraries load when they are used for the first time.
-_ROOM, _LITTLE = 1.25, "--max-gaussians"
 _BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 
 
 class Trainer:
-    """Fits Gaussians to the training views of a scene.
-
-    Nothing that is fitted depends on the test views; they are rendered for the curve alone.
+    """Fits Gaussians to the training views of a scene; the test views are rendered for the curve alone.
 
     Args:
         scene: posed training and test views.
@@ -66,6 +56,7 @@ class Trainer:
         seconds: time spent in training steps; evaluations are not counted.
         notes: lines that a user should read (a capped count, for instance).
         saved: the last checkpoint that was written or read, in words; "" before the first.
+        init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
         order, stack: the random stream of views, and the views that still come before it is asked again.
     """
 
@@ -77,7 +68,8 @@ class Trainer:
         self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
         model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree)
         model.sh_degree = 0
-        self._build(model, config.recipe.near_plane * nearest)
+        self.near_plane = config.recipe.near_plane * nearest
+        self._build(model)
 
     def _prepare(self, scene: Scene, config: FitConfig) -> None:
         """All that follows from the scene and the configuration alone."""
@@ -88,22 +80,18 @@ class Trainer:
         self.notes: list[str] = []
         self.saved = ""
         self.stack: list[int] = []
+        self._fingerprint = fingerprint(scene)
         self._background = scene.background.to(self.device, torch.float32)
         self._views = self._targets(scene.train)
         self._coarse_views = self._targets(scene.train.halved()) if self.times.coarse else []
 
-    def _build(self, model: GaussianModel, near_plane: float) -> None:
-        config, recipe = self.config, self.config.recipe
-        first = int(self.init["points"])
-        self.max_gaussians = max(10 * config.steps, 2 * first) if config.max_gaussians is None else config.max_gaussians
+    def _build(self, model: GaussianModel) -> None:
+        config, recipe, most = self.config, self.config.recipe, self.config.max_gaussians
+        self.max_gaussians = max(10 * config.steps, 2 * self.init["points"]) if most is None else most
         self.model = model.to(self.device)
-        groups = [
-            {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, rate), "name": name}
-            for name, rate in _GROUPS.items()
-        ]
-        self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
-        self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=_seed(config, 1)) if config.drop else None
-        self.renderer = GaussianRenderer(self.drop, near_plane=near_plane, max_bytes=config.max_bytes).train()
+        self.optimizer = adam(self.model, recipe)
+        self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=10 * config.seed + 1) if config.drop else None
+        self.renderer = GaussianRenderer(self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes).train()
         self.densifier = Densifier(
             self.model,
             self.optimizer,
@@ -112,17 +100,15 @@ class Trainer:
             percent_dense=recipe.percent_dense,
             prune_opacity=recipe.prune_opacity,
             max_gaussians=self.max_gaussians,
-            generator=torch.Generator().manual_seed(_seed(config, 2)),
+            generator=torch.Generator().manual_seed(10 * config.seed + 2),
         )
-        self.order = torch.Generator().manual_seed(_seed(config, 3))
+        self.order = torch.Generator().manual_seed(10 * config.seed + 3)
 
     def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
         """What a step needs of each view: its camera, its image and what D-SSIM wants of that."""
-        targets = []
-        for i in range(len(views)):
-            image = views.images[i : i + 1].to(self.device, torch.float32)
-            targets.append((move_camera(views.camera(i), self.device), image, target_moments(image)))
-        return targets
+        images = [views.images[i : i + 1].to(self.device, torch.float32) for i in range(len(views))]
+        cameras = [move_camera(views.camera(i), self.device) for i in range(len(views))]
+        return [(camera, image, target_moments(image)) for camera, image in zip(cameras, images, strict=True)]
 
     @property
     def most_bytes(self) -> int:
@@ -131,9 +117,8 @@ class Trainer:
         The renderer's budget, and for each Gaussian of the largest number the parameters, gradients, Adam's moments,
         their copies while densifying, and what projection and harmonics keep for their backward passes.
         """
-        images = self.scene.train.images
-        loss = images[:1].numel() * images.element_size() * _IMAGES_OF_THE_LOSS
-        gaussians = self.max_gaussians * _BYTES_PER_GAUSSIAN
+        images, gaussians = self.scene.train.images, self.max_gaussians * _BYTES_PER_GAUSSIAN
+        loss = images[:1].nbytes * _IMAGES_OF_THE_LOSS
         return _BYTES_AT_FIRST_USE + self.config.max_bytes + gaussians + loss + 4 * images.nbytes
 
     def fit(self, callback: Callable[[Trainer, float], bool] | None = None) -> None:
@@ -153,10 +138,7 @@ class Trainer:
                 return
 
     def train_step(self) -> float:
-        """One step and all that is due after it: a point of the curve, a densification, a reset of the opacities.
-
-        Returns:
-            The loss.
+        """One step and all that is due after it (curve, densification, reset of the opacities); returns the loss.
 
         Raises:
             TrainingDiverged: see :meth:`fit`.
@@ -165,24 +147,20 @@ class Trainer:
         if self.step >= self.config.steps:
             raise ValueError(f"steps: expected a step of {self.config.steps} to be left, got none")
         start = time.perf_counter()
-        loss = self._descend()
-        step = self.step
+        loss, step = self._descend(), self.step
         self.seconds += time.perf_counter() - start
         if step in self.times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
-            point = {"step": step, "seconds": round(self.seconds, 3)}
-            self.curve.append(
-                point | {"test_psnr": self.psnr(self.scene.test), "train_psnr": self.psnr(self.scene.train)}
-            )
+            levels = {"test_psnr": self.psnr(self.scene.test), "train_psnr": self.psnr(self.scene.train)}
+            self.curve.append({"step": step, "seconds": round(self.seconds, 3), **levels})
         start = time.perf_counter()
         if step in self.times.densify:
             self._stop_if(scale_fault(self.model, self.extent))
-            self.densifier.max_gaussians = limit = self._limit()
-            capped, first = self.densifier.step().capped, int(self.init["points"])
-            if capped and limit == self.max_gaussians < _ROOM * first and not any(_LITTLE in n for n in self.notes):
-                self.notes.append(
-                    f"step {step}: {_LITTLE} {self.max_gaussians} leaves little room beside the {first} first points: "
-                    f"{capped} Gaussians that should have been cloned or split were not"
-                )
+            first, most, growing = self.init["points"], self.max_gaussians, self.config.growth * self.config.steps
+            share = min(1.0, step / growing) if growing else 1.0
+            self.densifier.max_gaussians = first + round(share * (most - first))
+            little = f"--max-gaussians {most} leaves little room beside the {first} first points"
+            if self.densifier.step().capped and share == 1.0 and most < 1.25 * first and little not in self.notes:
+                self.notes.append(little)
         if step in self.times.reset:
             self.densifier.reset_opacity(self.config.recipe.reset_opacity)
         self.seconds += time.perf_counter() - start
@@ -198,35 +176,23 @@ class Trainer:
 
     def psnr(self, views: Views) -> float | None:
         """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
-        values = [
-            float(psnr(self.render(views.camera(i)).clamp(0, 1).cpu(), views.images[i : i + 1].float(), 1.0))
-            for i in range(len(views))
-        ]
+        renders = (self.render(views.camera(i)).clamp(0, 1).cpu() for i in range(len(views)))
+        values = [float(psnr(image, views.images[i : i + 1].float(), 1.0)) for i, image in enumerate(renders)]
         mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
         return round(mean, 4) if math.isfinite(mean) else None
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the rest of the fit depends on, copied: nested dicts of tensors and plain values."""
-        moments = self.optimizer.state
-        state = {
+        parts = {
             "config": self.config.to_dict(),
-            "scene": fingerprint(self.scene),
-            "init": self.init,
-            "step": self.step,
-            "seconds": self.seconds,
-            "curve": self.curve,
-            "notes": self.notes,
-            "extent": self.extent,
-            "near_plane": self.renderer.near_plane,
-            "sh_degree": self.model.sh_degree,
-            "stack": self.stack,
+            "scene": self._fingerprint,
             "model": self.model.state_dict(),
-            "optimizer": {group["name"]: moments.get(group["params"][0], {}) for group in self.optimizer.param_groups},
+            "optimizer": moments_of(self.optimizer),
             "densifier": self.densifier.state_dict(),
             "order": self.order.get_state(),
             "drop": None if self.drop is None else self.drop.get_rng_state(),
         }
-        return copy.deepcopy(state)
+        return copy.deepcopy(parts | {name: getattr(self, name) for name in PLAIN})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from where :meth:`state_dict` was taken, bit for bit; on another device if need be.
@@ -239,13 +205,14 @@ class Trainer:
                 cannot be used any more.
         """
         try:
-            longer = check_state(state, self.scene, self.config)
-            self.init, self.extent = dict(state["init"]), state["extent"]
-            model = GaussianModel(**state["model"], sh_degree=state["sh_degree"])
+            longer = check_state(state, self._fingerprint, self.config)
+            vars(self).update(copy.deepcopy({name: state[name] for name in PLAIN}))
+            self.notes += longer
+            model = GaussianModel(**state["model"])
             if model.max_sh_degree != self.config.sh_degree or model.means.dtype != torch.float32:
                 raise ValueError(f"model: expected float32 and harmonics of degree {self.config.sh_degree}, got others")
-            self._build(model, state["near_plane"])
-            load_moments(self.optimizer, state["optimizer"])
+            self._build(model)
+            load_moments(self.optimizer, copy.deepcopy(state["optimizer"]))
             self.densifier.load_state_dict(state["densifier"])
             self.order.set_state(state["order"])
             if self.drop is not None:
@@ -254,8 +221,6 @@ class Trainer:
             raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
         except (AttributeError, RuntimeError, TypeError) as error:
             raise ValueError(f"state: {error}") from error
-        self.step, self.seconds, self.stack = state["step"], state["seconds"], list(state["stack"])
-        self.curve, self.notes = [dict(point) for point in state["curve"]], [*state["notes"], *longer]
 
     def save(self, path: Path) -> None:
         """Write :meth:`state_dict` to a file, see :func:`save_checkpoint`.
@@ -268,9 +233,7 @@ class Trainer:
 
     @classmethod
     def resume(cls, scene: Scene, config: FitConfig, path: Path) -> Trainer:
-        """Continue from a checkpoint, bit for bit as if there had been no interruption.
-
-        Where the file is damaged the previous one is taken, and `notes` says so.
+        """Continue from a checkpoint bit for bit; where it is damaged from the one before, and `notes` says so.
 
         Raises:
             DataError: both files are damaged, or they belong to another scene or configuration.
@@ -308,8 +271,8 @@ class Trainer:
         image = out.image.masked_fill(out.image > 1, 1.0)  # it is never below 0
         loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments)
         if config.opacity_l1:
-            by = "low-gradient" if config.opacity_l1_by == "gradient" else "far"
-            scores = gaussian_scores(by, self.densifier, camera)
+            low = config.opacity_l1_by == "gradient"
+            scores = gaussian_scores("low-gradient" if low else "far", self.densifier, camera)
             loss = loss + config.opacity_l1 * opacity_l1(gaussians.opacities, scores)
         value = float(loss.detach())
         if int(out.projected.num_nonfinite):
@@ -331,17 +294,7 @@ class Trainer:
             last = f"the last good checkpoint is {self.saved}" if self.saved else "there is no checkpoint yet"
             raise TrainingDiverged(f"step {self.step}: {fault}; {last}")
 
-    def _limit(self) -> int:
-        """How many Gaussians there may be after this step."""
-        first, growing = int(self.init["points"]), self.config.growth * self.config.steps
-        share = min(1.0, self.step / growing) if growing else 1.0
-        return first + round(share * (self.max_gaussians - first))
-
     def _next_view(self) -> int:
         if not self.stack:
             self.stack = torch.randperm(len(self._views), generator=self.order).tolist()
         return self.stack.pop()
-
-
-def _seed(config: FitConfig, stream: int) -> int:
-    return config.seed * 10 + stream

@@ -1,0 +1,55 @@
+"""Adam with a learning rate for each parameter of the Gaussians, and its moments by their names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kgs.model import GaussianModel
+
+from .config import Recipe
+
+__all__ = ["adam", "load_moments", "moments_of"]
+
+_RATES = {
+    "means": "lr_means",
+    "quats": "lr_quats",
+    "log_scales": "lr_scales",
+    "opacity_logits": "lr_opacity",
+    "sh_dc": "lr_sh_dc",
+    "sh_rest": "lr_sh_rest",
+}
+
+
+def adam(model: GaussianModel, recipe: Recipe) -> torch.optim.Adam:
+    """The optimiser of a model: one group per parameter, that of the means first."""
+    groups = [
+        {"params": [model.get_parameter(name)], "lr": getattr(recipe, rate), "name": name}
+        for name, rate in _RATES.items()
+    ]
+    return torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
+
+
+def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Tensor]]:
+    """Step and moments of each group by its name; an empty dict where it had no gradient yet."""
+    return {group["name"]: optimizer.state.get(group["params"][0], {}) for group in optimizer.param_groups}
+
+
+def load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
+    """The inverse of `moments_of`; shapes and signs are checked, as torch does not.
+
+    Raises:
+        ValueError: they are not those of the optimiser's parameters.
+    """
+    groups, found = optimizer.state_dict()["param_groups"], {}
+    for group, held in zip(groups, optimizer.param_groups, strict=True):
+        shape, state = held["params"][0].shape, moments[group["name"]]
+        if state:
+            shapes = {"step": (), "exp_avg": shape, "exp_avg_sq": shape}
+            negative = [name for name in ("step", "exp_avg_sq") if bool((state[name] < 0).any())]
+            if negative or {name: tuple(value.shape) for name, value in state.items()} != shapes:
+                raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
+            found[group["params"][0]] = state
+    optimizer.load_state_dict({"state": found, "param_groups": groups})

@@ -1,0 +1,211 @@
+"""The folder of a fit: one fit at a time, and old results that stay whole until the new ones are."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kgs.datasets.synthetic import synthetic_scene
+from kgs.errors import DataError, TrainingDiverged
+from kgs.fit import folder, run
+from kgs.fit.checkpoint import load_checkpoint
+from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.folder import CHECKPOINT, UNFINISHED, locked
+from kgs.fit.run import fit_scene
+from kgs.fit.settings import load_fit
+from kgs.fit.starts import FirstPoints
+from kgs.fit.trainer import Trainer
+
+CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))
+OTHER = replace(CONFIG, seed=1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    return synthetic_scene(train_views=3, test_views=2, size=(24, 32), seed=0)
+
+
+@pytest.fixture(autouse=True)
+def _few_points(monkeypatch: Any) -> None:
+    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
+    first = FirstPoints(points, torch.full((150, 3), 0.5), "random")
+    monkeypatch.setattr(run, "choose_points", lambda *_: first)
+
+
+def fit(scene: Any, config: FitConfig, out: Path, **options: Any) -> list[str]:
+    """Fit; the lines that were said."""
+    lines: list[str] = []
+    request = {"scene": "/photos", "train_views": 3, "downscale": None, "background": "black"}
+    fit_scene(scene, config, out, say=lines.append, request=request, **options)
+    return lines
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def seed_of(out: Path) -> int:
+    """The seed of the set of files, the same in all of them."""
+    config, metrics = (json.loads((out / name).read_text()) for name in ("config.json", "metrics.json"))
+    assert config["fit"]["seed"] == metrics["seed"] == load_checkpoint(out / CHECKPOINT)["config"]["seed"]
+    assert load_fit(out).model.means.shape[0] == metrics["gaussians"]
+    return int(metrics["seed"])
+
+
+def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(DataError, match="another fit is at work in this folder.*--out"):
+        fit(scene, CONFIG, tmp_path)
+    fit(scene, CONFIG, tmp_path)
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
+    code = "import sys, time\nfrom pathlib import Path\nfrom kgs.fit.folder import locked\n"
+    code += "with locked(Path(sys.argv[1])):\n    print('locked', flush=True)\n    time.sleep(600)"
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"locked\n"
+    with pytest.raises(DataError, match="another fit"), locked(tmp_path):
+        pass
+    process.kill()
+    process.wait()
+    with locked(tmp_path):
+        pass
+
+
+def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    fit(scene, CONFIG, tmp_path)
+    before = contents(tmp_path)
+    monkeypatch.setattr("kgs.fit.trainer.gradient_fault", lambda model: "expected finite gradients")
+    with pytest.raises(TrainingDiverged, match="step 1.*no checkpoint yet"):
+        fit(scene, OTHER, tmp_path)
+    assert contents(tmp_path) == before
+    assert "unfinished" not in os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json"])
+def test_results_that_cannot_be_written_leave_the_old_ones(
+    scene: Any, tmp_path: Path, monkeypatch: Any, failing: str
+) -> None:
+    fit(scene, CONFIG, tmp_path)
+    plain = getattr(run, failing)
+
+    def full(path: Any, *arguments: Any, **options: Any) -> Any:
+        if failing == "write_json" and path.name != "metrics.json":
+            return plain(path, *arguments, **options)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run, failing, full)
+    with pytest.raises(OSError, match="space"):
+        fit(scene, OTHER, tmp_path)
+    assert seed_of(tmp_path) == 0
+    monkeypatch.undo()
+    assert fit(scene, OTHER, tmp_path, resume=True)[0] == "resumed at step 3"  # the training is not lost
+    assert seed_of(tmp_path) == 1
+
+
+@pytest.mark.parametrize("moves", [0, 1, 3, 7])
+def test_a_kill_while_files_are_moved(scene: Any, tmp_path: Path, monkeypatch: Any, moves: int) -> None:
+    fit(scene, CONFIG, tmp_path)
+    plain, done = os.replace, []
+
+    def killed(source: Any, target: Any) -> None:
+        if Path(source).name == UNFINISHED or done:
+            done.append(source)
+        if len(done) > moves:
+            raise KeyboardInterrupt
+        plain(source, target)
+
+    monkeypatch.setattr(folder.os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, OTHER, tmp_path)
+    monkeypatch.undo()
+    load_fit(tmp_path)  # ends the move
+    assert seed_of(tmp_path) == (0 if moves == 0 else 1)
+    assert not (tmp_path / "finished").exists()
+
+
+def test_no_pictures_or_checkpoints_of_the_former_fit_stay(scene: Any, tmp_path: Path) -> None:
+    fit(scene, CONFIG, tmp_path)
+    (tmp_path / "checkpoint.pt").write_bytes(b"kgs-checkpoint 2 ")
+    (tmp_path / "test" / "notes.txt").write_text("mine")
+    fit(replace(scene, test=scene.test.select([1])), OTHER, tmp_path)
+    assert len(list((tmp_path / "test").glob("*.png"))) == 1
+    assert (tmp_path / "test" / "notes.txt").exists()
+    assert not (tmp_path / "checkpoint.pt").exists()
+    assert seed_of(tmp_path) == 1
+
+
+def test_an_old_checkpoint_is_refused_in_one_line(scene: Any, tmp_path: Path) -> None:
+    (tmp_path / "checkpoint.pt").write_bytes(b"kgs-checkpoint 2 ")
+    with pytest.raises(DataError, match=r"checkpoint\.pt: is a checkpoint of an older version.*without --resume"):
+        fit(scene, CONFIG, tmp_path, resume=True)
+
+
+def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    fit(scene, CONFIG, tmp_path)
+    plain = Trainer._descend
+
+    def interrupted(self: Trainer) -> float:
+        if self.step == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return plain(self)
+
+    monkeypatch.setattr(Trainer, "_descend", interrupted)
+    lines = fit(scene, OTHER, tmp_path)
+    assert f"{tmp_path} keeps its finished fit" in lines[-1]
+    assert seed_of(tmp_path) == 0
+    assert seed_of(tmp_path / UNFINISHED) == 1
+    monkeypatch.undo()
+    assert fit(scene, OTHER, tmp_path, resume=True)[0] == "resumed at step 2"
+    assert seed_of(tmp_path) == 1
+    assert not (tmp_path / UNFINISHED).exists()
+
+
+def test_the_finished_fit_is_resumed_where_another_was_left_unfinished(scene: Any, tmp_path: Path) -> None:
+    fit(scene, CONFIG, tmp_path)
+    unfinished = Trainer(scene, OTHER, run.choose_points(scene, OTHER))
+    (tmp_path / UNFINISHED).mkdir()
+    unfinished.save(tmp_path / UNFINISHED / CHECKPOINT)
+    lines = fit(scene, replace(CONFIG, steps=5), tmp_path, resume=True)
+    assert lines[0] == "resumed at step 3"
+    assert "trained on from step 3" in lines[1]
+    assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 5
+
+
+@pytest.mark.parametrize("place", ["file", "file/out", "/proc/kgs"])
+def test_a_folder_that_cannot_be_written_to_is_refused_first(scene: Any, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DataError, match="expected a folder"):
+        fit(scene, CONFIG, tmp_path / place)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("place", [".", "images"])
+def test_results_do_not_go_among_the_scenes_files(scene: Any, tmp_path: Path, place: str) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "poses_bounds.npy").write_bytes(b"")
+    import cv2
+    import numpy as np
+
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((4, 4, 3), np.uint8))
+    before = contents(tmp_path)
+    with pytest.raises(DataError, match="holds files of a scene"):
+        fit(replace(scene, root=tmp_path), CONFIG, tmp_path / place)
+    assert contents(tmp_path) == before
+
+
+def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="device: expected"):
+        fit(scene, replace(CONFIG, device="foo"), tmp_path / "out")
+    with pytest.raises(DataError, match="expected at least 6x6 pixels, got 5x5"):
+        fit(synthetic_scene(train_views=2, size=(5, 5)), CONFIG, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,203 @@
+"""A resumed fit is the same fit; a finished one can be trained on; a loop of one's own works."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from kgs import DataError
+from kgs.fit import FirstPoints, FitConfig, Trainer
+from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
+from kgs.fit.config import Recipe
+
+CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
+
+
+@pytest.fixture(scope="module")
+def saved(scene, points, tmp_path_factory):
+    path = tmp_path_factory.mktemp("fit") / "checkpoint.safetensors"
+    trainer = Trainer(scene, CONFIG, points)
+    trainer.fit(lambda trainer, _: trainer.step == 2)
+    trainer.save(path)
+    return path
+
+
+def assert_same_bits(a, b):
+    for (name, one), (_, other) in zip(a.model.named_parameters(), b.model.named_parameters(), strict=True):
+        assert torch.equal(one, other), name
+
+
+def changed(scene, part, **changes):
+    """The scene with other values in one of its groups of views; "swap" exchanges the first two."""
+    views = getattr(scene, part)
+    cameras = views.cameras
+    values = {"images": views.images, "extrinsics": cameras.extrinsics, "intrinsics": cameras.intrinsics}
+    for name, change in changes.items():
+        values[name] = change(values[name].clone())
+    cameras = PinholeCamera(values["intrinsics"], values["extrinsics"], cameras.height, cameras.width)
+    return replace(scene, **{part: replace(views, cameras=cameras, images=values["images"])})
+
+
+def swap(tensor):
+    return tensor[[1, 0, *range(2, len(tensor))]]
+
+
+def nudge(tensor):
+    tensor.view(-1)[7] += 1e-6
+    return tensor
+
+
+@pytest.mark.parametrize("part", ["train", "test"])
+@pytest.mark.parametrize("change", [swap, nudge])
+@pytest.mark.parametrize(
+    ("name", "said"), [("images", "photos"), ("extrinsics", "poses"), ("intrinsics", "intrinsics")]
+)
+def test_another_photo_pose_or_matrix_is_named(scene, saved, part, change, name, said):
+    if name == "intrinsics" and change is swap:  # they are all the same
+        other = changed(scene, part, intrinsics=lambda k: k * torch.linspace(1, 1.1, len(k))[:, None, None])
+    else:
+        other = changed(scene, part, **{name: change})
+    with pytest.raises(DataError, match=f"{said} of the {part}.*views: expected those that the fit was begun with"):
+        Trainer.resume(other, CONFIG, saved)
+
+
+def test_other_views_masks_and_background_are_named(scene, saved):
+    views = scene.train
+    for other, said in (
+        (replace(scene, train=views.select([0, 1])), "names of the training views"),
+        (replace(scene, train=replace(views, masks=torch.ones(3, 1, 32, 40))), "masks of the training views"),
+        (replace(scene, background=torch.tensor([1.0, 1.0, 1.0])), "--background"),
+    ):
+        with pytest.raises(DataError, match=said):
+            Trainer.resume(other, CONFIG, saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "flag"),
+    [
+        ({"seed": 6}, "--seed: expected 5, as the fit was begun with, got 6"),
+        ({"drop": 0.0}, "--drop"),
+        ({"max_gaussians": 99}, "--max-gaussians"),
+        ({"recipe": Recipe(grad_threshold=2e-5)}, "--recipe.grad-threshold: expected 1e-05"),
+        ({"steps": 7}, "--steps: expected 6, as the fit was begun with, got 7"),
+        ({"steps": 1}, "--steps: expected 6"),
+    ],
+)
+def test_another_setting_is_named_by_its_flag(scene, saved, change, flag):
+    with pytest.raises(DataError, match=flag):
+        Trainer.resume(scene, replace(CONFIG, **change), saved)
+
+
+def test_a_fit_may_go_on_on_another_device(scene, saved):
+    resumed = Trainer.resume(scene, replace(CONFIG, device="cpu:0"), saved)
+    assert resumed.step == 2
+    streams = [resumed.order.get_state(), resumed.drop.get_rng_state(), resumed.densifier.generator.get_state()]
+    assert {stream.device.type for stream in streams} == {"cpu"}
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_fit_goes_from_the_cpu_to_cuda_and_back(scene, saved, tmp_path):
+    there = Trainer.resume(scene, replace(CONFIG, device="cuda"), saved)
+    there.train_step()
+    there.save(tmp_path / "checkpoint.safetensors")
+    back = Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")
+    back.fit()
+    assert back.step == CONFIG.steps
+    assert all(bool(value.isfinite().all()) for value in back.model.parameters())
+
+
+def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    done = Trainer(scene, CONFIG, points)
+    done.fit()
+    done.save(path)
+    longer = replace(CONFIG, steps=9)
+    with pytest.raises(DataError, match="--steps: expected at least the 6 that are done, got 5"):
+        Trainer.resume(scene, replace(CONFIG, steps=5), path)
+    trainer = Trainer.resume(scene, longer, path)
+    assert [note for note in trainer.notes if "from step 6" in note and "fit of 9 steps from the start" in note]
+    trainer.fit(lambda trainer, _: trainer.step == 7)
+    assert trainer.drop.progress == 7 / 9
+    assert trainer.model.sh_degree == done.model.sh_degree  # nothing learned is switched off
+    trainer.save(path)
+    again = Trainer.resume(scene, longer, path)
+    assert again.notes == trainer.notes
+    trainer.fit()
+    again.fit()
+    assert_same_bits(trainer, again)
+    assert [point["step"] for point in again.curve] == [6, 9]
+
+
+def test_a_loop_of_ones_own(scene, points):
+    by_hand, whole = Trainer(scene, CONFIG, points), Trainer(scene, CONFIG, points)
+    whole.fit()
+    losses, kept = [], None
+    while by_hand.step < CONFIG.steps:
+        losses.append(by_hand.train_step())
+        if by_hand.step == 3:
+            kept = by_hand.state_dict()
+    assert_same_bits(by_hand, whole)
+    with pytest.raises(ValueError, match="steps"):
+        by_hand.train_step()
+    other = Trainer(scene, CONFIG, FirstPoints(points.points[:20], points.colors[:20], "random"))
+    for trainer in (other, by_hand):  # a fresh one, and back in time
+        trainer.load_state_dict(kept)
+        assert trainer.step == 3
+        assert [trainer.train_step() for _ in range(3)] == losses[3:]
+        assert_same_bits(trainer, whole)
+
+
+@pytest.mark.parametrize(
+    "name", ["config", "scene", "model", "optimizer", "densifier", "order", "drop", "step", "stack"]
+)
+@pytest.mark.parametrize("value", [None, 7, "gone", [], {}])
+def test_a_wrong_entry_is_a_data_error(scene, saved, tmp_path, name, value):
+    state = load_checkpoint(saved)
+    state[name] = value
+    if value == "gone":
+        del state[name]
+    if (name, value) in (("stack", []), ("stack", "gone"), ("step", 7)):
+        return
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    with pytest.raises(DataError, match=r"checkpoint\.safetensors"):
+        Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")
+
+
+@pytest.mark.parametrize("photo", [0.0, 1.0])
+def test_a_photo_that_is_met_exactly_ends_no_fit(scene, points, tmp_path, photo):
+    """All black over black, or white over white, with nothing of the scene in sight."""
+    away = scene.test.cameras.extrinsics.clone()
+    away[:, :3, 3] += torch.tensor([0.0, 0.0, -1e6])
+    cameras = scene.test.cameras
+    test = replace(
+        scene.test,
+        cameras=PinholeCamera(cameras.intrinsics, away, cameras.height, cameras.width),
+        images=torch.full_like(scene.test.images, photo),
+    )
+    trainer = Trainer(replace(scene, test=test, background=torch.full((3,), photo)), CONFIG, points)
+    trainer.fit()
+    assert trainer.curve[-1]["test_psnr"] is None
+    assert trainer.curve[-1]["train_psnr"] > 0
+    trainer.save(tmp_path / "checkpoint.safetensors")
+
+
+@pytest.mark.parametrize("photo", [0.0, 1.0])
+def test_photos_of_one_colour_can_be_fitted(scene, points, photo):
+    blank = replace(scene, train=replace(scene.train, images=torch.full_like(scene.train.images, photo)))
+    trainer = Trainer(blank, CONFIG, points)
+    trainer.fit()
+    assert trainer.step == CONFIG.steps
+
+
+def test_a_program_in_float64_fits_the_same_bits(scene, points, monkeypatch):
+    whole = Trainer(scene, CONFIG, points)
+    whole.fit()
+    torch.set_default_dtype(torch.float64)
+    try:
+        trainer = Trainer(scene, CONFIG, points)
+        trainer.fit()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert_same_bits(trainer, whole)
