@@ -94,3 +94,14 @@ def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
     (tmp_path / "cloud.xyz").write_text(rows)
     found = first_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
     np.testing.assert_allclose(found.points.numpy(), local, atol=1e-5)
+
+
+@pytest.mark.parametrize("damage", [(b"uchar red", b"uchar rod"), (b"uchar alpha", b"uchar alphb")])
+def test_colours_that_are_not_those_of_points_are_grey(tmp_path: Path, damage: tuple[bytes, bytes]) -> None:
+    points = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    content = trimesh.PointCloud(points, colors=np.full((5, 4), 200, np.uint8)).export(file_type="ply")
+    (tmp_path / "cloud.ply").write_bytes(content.replace(*damage))
+    result = first_points(flat(), "file", file=tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(result.points.numpy(), points)
+    assert result.colors.shape == (5, 3)
+    assert set(result.colors.flatten().tolist()) <= {0.5, float(torch.tensor(200.0) / 255)}

@@ -63,6 +63,7 @@ def _cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
     except Exception as error:  # each of trimesh's readers raises what its parser meets
         raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
     points = (points if origin is None else points - origin).float()
-    if len(values) != len(points):
+    colors = torch.tensor(values)
+    if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # none, or not those of points
         return points, torch.full((len(points), 3), 0.5)
-    return points, torch.tensor(values)[:, :3].float() / 255.0
+    return points, colors[:, :3].float() / 255.0
