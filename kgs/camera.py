@@ -79,21 +79,13 @@ Cameras = PinholeCamera | PosedCamera
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """One posed camera, reduced to what projection needs.
+    """One posed camera, reduced to what projection needs."""
 
-    Args:
-        extrinsics: world-to-camera, `(4, 4)`.
-        project: (world points, camera points), both `(M, 3)`, to pixels `(M, 2)`.
-        jacobian: camera points `(M, 3)` to the derivative of the pixel, `(M, 2, 3)`.
-        parallel: whether all rays have one direction (orthographic).
-        sees: camera points `(M, 3)` to whether they lie before the fold of the distortion, `(M,)`; None: all do.
-    """
-
-    extrinsics: Tensor
-    project: Callable[[Tensor, Tensor], Tensor]
-    jacobian: Callable[[Tensor], Tensor]
-    parallel: bool = False
-    sees: Callable[[Tensor], Tensor] | None = None
+    extrinsics: Tensor  # world-to-camera, (4, 4)
+    project: Callable[[Tensor, Tensor], Tensor]  # (world points, camera points), both (M, 3), to pixels (M, 2)
+    jacobian: Callable[[Tensor], Tensor]  # camera points to the derivative of the pixel, (M, 2, 3)
+    parallel: bool = False  # whether all rays have one direction (orthographic)
+    sees: Callable[[Tensor], Tensor] | None = None  # whether camera points lie before the fold, (M,); None: all do
 
 
 def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers: str = "integer") -> PinholeCamera:

@@ -82,24 +82,19 @@ class _FootprintFactors(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
         a, q, inverse_norm, s, turned = ctx.saved_tensors
-        d_rows: Tensor | None = None
-        d_quats: Tensor | None = None
-        d_scales: Tensor | None = None
+        found: list[Tensor | None] = [None, None, None]
         g = columns(grad)
         if ctx.needs_input_grad[2]:
-            d_scales = (turned * g).unflatten(0, (2, 3)).sum(0).t()
+            found[2] = (turned * g).unflatten(0, (2, 3)).sum(0).t()
         g = (g.unflatten(0, (2, 3)) * s).flatten(0, 1)
         if ctx.needs_input_grad[0]:
             r = _rotation_columns(q)
             parts = [_dot(g[3 * i : 3 * i + 3], r[3 * k : 3 * k + 3]) for i in (0, 1) for k in (0, 1, 2)]
-            d_rows = torch.stack(parts, 1).unflatten(1, (2, 3))
+            found[0] = torch.stack(parts, 1).unflatten(1, (2, 3))
         if ctx.needs_input_grad[1]:
-            d_quats = (
-                _quaternion_gradient(q, (a.unflatten(0, (2, 3, 1)) * g.unflatten(0, (2, 1, 3))).sum(0))
-                .mul_(inverse_norm)
-                .t()
-            )
-        return d_rows, d_quats, d_scales
+            d_rotations = (a.unflatten(0, (2, 3, 1)) * g.unflatten(0, (2, 1, 3))).sum(0)
+            found[1] = _quaternion_gradient(q, d_rotations).mul_(inverse_norm).t()
+        return tuple(found)
 
 
 def columns(rows: Tensor) -> Tensor:
@@ -125,14 +120,11 @@ def _quaternion_gradient(q: Tensor, d: Tensor) -> Tensor:
     px, py, pz = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]
     sxy, sxz, syz = d[0, 1] + d[1, 0], d[0, 2] + d[2, 0], d[1, 2] + d[2, 1]
     dx, dy, dz = (2 * (d[i, i] - d[0, 0] - d[1, 1] - d[2, 2]) for i in (0, 1, 2))
-    found = torch.stack(
-        [
-            x * px + y * py + z * pz,
-            w * px + x * dx + y * sxy + z * sxz,
-            w * py + y * dy + x * sxy + z * syz,
-            w * pz + z * dz + x * sxz + y * syz,
-        ]
-    ).mul_(2)
+    dw = x * px + y * py + z * pz
+    dx = w * px + x * dx + y * sxy + z * sxz
+    dy = w * py + y * dy + x * sxy + z * syz
+    dz = w * pz + z * dz + x * sxz + y * syz
+    found = torch.stack([dw, dx, dy, dz]).mul_(2)
     return found.sub_(q * (q * found).sum(0))
 
 
@@ -163,12 +155,8 @@ def whitening(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> tuple[Tensor, 
     along = pivot.rsqrt()
     across = (pivot / det).sqrt()
     zero = torch.zeros_like(along)
-    return (
-        torch.where(x_larger, slope * across, across),
-        torch.where(x_larger, across, slope * across),
-        torch.where(x_larger, along, zero),
-        torch.where(x_larger, zero, along),
-    )
+    ax, ay = torch.where(x_larger, slope * across, across), torch.where(x_larger, across, slope * across)
+    return ax, ay, torch.where(x_larger, along, zero), torch.where(x_larger, zero, along)
 
 
 def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
@@ -178,20 +166,8 @@ def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: 
     """
     ax, ay, bx, by = whitening(*variances(factors, eps2d))
     x, y = means2d.unbind(1)
-    return torch.stack(
-        [
-            opacities.log(),
-            x,
-            y,
-            -0.5 * (ax * ax + bx * bx),
-            -(ax * ay + bx * by),
-            -0.5 * (ay * ay + by * by),
-            ax,
-            ay,
-            bx,
-            by,
-        ]
-    )
+    quadratic = -0.5 * (ax * ax + bx * bx), -(ax * ay + bx * by), -0.5 * (ay * ay + by * by)
+    return torch.stack([opacities.log(), x, y, *quadratic, ax, ay, bx, by])
 
 
 def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -80,11 +80,10 @@ class _InFullPrecision(torch.autograd.Function):
             ]
             wanted = [x for x, n in zip(inputs, needed, strict=True) if n]
             result = ctx.function(*inputs)
+            found = iter([torch.zeros_like(x) for x in wanted])
             if result.requires_grad:  # Kornia's project, for one, returns early where there are no points
-                options = {"create_graph": again, "allow_unused": True, "materialize_grads": True}
+                options: Any = {"create_graph": again, "allow_unused": True, "materialize_grads": True}
                 found = iter(torch.autograd.grad(result, wanted, grad, **options))
-            else:
-                found = iter([torch.zeros_like(x) for x in wanted])
         return None, *(next(found) if n else None for n in needed)
 
 

@@ -37,60 +37,35 @@ _PAIRS_TO_SHARE = 2**22  # from here on a CPU has work for two groups, so for tw
 
 @dataclass(frozen=True)
 class Rules:
-    """What counts as a layer, see `composite`, and how much memory there is.
-
-    Args:
-        alpha_threshold: as of `composite`.
-        transmittance_stop: as of `composite`.
-        median_depth: as of `composite`.
-        chunk_size: K, entries of a tile per step.
-        buffer_bytes: for the buffers of one thread.
-    """
+    """What counts as a layer, see `kgs.composite`, and how much memory a step has."""
 
     alpha_threshold: float
     transmittance_stop: float
     median_depth: bool
-    chunk_size: int
-    buffer_bytes: int
+    chunk_size: int  # K, entries of a tile per step
+    buffer_bytes: int  # for the buffers of one thread
 
 
 @dataclass(frozen=True)
 class Step:
-    """The record of one step of a group, for the backward pass.
+    """The record of one step of a group, for the backward pass."""
 
-    Args:
-        chunk: which chunk of each tile's list.
-        rows: positions in the group of its tiles; None: the first ones.
-        count: n, how many tiles.
-        transmittance: before the step, `(n, P)`.
-        alpha: `(K, n, P)`, where there is memory to keep it.
-        ended: whether the transmittance of a pixel fell to the stop.
-    """
-
-    chunk: int
-    rows: Tensor | None
-    count: int
-    transmittance: Tensor
-    alpha: Tensor | None
-    ended: bool
+    chunk: int  # which chunk of each tile's list
+    rows: Tensor | None  # positions in the group of its tiles; None: the first ones
+    count: int  # n, how many tiles
+    transmittance: Tensor  # before the step, (n, P)
+    alpha: Tensor | None  # (K, n, P), where there is memory to keep it
+    ended: bool  # whether the transmittance of a pixel fell to the stop
 
 
 @dataclass
 class Group:
-    """Tiles that are worked on together, the longest list first, and the steps that were done on them.
+    """Tiles that are worked on together, the longest list first, and the steps that were done on them."""
 
-    Args:
-        tiles: numbers in the slice, `(m,)`.
-        starts: first entry of each, `(m,)`.
-        ends: one past the last entry of each, `(m,)`.
-        chunks: how many each has, descending.
-        steps: what was done.
-    """
-
-    tiles: Tensor
-    starts: Tensor
-    ends: Tensor
-    chunks: list[int]
+    tiles: Tensor  # numbers in the slice, (m,)
+    starts: Tensor  # first entry of each, (m,)
+    ends: Tensor  # one past the last entry of each, (m,)
+    chunks: list[int]  # how many each has, descending
     steps: list[Step] = field(default_factory=list)
 
 
@@ -119,9 +94,9 @@ class Slice:
         columns = torch.stack([tile - row * lists.grid[1], row % lists.grid[0]])
         self.centres = (columns * size).to(dtype) + (size - 1) / 2
         # exp is slow where its result is denormal: the exponent is bounded below, and what that lets through is cut
-        floor = math.log(rules.alpha_threshold) - 20 if rules.alpha_threshold else math.log(torch.finfo(dtype).tiny) + 8
-        self.floor = floor
-        self.cut = _below(max(rules.alpha_threshold, 1.01 * math.exp(floor)), dtype)
+        threshold = rules.alpha_threshold
+        self.floor = math.log(threshold) - 20 if threshold else math.log(torch.finfo(dtype).tiny) + 8
+        self.cut = _below(max(threshold, 1.01 * math.exp(self.floor)), dtype)
         self.stop = _below(rules.transmittance_stop, dtype) if rules.transmittance_stop else -1.0
         self.by_layer = device.type == "cpu"  # scans: a GPU wants few launches, a CPU few passes
         self.clamps = bool((table[0] > math.log(ALPHA_MAX)).any())
@@ -134,12 +109,9 @@ class Slice:
 
         The features are three at a time: what is asked for beside the image does not change its bits.
         """
-        tiles, like = self.lists.num_tiles, self.table
-        return (
-            like.new_ones(tiles, 1, self.pixels),
-            like.new_zeros(tiles, 1 if self.depths is not None else 0, self.pixels),
-            *(like.new_zeros(tiles, block.shape[1], self.pixels) for block in self.features.split(3, dim=1)),
-        )
+        widths = [0 if self.depths is None else 1, *(block.shape[1] for block in self.features.split(3, dim=1))]
+        zeros = (self.table.new_zeros(self.lists.num_tiles, width, self.pixels) for width in widths)
+        return self.table.new_ones(self.lists.num_tiles, 1, self.pixels), *zeros
 
     def _make_groups(self, lengths: Tensor) -> list[Group]:
         chunks = torch.div(lengths + (self.chunk_size - 1), self.chunk_size, rounding_mode="floor")

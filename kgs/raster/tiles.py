@@ -27,25 +27,15 @@ __all__ = ["Reach", "Spans", "TileLists", "bin_to_tiles", "to_images", "to_tiles
 
 @dataclass(frozen=True)
 class TileLists:
-    """For each tile of a row slice its list: the Gaussians that can reach it, front to back. Integers.
+    """For each tile of a row slice its list: the Gaussians that can reach it, front to back. Integers."""
 
-    Args:
-        tile_size: side of a tile in pixels.
-        grid: (rows, columns) of tiles in one image.
-        first_tile: number of the slice's first tile; tiles are numbered row by row, camera after camera.
-        offsets: `(T + 1,)` int64; the entries of tile t are `offsets[t]:offsets[t + 1]`.
-        entries: `(E,)` int32, position in `ids`, sorted by tile and then from front to back.
-        ids: `(n,)` int64, the rows of `ProjectedGaussians` that may have entries, in depth order.
-        order: `(E,)` int64, which place each entry has if they are sorted by `ids` first and then by tile.
-    """
-
-    tile_size: int
-    grid: tuple[int, int]
-    first_tile: int
-    offsets: Tensor
-    entries: Tensor
-    ids: Tensor
-    order: Tensor
+    tile_size: int  # side of a tile in pixels
+    grid: tuple[int, int]  # (rows, columns) of tiles in one image
+    first_tile: int  # number of the slice's first tile; tiles are numbered row by row, camera after camera
+    offsets: Tensor  # (T + 1,) int64; the entries of tile t are offsets[t]:offsets[t + 1]
+    entries: Tensor  # (E,) int32, position in `ids`, sorted by tile and then from front to back
+    ids: Tensor  # (n,) int64, the rows of `ProjectedGaussians` that may have entries, in depth order
+    order: Tensor  # (E,) int64, which place each entry has if they are sorted by `ids` first and then by tile
 
     @property
     def num_tiles(self) -> int:
@@ -67,19 +57,12 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Spans:
-    """For each Gaussian and each row of tiles that it reaches the first tile and how many.
+    """For each Gaussian and each row of tiles that it reaches the first tile and how many; int32, `(S,)`."""
 
-    Args:
-        ranks: `(S,)` int32, position of the Gaussian in `Reach.ids`, ascending.
-        rows: `(S,)` int32, row of tiles.
-        first: `(S,)` int32, first column.
-        counts: `(S,)` int32, columns, may be 0.
-    """
-
-    ranks: Tensor
-    rows: Tensor
-    first: Tensor
-    counts: Tensor
+    ranks: Tensor  # position of the Gaussian in `Reach.ids`, ascending
+    rows: Tensor  # row of tiles
+    first: Tensor  # first column
+    counts: Tensor  # columns, may be 0
 
     def take(self, where: Tensor | slice) -> Spans:
         """Some of the spans."""
@@ -242,15 +225,9 @@ class Reach:
             tiles, entries = tiles.index_select(0, inside), entries.index_select(0, inside)
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
         per_tile = torch.bincount(keys, minlength=num_tiles)
-        return TileLists(
-            tile_size=self.tile_size,
-            grid=self.grid,
-            first_tile=begin * columns,
-            offsets=torch.cat([per_tile.new_zeros(1), torch.cumsum(per_tile, 0)]),
-            entries=entries.index_select(0, order),
-            ids=self.ids[low:high],
-            order=order,
-        )
+        offsets = torch.cat([per_tile.new_zeros(1), torch.cumsum(per_tile, 0)])
+        entries, ids = entries.index_select(0, order), self.ids[low:high]
+        return TileLists(self.tile_size, self.grid, begin * columns, offsets, entries, ids, order)
 
 
 def bin_to_tiles(

@@ -88,13 +88,8 @@ class _Passes:
     ) -> None:
         """Add to `total` what each Gaussian gets: six moments of dL/d ln alpha about its centre, and dL/d features.
 
-        Args:
-            done: what `forward` returned.
-            grads: dL/d sums, `(T, F, P)`.
-            behind: V behind the last layer, `(T, 1, P)`, see `kgs.raster`; used up.
-            total: `(n, 6 + F)`, without the columns that are not wanted.
-            moments: whether the moments are wanted.
-            features: whether dL/d features is wanted.
+        `grads` are dL/d sums, `(T, F, P)`; `behind` is V behind the last layer, `(T, 1, P)`, see `kgs.raster`, and used
+        up; `total` is `(n, 6 + F)`, without the columns that are not wanted.
         """
         for (low, high), part in reversed(done):
             entries = part.lists.entries.shape[0]
@@ -137,9 +132,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
-            raise RuntimeError(
-                "composite: expected backward without create_graph, the renderer has no second derivative"
-            )
+            raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         passes, inputs, reach = ctx.passes, ctx.saved_tensors, ctx.passes.reach
         _, factors, opacities, _ = inputs
         grads, behind = (to_tiles(x, reach.grid, reach.tile_size) for x in (grad_sums, grad_transmittance))

@@ -83,12 +83,8 @@ class Forward(_Worker):
 
     def __init__(self, part: Slice, outputs: tuple[Tensor, ...], keep: bool, keep_alphas: bool) -> None:
         super().__init__(part, buffers=2)
-        self.blocks, self.outputs, self.keep, self.keep_alphas = (
-            part.features.split(3, dim=1),
-            outputs,
-            keep,
-            keep_alphas,
-        )
+        self.outputs, self.keep, self.keep_alphas = outputs, keep, keep_alphas
+        self.blocks = part.features.split(3, dim=1)
 
     def __call__(self, group: Group) -> None:
         """Composite a group."""
@@ -112,25 +108,21 @@ class Forward(_Worker):
             if ended:
                 F.threshold(layers, part.stop, 0.0, inplace=True)
             if self.keep:
-                kept = alpha if self.keep_alphas else None
-                group.steps.append(Step(j, rows, n, light[:, 0].clone(), kept, ended))
+                group.steps.append(Step(j, rows, n, light[:, 0].clone(), alpha if self.keep_alphas else None, ended))
             if part.depths is not None:
                 crossing = ((layers[:-1] >= 0.5) & (layers[1:] < 0.5)).to(light.dtype)
-                median.baddbmm_(
-                    part.depths.index_select(0, ids).view(size, n, 1).permute(1, 2, 0), crossing.transpose(0, 1)
-                )
+                depths = part.depths.index_select(0, ids).view(size, n, 1).permute(1, 2, 0)
+                median.baddbmm_(depths, crossing.transpose(0, 1))
             weights = torch.mul(alpha, layers[:-1], out=buffer).transpose(0, 1)
             for block, total in zip(self.blocks, sums, strict=True):
                 total.baddbmm_(block.index_select(0, ids).view(size, n, -1).permute(1, 2, 0), weights)
             light[:, 0] = layers[-1]
             if ended:
-                live = light[:, 0].amax(1) > 0
-                live_count = int(live.sum())
-                if live_count == 0:
+                kept = (light[:, 0].amax(1) > 0).nonzero()[:, 0]
+                if len(kept) == 0:
                     break
-                if live_count < _LIVE_SHARE * n:
+                if len(kept) < _LIVE_SHARE * n:
                     self._write(tiles, state)
-                    kept = live.nonzero()[:, 0]
                     tiles, starts, ends = (x.index_select(0, kept) for x in (tiles, starts, ends))
                     state = tuple(x.index_select(0, kept) for x in state)
                     rows = kept if rows is None else rows.index_select(0, kept)
@@ -171,10 +163,8 @@ class Backward(_Worker):
                 tiles, starts, ends = (x[: step.count] for x in (group.tiles, group.starts, group.ends))
                 self._step(step, tiles, starts, ends, grads[: step.count], behind[: step.count])
             else:
-                rows = step.rows[: step.count]
-                tiles, starts, ends, g, later = (
-                    x.index_select(0, rows) for x in (group.tiles, group.starts, group.ends, grads, behind)
-                )
+                rows, columns = step.rows[: step.count], (group.tiles, group.starts, group.ends, grads, behind)
+                tiles, starts, ends, g, later = (x.index_select(0, rows) for x in columns)
                 self._step(step, tiles, starts, ends, g, later)
                 behind.index_copy_(0, rows, later)
         self.behind.index_copy_(0, group.tiles, behind[:, None])
