@@ -75,7 +75,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         Ks: intrinsics in pixels, `(C, 3, 3)`.
         width: of the images in pixels.
         height: of the images in pixels.
-        near_plane: see :class:`kgs.RasterOptions`, as for all its other options.
+        near_plane, eps2d, tile_size, alpha_threshold, transmittance_stop, max_bytes: see :class:`kgs.RasterOptions`.
         far_plane: nothing is cut, so 1e10 or more.
         sh_degree: degree 0 to 3 of the harmonics to use; K is at least (sh_degree + 1)^2. None: `colors` as they are.
         backgrounds: `(C, D)`, or None for 0.

@@ -1,17 +1,13 @@
 """What tests of projection have in common."""
 
 import torch
-from factories import random_camera, random_gaussians
-from kornia.geometry.camera import PinholeCamera
+from factories import FIELDS, batch, random_camera, random_gaussians
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 
 from kgs import Gaussians, PosedCamera, project
 
 HEIGHT, WIDTH = 48, 64
-
-
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
 LENGTHS = {kind: 0 for kind in CameraModelType} | {  # of the distortion
@@ -21,16 +17,6 @@ LENGTHS = {kind: 0 for kind in CameraModelType} | {  # of the distortion
 
 
 PACKED = ("means2d", "factors", "depths", "radii", "opacities", "colors")
-
-
-def replace(gaussians, **changes):
-    return Gaussians(**{name: getattr(gaussians, name) for name in FIELDS} | changes)
-
-
-def batch(*cameras):
-    return PinholeCamera(
-        *(torch.cat([getattr(c, name) for c in cameras]) for name in ("intrinsics", "extrinsics", "height", "width"))
-    )
 
 
 def scene(n=60, degree=1, dtype=torch.float64, cameras=1):

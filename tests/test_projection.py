@@ -5,11 +5,11 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
 from oracles import real_harmonic
-from projection_checks import FIELDS, HEIGHT, LENGTHS, PACKED, WIDTH, covariances, posed, replace, scene, sigma_route
+from projection_checks import HEIGHT, LENGTHS, PACKED, WIDTH, covariances, posed, scene, sigma_route
 
 import kgs
 from kgs import Gaussians, project

@@ -2,21 +2,10 @@
 
 import pytest
 import torch
-from factories import random_camera, random_gaussians
+from factories import FIELDS, random_camera, random_gaussians, replace
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
-from projection_checks import (
-    FIELDS,
-    HEIGHT,
-    LENGTHS,
-    PACKED,
-    WIDTH,
-    assert_same,
-    posed,
-    replace,
-    scene,
-    values_and_gradients,
-)
+from projection_checks import HEIGHT, LENGTHS, PACKED, WIDTH, assert_same, posed, scene, values_and_gradients
 
 from kgs import Gaussians, project
 

@@ -4,18 +4,8 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
-from projection_checks import (
-    FIELDS,
-    HEIGHT,
-    PACKED,
-    WIDTH,
-    assert_same,
-    replace,
-    scene,
-    sigma_route,
-    values_and_gradients,
-)
+from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
+from projection_checks import HEIGHT, PACKED, WIDTH, assert_same, scene, sigma_route, values_and_gradients
 
 from kgs import DropGaussian, Gaussians, project
 

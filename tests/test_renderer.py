@@ -5,12 +5,18 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import FIELDS, OUTPUTS, batch, leaves, pinhole, posed, random_camera, random_gaussians
 from kornia.sensors.camera import CameraModelType
-from renderer_checks import DTYPES, FIELDS, OUTPUTS, batch, largest, posed, with_grad
 
 import kgs.reference
 from kgs import DropGaussian, GaussianRenderer, Gaussians
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def largest(a, b):
+    return (a - b).abs().max().item()
+
 
 # -- outputs -------------------------------------------------------------------------------------------------------
 
@@ -50,7 +56,7 @@ def test_alpha_and_depth_are_what_the_reference_weights_say(dtype):
 
 
 def test_depth_is_zero_without_gradient_where_there_is_nothing():
-    gaussians, inputs = with_grad(random_gaussians(3, 0))
+    gaussians, inputs = leaves(random_gaussians(3, 0))
     camera = random_camera(48, 48, 0)
     out = GaussianRenderer()(gaussians, camera, outputs=("alpha", "depth"))
     nothing = out.alpha < 1e-6
@@ -75,7 +81,7 @@ def test_depth_of_a_single_plane_is_its_depth():
 
 
 def test_every_form_of_background():
-    cameras = batch([random_camera(24, 33, seed) for seed in (0, 1)])
+    cameras = batch(*[random_camera(24, 33, seed) for seed in (0, 1)])
     gaussians, renderer = random_gaussians(20, 0), GaussianRenderer()
     out = renderer(gaussians, cameras, outputs=("image", "alpha"))
     light = 1 - out.alpha
@@ -89,7 +95,7 @@ def test_every_form_of_background():
 
 @pytest.mark.parametrize("shape", [(3,), (2, 3), (2, 3, 24, 33)])
 def test_gradient_of_the_background_is_the_light_that_reaches_it(shape):
-    cameras = batch([random_camera(24, 33, seed) for seed in (0, 1)])
+    cameras = batch(*[random_camera(24, 33, seed) for seed in (0, 1)])
     gaussians = random_gaussians(20, 0)
     background = torch.rand(shape, dtype=torch.float64, requires_grad=True)
     weights = torch.randn(2, 3, 24, 33, dtype=torch.float64)
@@ -124,7 +130,7 @@ def test_dropped_gaussians_are_seen_but_not_drawn():
     gaussians, camera = random_gaussians(60, 0), pinhole(64, 64, (40.0, 40.0))
     drop = DropGaussian(p=0.5, schedule="constant", seed=3)
     renderer = GaussianRenderer(opacity_layer=drop)
-    gaussians, inputs = with_grad(gaussians)
+    gaussians, inputs = leaves(gaussians)
     out = renderer(gaussians, camera)
     full = renderer.eval()(gaussians, camera)
     dropped = out.projected.opacities == 0
@@ -166,7 +172,7 @@ def test_results_have_the_dtype_of_the_gaussians(dtype):
 def test_lower_precision_around_it_changes_nothing(setting, backward_inside, matmul_precision):
     """Nor the gradients of Gaussians, intrinsics and pose; "medium" rounds where the processor has units for it."""
     camera = random_camera(24, 32, 0, torch.float32)
-    gaussians, inputs = with_grad(random_gaussians(3000, 0, torch.float32, 3))
+    gaussians, inputs = leaves(random_gaussians(3000, 0, torch.float32, 3))
     inputs += [camera.intrinsics.requires_grad_(), camera.extrinsics.requires_grad_()]
 
     def lowered(on):
@@ -189,7 +195,7 @@ def test_lower_precision_around_it_changes_nothing(setting, backward_inside, mat
 def test_inference_keeps_no_graph(mode, threads):
     # enough tiles for several pieces of work, so that a second thread has some
     camera = random_camera(200, 400, 0, torch.float32)
-    gaussians, _ = with_grad(random_gaussians(400, 0, torch.float32, 1, image_size=100))
+    gaussians, _ = leaves(random_gaussians(400, 0, torch.float32, 1, image_size=100))
     expected = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
     before = torch.get_num_threads()
     try:
@@ -205,7 +211,7 @@ def test_inference_keeps_no_graph(mode, threads):
 
 
 def test_gradient_of_means2d_is_kept():
-    gaussians, inputs = with_grad(random_gaussians(40, 0))
+    gaussians, inputs = leaves(random_gaussians(40, 0))
     out = GaussianRenderer()(gaussians, random_camera(24, 32, 0))
     out.image.square().sum().backward()
     assert out.projected.means2d.grad.shape == (len(out.projected), 2)
@@ -238,9 +244,9 @@ def test_other_dtypes_are_a_type_error_that_names_the_argument(name, dtype):
         (
             "cameras",
             TypeError,
-            {"cameras": posed(CameraModelType.PINHOLE, [9.0, 9.0, 6.0, 4.0], extrinsics=torch.eye(4)[None])},
+            {"cameras": posed(CameraModelType.PINHOLE, [9.0, 9.0, 6.0, 4.0], (24, 32), extrinsics=torch.eye(4)[None])},
         ),
-        ("cameras", ValueError, {"cameras": batch([random_camera(9, w, 0, torch.float32) for w in (12, 13)])}),
+        ("cameras", ValueError, {"cameras": batch(*[random_camera(9, w, 0, torch.float32) for w in (12, 13)])}),
         ("gaussians", TypeError, {"gaussians": None}),
     ],
 )

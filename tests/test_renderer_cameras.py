@@ -5,13 +5,19 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import FIELDS, OUTPUTS, batch, leaves, pinhole, posed, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
-from renderer_checks import DTYPES, FIELDS, OUTPUTS, batch, largest, posed, with_grad
 
 import kgs.reference
 from kgs import GaussianRenderer, Gaussians
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def largest(a, b):
+    return (a - b).abs().max().item()
+
 
 # -- cameras -------------------------------------------------------------------------------------------------------
 
@@ -19,9 +25,9 @@ from kgs import GaussianRenderer, Gaussians
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_sixteen_cameras_at_once_are_sixteen_single_ones(dtype):
     singles = [random_camera(24, 30, seed, dtype) for seed in range(16)]
-    gaussians, inputs = with_grad(random_gaussians(50, 0, dtype, 2))
+    gaussians, inputs = leaves(random_gaussians(50, 0, dtype, 2))
     renderer = GaussianRenderer()
-    together = renderer(gaussians, batch(singles), outputs=OUTPUTS)
+    together = renderer(gaussians, batch(*singles), outputs=OUTPUTS)
     apart = [renderer(gaussians, camera, outputs=OUTPUTS) for camera in singles]
     for name in OUTPUTS:
         assert torch.equal(getattr(together, name), torch.cat([getattr(one, name) for one in apart])), name
@@ -45,7 +51,7 @@ def test_many_tiles_keep_their_numbers(size, views):
         opacities=torch.full((41,), 0.5, dtype=torch.float64),
         colors=torch.rand(41, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1,
     )
-    image = GaussianRenderer()(dots, batch([pinhole(height, width, (2000.0, 2000.0))] * views)).image
+    image = GaussianRenderer()(dots, batch(*[pinhole(height, width, (2000.0, 2000.0))] * views)).image
     lit = image[:, :, (height - 1) // 2 : height // 2 + 1].sum(2)  # the two middle rows share each dot
     scale = 2 * 0.5 * math.exp(-0.5 * 0.25 / 0.3)
     assert (lit[:, :, columns.long()] - scale * dots.colors.T).abs().max() <= 1e-6
@@ -62,7 +68,7 @@ def test_orthographic_camera_is_the_marginal_of_each_gaussian():
     )
     fx, fy, cx, cy = 9.0, 7.0, 15.0, 11.5
     turn = random_camera(24, 32, 8).extrinsics
-    camera = posed(CameraModelType.ORTHOGRAPHIC, [fx, fy, cx, cy], extrinsics=turn)
+    camera = posed(CameraModelType.ORTHOGRAPHIC, [fx, fy, cx, cy], (24, 32), extrinsics=turn)
     alpha = GaussianRenderer(alpha_threshold=0)(gaussians, camera, outputs=("alpha",)).alpha[0, 0]
     w, x, y, z = (gaussians.quats[0] / gaussians.quats[0].norm()).tolist()
     local = torch.linalg.matrix_exp(  # of the rotation vector of the quaternion
@@ -85,7 +91,7 @@ def test_pinhole_of_both_kinds_is_one_image():
     gaussians, camera = random_gaussians(40, 0, sh_degree=3), random_camera(24, 32, 0)
     k = camera.intrinsics[0]
     params = [k[0, 0].item(), k[1, 1].item(), k[0, 2].item(), k[1, 2].item()]
-    other = posed(CameraModelType.PINHOLE, params, extrinsics=camera.extrinsics)
+    other = posed(CameraModelType.PINHOLE, params, (24, 32), extrinsics=camera.extrinsics)
     assert largest(GaussianRenderer()(gaussians, camera).image, GaussianRenderer()(gaussians, other).image) <= 1e-12
 
 
@@ -93,19 +99,19 @@ def test_brown_conrady_without_distortion_is_the_pinhole():
     gaussians, camera = random_gaussians(40, 0, sh_degree=3), random_camera(24, 32, 0)
     k = camera.intrinsics[0]
     params = [k[0, 0].item(), k[1, 1].item(), k[0, 2].item(), k[1, 2].item()]
-    lens = posed(CameraModelType.BROWN_CONRADY, params + [0.0] * 8, extrinsics=camera.extrinsics)
+    lens = posed(CameraModelType.BROWN_CONRADY, params + [0.0] * 8, (24, 32), extrinsics=camera.extrinsics)
     expected = GaussianRenderer()(gaussians, camera, outputs=("image", "depth"))
     out = GaussianRenderer()(gaussians, lens, outputs=("image", "depth"))
     assert largest(out.image, expected.image) <= 1e-10
     assert largest(out.depth, expected.depth) <= 1e-10
-    bent = posed(CameraModelType.BROWN_CONRADY, [*params, 0.2, *[0.0] * 7], extrinsics=camera.extrinsics)
+    bent = posed(CameraModelType.BROWN_CONRADY, [*params, 0.2, *[0.0] * 7], (24, 32), extrinsics=camera.extrinsics)
     assert largest(GaussianRenderer()(gaussians, bent).image, expected.image) > 1e-3
 
 
 def test_fisheye_puts_a_dot_where_the_angle_says():
     # Kannala-Brandt without higher terms is the equidistant projection: radius = f times the angle off the axis
     f, angle = 20.0, 0.6
-    camera = posed(CameraModelType.KANNALA_BRANDT_K3, [f, f, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0], 25, 33)
+    camera = posed(CameraModelType.KANNALA_BRANDT_K3, [f, f, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0], (25, 33))
     dot = Gaussians(
         means=torch.tensor([[math.sin(angle), 0.0, math.cos(angle)]]).double() * 3,
         quats=torch.tensor([[1.0, 0, 0, 0]]).double(),
@@ -118,7 +124,7 @@ def test_fisheye_puts_a_dot_where_the_angle_says():
     y = (mass.sum(1) * torch.arange(25)).sum() / mass.sum()
     assert x.item() == pytest.approx(16 + f * angle, abs=0.02)
     assert y.item() == pytest.approx(12, abs=1e-6)
-    gaussians, inputs = with_grad(random_gaussians(30, 0, sh_degree=1))
+    gaussians, inputs = leaves(random_gaussians(30, 0, sh_degree=1))
     image = GaussianRenderer()(gaussians, camera).image
     assert image.isfinite().all()
     assert (image > 0).any()
@@ -131,17 +137,17 @@ def test_one_lens_for_several_poses_and_one_lens_each():
     params = [30.0, 31.0, 15.5, 11.5, 0.05, -0.02, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0]
     poses = torch.cat([random_camera(24, 32, seed).extrinsics for seed in (0, 1)])
     gaussians, renderer = random_gaussians(30, 1), GaussianRenderer()
-    shared = renderer(gaussians, posed(kind, params, extrinsics=poses)).image
-    apart = [renderer(gaussians, posed(kind, params, extrinsics=poses[i : i + 1])).image for i in (0, 1)]
+    shared = renderer(gaussians, posed(kind, params, (24, 32), extrinsics=poses)).image
+    apart = [renderer(gaussians, posed(kind, params, (24, 32), extrinsics=poses[i : i + 1])).image for i in (0, 1)]
     assert torch.equal(shared, torch.cat(apart))
     wide = [20.0, *params[1:]]
-    each = renderer(gaussians, posed(kind, [params, wide], extrinsics=poses)).image
+    each = renderer(gaussians, posed(kind, [params, wide], (24, 32), extrinsics=poses)).image
     assert torch.equal(each[:1], apart[0])
-    assert torch.equal(each[1:], renderer(gaussians, posed(kind, wide, extrinsics=poses[1:])).image)
+    assert torch.equal(each[1:], renderer(gaussians, posed(kind, wide, (24, 32), extrinsics=poses[1:])).image)
 
 
 def test_opacities_a_camera():
-    cameras = batch([random_camera(24, 32, seed) for seed in (0, 1)])
+    cameras = batch(*[random_camera(24, 32, seed) for seed in (0, 1)])
     gaussians = random_gaussians(30, 0)
     mine = torch.stack([gaussians.opacities, gaussians.opacities.flip(0)]).requires_grad_()
     out = GaussianRenderer()(dataclasses.replace(gaussians, opacities=mine), cameras).image
@@ -162,9 +168,9 @@ def test_opacities_a_camera():
 def test_nothing_to_see(n, views):
     gaussians = random_gaussians(n, 0, torch.float32, 1)
     gaussians = dataclasses.replace(gaussians, means=gaussians.means * torch.tensor([1.0, 1.0, -1.0]))
-    gaussians, inputs = with_grad(gaussians)
+    gaussians, inputs = leaves(gaussians)
     background = torch.rand(3, requires_grad=True)
-    cameras = batch([pinhole(9, 13, (20.0, 20.0), dtype=torch.float32)] * views)
+    cameras = batch(*[pinhole(9, 13, (20.0, 20.0), dtype=torch.float32)] * views)
     out = GaussianRenderer()(gaussians, cameras, background, OUTPUTS)
     assert torch.equal(out.image, background[None, :, None, None].expand(views, 3, 9, 13))
     for name in OUTPUTS[1:]:
@@ -186,7 +192,7 @@ def test_images_of_any_size(size):
 
 @pytest.mark.parametrize("size", [(8, 8), (16, 24), (15, 17)])
 def test_the_image_is_the_users_own_to_edit(size):
-    gaussians, inputs = with_grad(random_gaussians(20, 1))
+    gaussians, inputs = leaves(random_gaussians(20, 1))
     camera = random_camera(*size, 1)
     expected = torch.autograd.grad(GaussianRenderer()(gaussians, camera).image.clamp(0, 0.5).sum(), inputs)
     image = GaussianRenderer()(gaussians, camera).image

@@ -5,9 +5,9 @@ import itertools
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import FIELDS, leaves, pinhole, random_camera, random_gaussians
 from oracles import mpmath_pixels
-from stiff_checks import FIELDS, leaves, one
+from stiff_checks import one
 
 from kgs import GaussianRenderer, Gaussians
 

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
-from stiff_checks import FIELDS, leaves, one
+from factories import FIELDS, leaves, pinhole, random_camera, random_gaussians
+from stiff_checks import one
 
 from kgs import GaussianModel, GaussianRenderer, Gaussians
 

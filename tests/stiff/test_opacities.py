@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import FIELDS, pinhole, random_camera, random_gaussians
 from oracles import enumerate_drops, near_threshold
-from stiff_checks import FIELDS, one
+from stiff_checks import one
 
 import kgs.reference
 from kgs import GaussianRenderer, Gaussians
