@@ -1,10 +1,34 @@
-"""Held-out quality against training time: one knob of the fit at a time, on the study's grid."""
+"""Held-out quality against training time: one knob of the fit at a time, around the default, on the study's grid."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-__all__ = ["training"]
+import pandas as pd
+
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.fit.config import FAST, FitConfig
+from kgs.fit.run import choose_points
+
+from .output import markdown_table, mean_sd
+from .scenes import SYNTHETIC, check_scenes
+from .study.cells import fit_and_measure
+from .study.grid import Cell, run_grid
+from .study.tables import each
+
+__all__ = ["KNOBS", "fit_cell", "knob_cells", "training", "write_knobs"]
+
+# The default of each stands in FitConfig; where None means the rule there, it is the default here too.
+KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
+KNOBS |= {"max_gaussians": (5_000, 10_000), "drop": (0.0, 0.1, 0.3)}
+# What the table shows, with how many decimals.
+HEADS = {"psnr": "PSNR [dB]", "gain": "over the default", "ssim": "SSIM", "train_psnr": "PSNR of training views"}
+HEADS |= {"cpu_seconds": "CPU seconds", "gaussians": "Gaussians"}
+DECIMALS = dict(zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True))
+SIZE = (126, 168)  # of the synthetic pictures
 
 
 def training(
@@ -28,11 +52,93 @@ def training(
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the cells instead.
     """
-    from .study.grid import run_grid
-    from .study.knobs import fit_cell, knob_cells, write_knobs
-
     cells = knob_cells(quick)
     rows = run_grid(cells, fit_cell, out / "training.jsonl", scheduler=scheduler, processes=processes)
     if rows:
         print(write_knobs(rows, out))
     return int(len(rows) < len(cells))
+
+
+def knob_cells(quick: bool = False) -> list[Cell]:
+    """The default, `--fast`, and each other value of each knob, with three seeds; `quick`: two tiny cells instead.
+
+    On the built-in scene and, where KGS_DATA is set, on fern; DataError: the folder lacks it.
+    """
+    if quick:
+        return [{"scene": SYNTHETIC, "seed": 0, "steps": steps} for steps in (20, 40)]
+    scenes = [SYNTHETIC]
+    if "KGS_DATA" in os.environ:
+        check_scenes(Path(os.environ["KGS_DATA"]), ["llff/fern"])
+        scenes.append("fern")
+    settings: list[Cell] = [{}, {"fast": True}]
+    settings += [{knob: value} for knob, values in KNOBS.items() for value in values]
+    return [{"scene": scene, "seed": seed, **setting} for seed in range(3) for setting in settings for scene in scenes]
+
+
+def fit_cell(cell: Cell) -> dict[str, Any]:
+    """One fit of "scene", "synthetic" or "fern" (found through KGS_DATA), from SIFT points.
+
+    "fast" says that the fit starts from that setting and not from the default; the rest are fields of FitConfig.
+    """
+    settings = FAST if cell.get("fast") else FitConfig()
+    turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
+    config = FitConfig.from_dict(settings.to_dict() | {"init": "sift"} | turned)
+    if cell["scene"] == SYNTHETIC:
+        scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
+    else:
+        scene = load_scene(Path(os.environ["KGS_DATA"]) / "llff" / cell["scene"], train_views=3, downscale=2)
+    _, metrics, result = fit_and_measure(scene, config, choose_points(scene, config))
+    test, train = metrics["test"], metrics["train"]
+    return result | {"psnr": test["psnr"], "ssim": test["ssim"], "train_psnr": train["psnr"]}
+
+
+def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
+    """Write training.csv, training.md and training.png: each setting's mean and standard deviation over seeds.
+
+    The gain over the default is in dB of test PSNR, from the seeds that both have; the two fits of a seed have the same
+    first points.
+
+    Returns:
+        What training.md holds.
+    """
+    frame = pd.DataFrame([_knob(row["cell"]) | {key: row["result"].get(key) for key in HEADS} for row in rows])
+    default = frame[frame.knob == "default"].set_index(["scene", "seed"]).psnr
+    frame["gain"] = frame.psnr - default.reindex(pd.MultiIndex.from_frame(frame[["scene", "seed"]])).to_numpy()
+    keys = ["scene", "knob", "value"]
+    table = frame.groupby(keys, sort=False)[[*HEADS]].agg(["mean", "std"])
+    table.columns = [f"{column[0]}_sd" if column[1] == "std" else column[0] for column in table.columns]
+    table = table.assign(n=frame.groupby(keys, sort=False).size()).reset_index()
+    table.to_csv(out / "training.csv", index=False)
+    lines = [
+        [scene, f"{knob} {value}".strip(), len(cells), *(mean_sd(cells[key], d) for key, d in DECIMALS.items())]
+        for (scene, knob, value), cells in each(frame, *keys)
+    ]
+    lines.sort(key=lambda line: (line[0], line[1] != "default", str(line[1]).split()[0]))
+    title = "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)"
+    text = markdown_table(title, ["setting", "n", *HEADS.values()], lines, first="scene")
+    (out / "training.md").write_text(text, encoding="utf-8")
+    _plot(out / "training.png", table)
+    return text
+
+
+def _knob(cell: Mapping[str, Any]) -> dict[str, Any]:
+    turned = {key: value for key, value in cell.items() if key not in ("scene", "seed")}
+    knob, value = next(iter(turned.items()), ("default", ""))
+    return {"scene": cell["scene"], "seed": cell["seed"], "knob": knob, "value": "" if value is True else str(value)}
+
+
+def _plot(path: Path, table: pd.DataFrame) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.5 * table.scene.nunique(), 4), layout="constrained")
+    axes = figure.subplots(1, table.scene.nunique(), squeeze=False)[0]
+    for axis, (scene, lines) in zip(axes, table.groupby("scene", sort=False), strict=True):
+        is_default = lines.knob == "default"
+        for knob in lines.knob[~is_default].unique():
+            line = lines[is_default | (lines.knob == knob)].sort_values("cpu_seconds")
+            axis.errorbar(line.cpu_seconds, line.psnr, line.psnr_sd, marker=".", capsize=2, lw=1, label=knob)
+        axis.plot(lines.cpu_seconds[is_default], lines.psnr[is_default], "k*", markersize=12, label="default")
+        axis.set(xscale="log", title=scene, xlabel="CPU seconds of the fit", ylabel="test PSNR [dB]")
+        axis.grid(alpha=0.3, which="both")
+        axis.legend(frameon=False)
+    figure.savefig(path, dpi=120)

@@ -46,11 +46,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     Args:
         preset: "quick": the synthetic scene, minutes. "cpu": the five scenes of `SCENES` in a quarter of the pixels of
             504x378, 2000 steps; hours. "paper": 10 000 steps in full size on every scene below `data`; days on a CPU.
-        data: the folder of the scenes: `llff/fern` and so on.
-
-    Raises:
-        ValueError: an unknown preset.
-        DataError: the preset needs scenes and `data` is None or lacks them.
+        data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in PRESETS:
         raise ValueError(f"preset: expected one of {list(PRESETS)}, got {preset!r}")

@@ -57,7 +57,7 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     notes = page.get_template("notes.txt").render().splitlines()
     text = "\n".join([f"# {TITLE}", "", *(f"- {finding}" for finding in (*results, *origin)), "", ""])
     latex = "".join(f"% {sentence}\n" for sentence in (*results, *origin, *notes))
-    for title, table in tables:
+    for title, table in tables.items():
         text += markdown_table(title, table.columns[1:], table.to_numpy().tolist(), table.columns[0])
         caption = re.sub(r"([%_])", r"\\\1", title)
         body = table.to_latex(index=False, escape=True, caption=caption)

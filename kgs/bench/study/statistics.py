@@ -11,9 +11,9 @@ from typing import NamedTuple
 import pandas as pd
 from scipy import stats
 
-__all__ = ["Difference", "Noise", "noise_floor", "paired_difference"]
+__all__ = ["BEST_OF_5", "Difference", "Noise", "noise_floor", "paired_difference"]
 
-BEST_OF_5 = 1.163  # expected largest of five standard normal numbers
+BEST_OF_5 = 1.163  # how far the best of five runs lies over the mean on average, in standard deviations
 
 
 class Difference(NamedTuple):
@@ -45,10 +45,6 @@ class Noise(NamedTuple):
         Student's t, as the standard deviation is itself from few numbers. For n = 1: two single runs.
         """
         return float(stats.t.ppf(0.975, self.freedom)) * math.sqrt(2 / n) * self.sd
-
-    def best_of_five_gain(self) -> float:
-        """How far the best of five runs lies over the mean on average."""
-        return BEST_OF_5 * self.sd
 
 
 def noise_floor(groups: pd.DataFrame) -> Noise:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -12,9 +12,9 @@ from kgs.fit.metrics import MEASURES
 
 from .presets import EQUAL_MEAN_RATE, FAMILIES, FIXED, MAIN, METHODS, OFF, PAPER
 from .published import benchmark_of, published, published_difference
-from .statistics import Difference, noise_floor, paired_difference
+from .statistics import BEST_OF_5, Difference, noise_floor, paired_difference
 
-__all__ = ["COLUMNS", "KEYS", "LPIPS", "QUALITY", "Table", "cells_frame", "difference", "each", "findings"]
+__all__ = ["COLUMNS", "KEYS", "LPIPS", "QUALITY", "STARTS", "cells_frame", "difference", "each", "findings"]
 __all__ += ["main_cells", "sparse_tables", "wide"]
 
 KEYS = ("scene", "views", "start", "method")  # what cells have in common that differ in the seed alone
@@ -32,13 +32,6 @@ _COMPARISONS = {
     f"Dense first points over those of SIFT, both with {PAPER}": ("start", "dense", "sift"),
 }
 Lines = list[dict[str, str]]
-
-
-class Table(NamedTuple):
-    """One table: its title, and its lines as text."""
-
-    title: str
-    lines: pd.DataFrame
 
 
 def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -119,32 +112,25 @@ def findings(frame: pd.DataFrame) -> list[str]:
     noise = noise_floor(wide(frame, "test.psnr"))
     if noise.freedom:
         single, three = (f"{noise.between_means(n):.2f} dB" for n in (1, 3))
-        what = f"two single runs differ by up to {single}, and two means of three by up to {three}"
-        sentences.append(
-            f"Where nothing but the seed differs, {what}, 95 times in 100 ({noise.groups} groups of runs)."
-        )
+        what = f"two single runs differ by up to {single}, and two means of three by up to {three}, 95 times in 100"
+        sentences.append(f"Where nothing but the seed differs, {what} ({noise.groups} groups of runs).")
     return sentences
 
 
-def sparse_tables(frame: pd.DataFrame) -> list[Table]:
-    """All tables that have a line, the main one first."""
+def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """All tables that have a line, of text, by title; the main one first."""
     main = main_cells(frame)
-    tables = {
+    title = (
         "Test views: mean (sd) over n seeds; paired differences over off with their 95 % interval; the paper's figures "
-        "are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction": (
-            _methods(main)
-        ),
-        "Numbers of views": _views(frame),
-        "First points": _starts(frame),
-    }
+        "are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction"
+    )
+    tables = {title: _methods(main), "Numbers of views": _views(frame), "First points": _starts(frame)}
     for _, cells in each(main, *KEYS[:3]):
         tables |= _ablations(cells) if set(cells.method) - set(MAIN) else {}
-    tables["Noise between seeds under identical settings, pooled, and the difference that it makes 1 time in 20"] = (
-        _noise(frame)
-    )
-    tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = _cost(main)
-    tables["Scenes, splits and settings"] = _protocol(frame)
-    return [Table(title, pd.DataFrame(lines)) for title, lines in tables.items() if lines]
+    title = "Noise between seeds under identical settings, pooled, and the difference that it makes 1 time in 20"
+    tables |= {title: _noise(frame), "Cost, overfitting and co-adaptation: mean (sd) over n seeds": _cost(main)}
+    tables |= {"Scenes, splits and settings": _protocol(frame)}
+    return {title: pd.DataFrame(lines) for title, lines in tables.items() if lines}
 
 
 def _methods(main: pd.DataFrame) -> Lines:
@@ -226,16 +212,13 @@ def _starts(frame: pd.DataFrame) -> Lines:
 def _noise(frame: pd.DataFrame) -> Lines:
     scenes = [(scene, "test.psnr", cells) for (scene,), cells in each(frame, "scene")]
     lines = []
-    for name, measure, cells in [
-        *scenes[: len(scenes) if len(scenes) > 1 else 0],
-        *(("all cells", m, frame) for m in QUALITY),
-    ]:
+    for name, measure, cells in [*(scenes if len(scenes) > 1 else []), *(("all cells", m, frame) for m in QUALITY)]:
         noise = noise_floor(wide(cells, measure))
         label = {"test.psnr": "PSNR [dB]", LPIPS: "LPIPS"}.get(measure, "SSIM")
         line = {"scene": name, "measure": label, "groups": str(noise.groups), "degrees of freedom": str(noise.freedom)}
         numbers = {"sd between seeds": noise.sd, "two single runs": noise.between_means(1)}
         numbers |= {f"two means of {n}": noise.between_means(n) for n in (3, 5)}
-        numbers["best of 5 over the mean"] = noise.best_of_five_gain()
+        numbers["best of 5 over the mean"] = BEST_OF_5 * noise.sd
         if noise.freedom:
             lines.append(line | {key: f"{value:.{QUALITY[measure] + 1}f}" for key, value in numbers.items()})
     return lines

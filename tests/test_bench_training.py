@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from kgs.bench.study import knobs
-from kgs.bench.study.knobs import KNOBS, fit_cell, knob_cells, write_knobs
+from kgs.bench import training
+from kgs.bench.training import KNOBS, fit_cell, knob_cells, write_knobs
 from kgs.fit.config import FitConfig
 
 
@@ -48,7 +48,7 @@ def test_summary_is_mean_and_deviation_over_seeds(tmp_path):
 
 
 def test_a_fit_of_a_cell(monkeypatch):
-    monkeypatch.setattr(knobs, "SIZE", (30, 40))
+    monkeypatch.setattr(training, "SIZE", (30, 40))
     result = fit_cell({"scene": "synthetic", "seed": 0, "steps": 5, "max_gaussians": 300})
     assert result["curve"][-1]["step"] == 5
     assert result["psnr"] == pytest.approx(result["curve"][-1]["test_psnr"], abs=1e-3)
