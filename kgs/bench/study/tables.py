@@ -57,7 +57,8 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
     order = {name: k for k, name in enumerate([*frame.scene.unique(), *STARTS, *METHODS])}
     places = frame[["scene", "start", "method"]].apply(lambda column: column.map(order)).fillna(len(order))
-    return frame.iloc[places.assign(views=frame.views).sort_values(list(KEYS), kind="stable").index]
+    places = pd.DataFrame(places).assign(views=frame.views).sort_values(list(KEYS), kind="stable")
+    return frame.iloc[places.index]
 
 
 def each(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
