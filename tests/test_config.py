@@ -1,6 +1,11 @@
-import json
-from itertools import pairwise
+"""Every number of a fit: ranges, kinds, and the steps that follow from them."""
 
+import json
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from kgs.fit.config import FitConfig, Recipe, timetable
@@ -39,10 +44,39 @@ def test_config_survives_json():
     assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"drop": 1.0}, {"drop": -0.1}, {"sh_degree": 4}, {"evaluations": 0}])
-def test_numbers_out_of_range_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        FitConfig(**wrong)
+WRONG = {
+    "steps": (0, True, 2.0, "3", None, 10**8, 10**400, np.bool_(True)),
+    "drop": (1.0, -0.1, math.nan, None, "0.2", True),
+    "opacity_l1": (-0.1, math.inf, 10**400),
+    "sh_degree": (4, -1),
+    "evaluations": (0,),
+    "max_gaussians": (0, -5, True, 1.5),
+    "seed": (2**59, 1.5),
+    "init": ("points", None, ["dense"], "file"),
+    "init_file": ("a.ply", 3, ""),
+    "device": (None, 0),
+    "recipe": (None, {}),
+    "max_bytes": (0,),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
+def test_values_out_of_range_or_of_another_kind_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"^{'init_file' if value == 'file' else name}: expected"):
+        FitConfig(**{name: value})
+
+
+@pytest.mark.parametrize("wrong", [{"lr_means": 0}, {"lr_sh_dc": -1}, {"reset_opacity": 1.0}, {"adam_eps": math.nan}])
+def test_the_recipe_is_held_to_its_ranges_too(wrong):
+    with pytest.raises(ValueError, match=rf"^{next(iter(wrong))}: expected"):
+        Recipe(**wrong)
+
+
+def test_numpys_numbers_and_paths_as_text_become_pythons():
+    config = FitConfig(steps=np.int64(7), drop=np.float32(0.5), max_gaussians=np.int32(9), init="file", init_file="a")
+    assert [type(x) for x in (config.steps, config.drop, config.max_gaussians)] == [int, float, int]
+    assert config.init_file == Path("a")
+    assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 def test_unknown_entry_is_refused():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,7 @@ def at_step(trainer: Trainer, step: int, act: Any) -> None:
     trainer._descend = descend  # type: ignore[method-assign]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_step_and_saves(trainer: Trainer, tmp_path: Path, number: int) -> None:
     handler = signal.getsignal(number)
     at_step(trainer, 9, lambda: os.kill(os.getpid(), number))
@@ -146,3 +147,24 @@ def test_memory_is_foretold(scene: Any, tmp_path: Path) -> None:
     lines: list[str] = []
     fit_scene(scene, replace(CONFIG, steps=2), tmp_path, say=lines.append)
     assert any(line.startswith("memory: at most ") and "300 Gaussians" in line for line in lines)
+
+
+def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        at_step(trainer, 3, lambda: os.kill(os.getpid(), signal.SIGHUP))
+        assert train(trainer, tmp_path / CHECKPOINT) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert trainer.step == 24
+
+
+def test_nobody_has_to_listen(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    """stdout and stderr closed by their readers: the results are written all the same."""
+    for name in ("stdout", "stderr"):
+        reader, writer = os.pipe()
+        os.close(reader)
+        monkeypatch.setattr(sys, name, open(writer, "w"))  # noqa: SIM115  # closed by nobody, as a shell's
+    fit_scene(scene, replace(CONFIG, steps=2), tmp_path)
+    monkeypatch.undo()
+    assert (tmp_path / "metrics.json").is_file()

@@ -213,7 +213,7 @@ def _digest(*tensors: Tensor) -> str:
     checksum = hashlib.sha256()
     for tensor in tensors:
         checksum.update(f"{tensor.dtype} {tuple(tensor.shape)} ".encode())
-        checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+        checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return checksum.hexdigest()
 
 

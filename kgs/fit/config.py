@@ -7,7 +7,6 @@ another densification threshold and without pruning by size.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
-from functools import lru_cache
 from itertools import pairwise
 from numbers import Integral, Real
 from os import PathLike
@@ -211,16 +210,12 @@ def timetable(config: FitConfig) -> Timetable:
     )
 
 
-@lru_cache
-def _hints(cls: type) -> dict[str, Any]:
-    return get_type_hints(cls, include_extras=True)
-
-
 def _check(config: FitConfig | Recipe) -> None:
     """Hold each entry against its annotation; NumPy's numbers and paths given as text become Python's own."""
+    hints = get_type_hints(type(config), include_extras=True)
     for entry in fields(config):
-        value, hint = getattr(config, entry.name), _hints(type(config))[entry.name]
-        plain, expected = _plain(value, hint)
+        value = getattr(config, entry.name)
+        plain, expected = _plain(value, hints[entry.name])
         if plain is None and value is not entry.default:
             raise ValueError(f"{entry.name}: expected {expected}, got {str(value)[:60]!r}")
         object.__setattr__(config, entry.name, plain)
@@ -237,9 +232,9 @@ def _plain(value: Any, hint: Any) -> tuple[Any, str]:
     kind, limits = get_args(hint)
     is_whole = kind is not float
     expected = f"a {'whole' if is_whole else 'finite'} number {limits}"
-    if isinstance(value, bool) or not isinstance(value, Integral if is_whole else Real) or not limits.holds(value):
-        return None, expected
-    return int(value) if is_whole else float(value), expected
+    is_number = isinstance(value, Integral if is_whole else Real) and not isinstance(value, bool)
+    as_python: Any = int if is_whole else float
+    return as_python(value) if is_number and limits.holds(value) else None, expected
 
 
 # A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps at twice the

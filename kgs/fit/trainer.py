@@ -87,7 +87,7 @@ class Trainer:
 
     def _build(self, model: GaussianModel) -> None:
         config, recipe, most = self.config, self.config.recipe, self.config.max_gaussians
-        self.max_gaussians = max(10 * config.steps, 2 * self.init["points"]) if most is None else most
+        self.max_gaussians = max(10 * config.steps, 2 * int(self.init["points"])) if most is None else most
         self.model = model.to(self.device)
         self.optimizer = adam(self.model, recipe)
         self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=10 * config.seed + 1) if config.drop else None
