@@ -43,9 +43,11 @@ Row = dict[str, Any]
 def extremes(*, out: Path, quick: bool = False) -> int:
     """Errors, bounds and times of stiff and extreme cases on this machine.
 
-    Writes extremes.csv, extremes.json and extremes.md. A minute, or seconds:
+    For example:
       kgs bench extremes -o extremes
       kgs bench extremes -o extremes --quick
+
+    Writes extremes.csv, extremes.json and extremes.md in a minute, with --quick in seconds.
 
     Args:
         out: folder for the results, made if it is not there.

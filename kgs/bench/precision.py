@@ -60,9 +60,11 @@ _COLUMNS |= {"exact, float32": EXACT, "exact, float64": EXACT64}
 def precision(*, out: Path, quick: bool = False) -> None:
     """Errors of images, gradients and footprints against the time they take, for each knob of the renderer.
 
-    Writes precision.csv, precision.json, precision.md, render.png and gradients.png. Five minutes, or half a one:
+    For example:
       kgs bench precision -o precision
       kgs bench precision -o precision --quick
+
+    Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
 
     Args:
         out: folder for the results, made if it is not there.

@@ -43,9 +43,11 @@ Row = dict[str, Any]
 def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     """Time and memory of renders and training steps on this machine, by stage and by what is asked for.
 
-    Writes speed.csv, speed.json, speed.md and scaling.png. Minutes, or tens of seconds on a GPU:
+    For example:
       kgs bench speed -o speed
       kgs bench speed -o speed --quick --device cuda
+
+    Writes speed.csv, speed.json, speed.md and scaling.png in minutes, with --quick in tens of seconds.
 
     Args:
         out: folder for the results, made if it is not there.

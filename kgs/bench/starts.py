@@ -50,12 +50,14 @@ Row = dict[str, Any]
 def starts(*, out: Path, quick: bool = False) -> None:
     """Depth errors, completeness and times of the first points of a fit.
 
+    For example:
+      KGS_DATA=SCENES kgs bench starts -o starts
+      kgs bench starts -o starts --quick
+
+    Writes starts.csv, starts.json and starts.md in 20 minutes, with --quick in 10 seconds.
     The synthetic scene has exact depths. Real scenes, in the folder of the environment variable KGS_DATA, have counts
     and times; three views are also compared with the points of a COLMAP model where there is one, which were refined
     with the test views too and are not exact. (Most of many views that such a point projects into do not observe it.)
-    Writes starts.csv, starts.json and starts.md. Twenty minutes, or ten seconds:
-      KGS_DATA=SCENES kgs bench starts -o starts
-      kgs bench starts -o starts --quick
 
     Args:
         out: folder for the results, made if it is not there.
