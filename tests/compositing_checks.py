@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import factories
 import torch
 from factories import random_camera, random_gaussians
 
-from kgs import ProjectedGaussians, project
+from kgs import project
 
 TH, STOP = 1 / 255, 1e-4
 
@@ -16,24 +17,11 @@ DTYPES = [torch.float32, torch.float64]
 def footprints(opacities, centres=None, factors=None, depths=None, size=(3, 4), dtype=torch.float64, eps2d=0.0):
     """Hand-made projected Gaussians, front to back; without `factors` so wide that alpha is the same everywhere."""
     opacities = torch.as_tensor(opacities, dtype=dtype)
-    n = opacities.shape[0]
-    if factors is None:
-        factors = torch.eye(2, 3, dtype=dtype).mul(1e9).expand(n, 2, 3)
-    return ProjectedGaussians(
-        camera_ids=torch.zeros(n, dtype=torch.int64),
-        gaussian_ids=torch.arange(n),
-        means2d=torch.zeros(n, 2, dtype=dtype) if centres is None else torch.as_tensor(centres, dtype=dtype),
-        factors=torch.as_tensor(factors, dtype=dtype),
-        depths=torch.arange(1, n + 1).to(dtype) if depths is None else torch.as_tensor(depths, dtype=dtype),
-        radii=torch.ones(n, dtype=dtype),
-        opacities=opacities,
-        colors=torch.zeros(n, 3, dtype=dtype),
-        image_size=size,
-        num_cameras=1,
-        num_gaussians=n,
-        num_nonfinite=torch.tensor(0),
-        eps2d=eps2d,
-    )
+    wide = torch.eye(2, 3, dtype=dtype).mul(1e9).expand(len(opacities), 2, 3)
+    factors = wide if factors is None else torch.as_tensor(factors, dtype=dtype)
+    centres = torch.zeros(len(opacities), 2) if centres is None else torch.as_tensor(centres, dtype=dtype)
+    changes = {} if depths is None else {"depths": torch.as_tensor(depths, dtype=dtype)}
+    return factories.footprints(centres.to(dtype), factors, opacities, size, eps2d, **changes)
 
 
 def leaves(projected, features):

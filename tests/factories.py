@@ -17,7 +17,7 @@ from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
 __all__ += ["pinhole", "posed", "random_camera", "random_cloud", "random_gaussians", "random_model", "random_opacities"]
-__all__ += ["random_scene", "random_views", "replace", "select", "splat_columns", "with_camera", "wide_footprints"]
+__all__ += ["random_scene", "random_views", "replace", "select", "splat_columns", "with_camera"]
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -223,16 +223,6 @@ def footprints(
         eps2d=eps2d,
     )
     return dataclasses.replace(made, **changes)
-
-
-def wide_footprints(
-    opacities: Any, size: tuple[int, int] = (3, 4), dtype: torch.dtype = torch.float64, **changes: Any
-) -> ProjectedGaussians:
-    """Footprints so wide that alpha is the opacity in every pixel."""
-    opacities = torch.as_tensor(opacities, dtype=dtype)
-    m = len(opacities)
-    factors = torch.eye(2, 3, dtype=dtype).mul(1e9).expand(m, 2, 3)
-    return footprints(torch.zeros(m, 2, dtype=dtype), factors, opacities, size, 0.0, **changes)
 
 
 # -- the layer -----------------------------------------------------------------------------------------------------

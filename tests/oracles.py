@@ -91,6 +91,7 @@ def real_harmonic(index: int, polar: mpf, azimuth: mpf) -> mpf:
 
 def quaternion_product(p: Tensor, q: Tensor) -> Tensor:
     """Hamilton's product of quaternions w, x, y, z."""
+    p, q = torch.broadcast_tensors(p, q)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + torch.linalg.cross(p[..., 1:], q[..., 1:], dim=-1)
     return torch.cat([p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdim=True), vector], -1)
 

@@ -1,7 +1,7 @@
 """What tests of the reference have in common."""
 
 import torch
-from factories import pinhole
+from factories import FIELDS, pinhole
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -10,19 +10,12 @@ from kgs import Gaussians
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 
 
-NAMES = ("means", "quats", "scales", "opacities", "colors")
-
-
 def tensor(*values: object) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
 def fields(gaussians: Gaussians) -> dict[str, Tensor]:
-    return {name: getattr(gaussians, name) for name in NAMES}
-
-
-def replace(gaussians: Gaussians, **changes: Tensor) -> Gaussians:
-    return Gaussians(**{**fields(gaussians), **changes})
+    return {name: getattr(gaussians, name) for name in FIELDS}
 
 
 def posed(camera: PinholeCamera, **changes: Tensor) -> PinholeCamera:

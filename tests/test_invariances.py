@@ -4,8 +4,9 @@ import dataclasses
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import join, pinhole, random_camera, random_gaussians, select, with_camera
 from kornia.geometry.camera import PinholeCamera
+from oracles import quaternion_product
 
 from kgs import GaussianRenderer, Gaussians
 
@@ -19,24 +20,6 @@ SEEDS = [0, 1]
 
 def scene(seed, dtype, n=150, size=(40, 56), sh_degree=2):
     return random_gaussians(n, seed, dtype, sh_degree), random_camera(*size, seed, dtype)
-
-
-def with_pose(camera, extrinsics):
-    return PinholeCamera(camera.intrinsics, extrinsics.to(camera.extrinsics), camera.height, camera.width)
-
-
-def rows(gaussians, ids):
-    return Gaussians(*(getattr(gaussians, name)[ids] for name in FIELDS))
-
-
-def join(a, b):
-    return Gaussians(*(torch.cat([getattr(a, name), getattr(b, name)]) for name in FIELDS))
-
-
-def multiply(p, q):
-    """Product of quaternions w, x, y, z."""
-    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + torch.linalg.cross(p[..., 1:], q[..., 1:], dim=-1)
-    return torch.cat([p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdim=True), vector], -1)
 
 
 def assert_same(a, b, names=OUTPUTS):
@@ -57,7 +40,7 @@ def test_the_order_of_the_gaussians_does_not_matter(seed, dtype, _):
     assert len(gaussians.means[:, 2].unique()) == len(gaussians)
     order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(seed))
     inputs = [
-        [getattr(g, name).clone().requires_grad_() for name in FIELDS] for g in (gaussians, rows(gaussians, order))
+        [getattr(g, name).clone().requires_grad_() for name in FIELDS] for g in (gaussians, select(gaussians, order))
     ]
     outs = [GaussianRenderer()(Gaussians(*values), camera, outputs=OUTPUTS) for values in inputs]
     assert_same(*outs)
@@ -77,19 +60,19 @@ def test_rigid_motion_of_world_and_camera(seed, dtype, bound):
 
     def rotate(points):
         pure = torch.cat([points.new_zeros(len(points), 1), points], 1)
-        return multiply(multiply(turn.expand_as(pure), pure), conjugate.expand_as(pure))[:, 1:]
+        return quaternion_product(quaternion_product(turn.expand_as(pure), pure), conjugate.expand_as(pure))[:, 1:]
 
     moved = dataclasses.replace(
         gaussians,
         means=rotate(gaussians.means) + shift,
-        quats=multiply(turn.expand_as(gaussians.quats), gaussians.quats),
+        quats=quaternion_product(turn.expand_as(gaussians.quats), gaussians.quats),
     )
     back = torch.eye(4, dtype=torch.float64)
     back[:3, :3] = rotate(torch.eye(3, dtype=torch.float64))  # its rows are the rotated axes: the inverse rotation
     back[:3, 3] = -back[:3, :3] @ shift
     first = Gaussians(*(getattr(gaussians, name).to(dtype) for name in FIELDS))
     second = Gaussians(*(getattr(moved, name).to(dtype) for name in FIELDS))
-    posed = with_pose(camera, camera.extrinsics @ back)
+    posed = with_camera(camera, camera.extrinsics @ back)
     cameras = [
         PinholeCamera(c.intrinsics.to(dtype), c.extrinsics.to(dtype), c.height, c.width) for c in (camera, posed)
     ]
@@ -103,7 +86,7 @@ def test_translation_keeps_the_view_dependent_colour(dtype, bound):
     moved = dataclasses.replace(gaussians, means=gaussians.means + shift)
     pose = camera.extrinsics.clone()
     pose[0, :3, 3] -= pose[0, :3, :3] @ shift
-    assert difference(EXACT, (gaussians, camera), (moved, with_pose(camera, pose))) <= bound
+    assert difference(EXACT, (gaussians, camera), (moved, with_camera(camera, pose))) <= bound
 
 
 @pytest.mark.parametrize(("dtype", "bound"), DTYPES)
@@ -116,13 +99,13 @@ def test_scale_of_the_world(scale, dtype, bound):
     options = {"alpha_threshold": 0, "transmittance_stop": 0}
     a = EXACT(gaussians, camera, outputs=("image", "depth"))
     renderer = GaussianRenderer(near_plane=0.01 * scale, **options)
-    b = renderer(larger, with_pose(camera, pose), outputs=("image", "depth"))
+    b = renderer(larger, with_camera(camera, pose), outputs=("image", "depth"))
     assert (a.image - b.image).abs().max() <= bound
     solid = 1 - EXACT(gaussians, camera, outputs=("alpha",)).alpha < 0.9
     assert ((a.depth - b.depth / scale).abs() * solid).max() <= 20 * bound
     # and with the default near plane a small world is behind it
     if scale <= 1e-3:
-        assert len(GaussianRenderer()(larger, with_pose(camera, pose)).projected) == 0
+        assert len(GaussianRenderer()(larger, with_camera(camera, pose)).projected) == 0
 
 
 @pytest.mark.parametrize(("dtype", "bound"), DTYPES)
@@ -191,7 +174,7 @@ def test_crop_is_the_window_of_the_whole(window, dtype, bound):
     x, y = EXACT(gaussians, camera).projected.means2d.unbind(1)
     inside = (x > left - 0.5 - 0.15 * width) & (x < left + width - 0.5 + 0.15 * width)
     inside &= (y > top - 0.5 - 0.15 * height) & (y < top + height - 0.5 + 0.15 * height)
-    gaussians = rows(gaussians, inside)
+    gaussians = select(gaussians, inside)
     assert len(gaussians) > 0
     intrinsics = camera.intrinsics.clone()
     intrinsics[:, 0, 2] -= left
@@ -224,7 +207,7 @@ def test_an_integer_shift_of_the_principal_point_shifts_the_image():
     gaussians = random_gaussians(30, 0)
     inner = EXACT(gaussians, pinhole(24, 32, (30.0, 30.0), (15.0, 11.0))).projected.means2d
     x, y = inner.unbind(1)
-    gaussians = rows(gaussians, (x > 0) & (x < 31) & (y > 0) & (y < 23))
+    gaussians = select(gaussians, (x > 0) & (x < 31) & (y > 0) & (y < 23))
     assert len(gaussians) > 5
     plain = EXACT(gaussians, pinhole(24, 32, (30.0, 30.0), (15.0, 11.0))).image
     shifted = EXACT(gaussians, pinhole(24, 32, (30.0, 30.0), (17.0, 10.0))).image

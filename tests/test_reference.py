@@ -6,9 +6,9 @@ import math
 import mpmath
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians, replace
 from oracles import mpmath_pixels, real_harmonic, theta_mass
-from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, grid, one, replace, stack, tensor
+from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, grid, one, stack, tensor
 from torch import Tensor
 
 from kgs import Gaussians

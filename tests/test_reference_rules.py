@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
 from oracles import near_threshold
-from reference_checks import BLUE, EXACT, GREEN, NAMES, RED, SMALL, fields, grid, one, posed, replace, stack, tensor
+from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, grid, one, posed, stack, tensor
 
 from kgs import Gaussians
 from kgs.reference import layers, render
@@ -37,11 +37,11 @@ def test_gaussians_behind_the_camera_change_no_bit():
     gaussians, camera = random_gaussians(20, 10), random_camera(8, 9, 10)
     behind = random_gaussians(1000, 11)
     behind = replace(behind, means=behind.means * tensor(1, 1, -1))
-    both = Gaussians(*(torch.cat([getattr(behind, name), getattr(gaussians, name)]) for name in NAMES))
+    both = Gaussians(*(torch.cat([getattr(behind, name), getattr(gaussians, name)]) for name in FIELDS))
     assert torch.equal(render(gaussians, camera), render(both, camera))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_gaussian_that_is_not_finite_is_left_out(name, value):
     gaussians, camera = random_gaussians(10, 12, sh_degree=1), random_camera(8, 9, 12)
@@ -51,7 +51,7 @@ def test_a_gaussian_that_is_not_finite_is_left_out(name, value):
     extrinsics = camera.extrinsics[0].clone().requires_grad_()
     image = render(Gaussians(**leaves), posed(camera, extrinsics=extrinsics))
     keep = torch.arange(10) != 4
-    others = Gaussians(*(getattr(gaussians, key)[keep] for key in NAMES))
+    others = Gaussians(*(getattr(gaussians, key)[keep] for key in FIELDS))
     assert torch.equal(image, render(others, camera))
     image.sum().backward()
     assert extrinsics.grad.isfinite().all()

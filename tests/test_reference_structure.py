@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians, replace
 from kornia.geometry.camera import PinholeCamera
-from oracles import enumerate_drops
-from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, posed, replace, stack, tensor
+from oracles import enumerate_drops, quaternion_product
+from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, posed, stack, tensor
 from torch import Tensor
 
 import kgs.reference
@@ -79,11 +79,6 @@ def turn(axis: Tensor, angle: float) -> tuple[Tensor, Tensor]:
     quat = torch.cat([tensor(math.cos(angle / 2)), math.sin(angle / 2) * axis])
     generators = torch.stack([torch.linalg.cross(axis, column) for column in torch.eye(3).double()], 1)
     return quat, torch.linalg.matrix_exp(angle * generators)
-
-
-def quaternion_product(p: Tensor, q: Tensor) -> Tensor:
-    w, v, a, b = p[:1], p[1:], q[:, :1], q[:, 1:]
-    return torch.cat([w * a - b @ v[:, None], w * b + a * v + torch.linalg.cross(v.expand_as(b), b)], 1)
 
 
 def test_moving_world_and_camera_together_changes_nothing():

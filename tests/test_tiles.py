@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from factories import random_camera, random_gaussians
-from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, packed, scene
+from factories import footprints, random_camera, random_gaussians
+from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, scene
 
 from kgs import Gaussians, project
 from kgs.raster.tiles import Reach, bin_to_tiles
@@ -17,7 +17,7 @@ def needles(seed, ratio, size=(45, 67)):
     across = torch.stack([-along[:, 1], along[:, 0]], 1)
     factors = torch.stack([0.5 * ratio * along, 0.5 * across, torch.zeros_like(along)], 2)
     means2d = random[:, 1:3] * torch.tensor([size[1], size[0]])
-    return packed(means2d, factors, random[:, 3] * 0.9 + 0.1, size)
+    return footprints(means2d, factors, random[:, 3] * 0.9 + 0.1, size)
 
 
 def strengths(projected, tile_size):
@@ -85,7 +85,7 @@ def test_a_single_pixel_just_above_the_threshold_is_enough(width, length):
     inverse = torch.linalg.inv(wide @ wide.mT + 0.3 * torch.eye(2, dtype=torch.float64))
     d = torch.tensor([edge, 7.0]) - means2d.double()
     reach = torch.exp(((d[:, None] @ inverse) * d[:, None]).sum((1, 2)) / 2)
-    bins = bin_to_tiles(packed(means2d, factors, (THRESHOLD * reach * (1 + 1e-5)).float(), (8, width)))
+    bins = bin_to_tiles(footprints(means2d, factors, (THRESHOLD * reach * (1 + 1e-5)).float(), (8, width)))
     reachable = THRESHOLD * reach < 2
     last = bins.ids[bins.entries[bins.offsets[-2] :].long()]
     assert reachable.sum() > 1000
@@ -128,7 +128,7 @@ def test_opacity_zero_or_below_the_threshold_is_in_no_tile(threshold):
     opacities = projected.opacities.clone()
     opacities[::3] = 0
     opacities[1::3] *= 1 if threshold == 0 else 1e-3
-    projected = packed(projected.means2d, projected.factors, opacities, projected.image_size)
+    projected = footprints(projected.means2d, projected.factors, opacities, projected.image_size)
     got = listed(projected, bin_to_tiles(projected, 8, threshold)).any(1)
     assert not got[::3].any()
     assert got[1::3].any() == (threshold == 0)
@@ -148,7 +148,9 @@ def test_opacities_above_one_reach_farther():
 
 @pytest.mark.parametrize("huge", [1e3, 1e6, 1e12])
 def test_a_gaussian_larger_than_the_world_is_in_every_tile(huge):
-    projected = packed(torch.tensor([[1e3, -1e3]]), huge * torch.eye(2, 3)[None] * 1e3, torch.tensor([0.5]), (45, 67))
+    projected = footprints(
+        torch.tensor([[1e3, -1e3]]), huge * torch.eye(2, 3)[None] * 1e3, torch.tensor([0.5]), (45, 67)
+    )
     assert listed(projected, bin_to_tiles(projected)).all()
 
 
@@ -177,7 +179,9 @@ def test_each_tile_is_sorted_by_depth_and_ties_by_index():
 def test_many_ties_and_negative_depths():
     projected = scene(0, n=300)
     for depths in ((projected.depths * 2).round(), -projected.depths, torch.zeros_like(projected.depths)):
-        tied = packed(projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths)
+        tied = footprints(
+            projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths
+        )
         check_structure(tied, bin_to_tiles(tied))
 
 

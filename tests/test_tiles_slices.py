@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from tile_checks import THRESHOLD, check_structure, dots, listed, packed, scene, tiles_of_entries
+from factories import footprints
+from tile_checks import THRESHOLD, check_structure, dots, listed, scene, tiles_of_entries
 
 from kgs.raster.tiles import Reach, bin_to_tiles
 
@@ -21,7 +22,7 @@ def test_tile_numbers_beyond_16_bits(cameras):
     row, column = row[order], column[order]
     means2d = torch.stack([column * 4 + 1.5, row * 4 + 1.5], 1)
     depths = torch.rand(m, generator=generator)
-    projected = dots(means2d, (height, width), 0.2, camera_ids=camera, cameras=cameras, depths=depths)
+    projected = dots(means2d, (height, width), 0.2, camera_ids=camera, num_cameras=cameras, depths=depths)
     bins = bin_to_tiles(projected, 4)
     assert bins.num_tiles == cameras * 16 * 1024
     check_structure(projected, bins)
@@ -47,7 +48,7 @@ def test_a_batch_of_cameras_is_its_cameras_one_by_one():
     table = listed(together, bins).reshape(len(together), cameras, -1)
     for c in range(cameras):
         own = together.camera_ids == c
-        single = packed(*(x[own] for x in (together.means2d, together.factors, together.opacities)), (45, 67))
+        single = footprints(*(x[own] for x in (together.means2d, together.factors, together.opacities)), (45, 67))
         assert torch.equal(table[own, c], listed(single, bin_to_tiles(single)))
         assert not table[own][:, torch.arange(cameras) != c].any()
 

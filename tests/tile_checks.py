@@ -3,9 +3,9 @@
 import functools
 
 import torch
-from factories import random_camera, random_gaussians
+from factories import footprints, random_camera, random_gaussians
 
-from kgs import ProjectedGaussians, project
+from kgs import project
 
 THRESHOLD = 1 / 255
 
@@ -13,30 +13,10 @@ THRESHOLD = 1 / 255
 INTEGERS = ("offsets", "entries", "ids", "by_gaussian", "gaussian_offsets")
 
 
-def packed(means2d, factors, opacities, size, camera_ids=None, depths=None, cameras=1, eps2d=0.3):
-    """What `project` would have returned."""
-    m = len(means2d)
-    return ProjectedGaussians(
-        camera_ids=torch.zeros(m, dtype=torch.int64) if camera_ids is None else camera_ids,
-        gaussian_ids=torch.arange(m),
-        means2d=means2d,
-        factors=factors,
-        depths=torch.arange(1, m + 1).to(means2d) if depths is None else depths,
-        radii=torch.ones(m).to(means2d),
-        opacities=opacities,
-        colors=torch.ones(m, 3).to(means2d),
-        image_size=size,
-        num_cameras=cameras,
-        num_gaussians=m,
-        num_nonfinite=torch.tensor(0),
-        eps2d=eps2d,
-    )
-
-
 def dots(means2d, size, opacity=0.9, **options):
     """Round footprints of variance 0.3 px^2."""
     means2d = torch.as_tensor(means2d, dtype=torch.float32).reshape(-1, 2)
-    return packed(means2d, torch.zeros(len(means2d), 2, 3), torch.full((len(means2d),), opacity), size, **options)
+    return footprints(means2d, torch.zeros(len(means2d), 2, 3), torch.full((len(means2d),), opacity), size, **options)
 
 
 @functools.cache
@@ -46,7 +26,7 @@ def scene(seed, dtype=torch.float32, size=(45, 67), n=150, cameras=1):
     names = ("means2d", "factors", "opacities", "depths")
     fields = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     camera_ids = torch.cat([torch.full((len(part),), c) for c, part in enumerate(parts)])
-    return packed(size=size, camera_ids=camera_ids, cameras=cameras, **fields)
+    return footprints(size=size, camera_ids=camera_ids, num_cameras=cameras, **fields)
 
 
 def tiles_of_entries(bins):
