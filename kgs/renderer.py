@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -85,13 +86,9 @@ class GaussianRenderer(nn.Module):
         RasterOptions(tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes)
         check_backend(backend)
         self.opacity_layer = nn.Identity() if opacity_layer is None else opacity_layer
-        self.tile_size = tile_size
-        self.near_plane = near_plane
-        self.eps2d = eps2d
-        self.alpha_threshold = alpha_threshold
-        self.transmittance_stop = transmittance_stop
-        self.max_bytes = max_bytes
-        self.backend = backend
+        self.tile_size, self.near_plane, self.eps2d = tile_size, near_plane, eps2d
+        self.alpha_threshold, self.transmittance_stop = alpha_threshold, transmittance_stop
+        self.max_bytes, self.backend = max_bytes, backend
 
     def forward(
         self,
@@ -121,15 +118,9 @@ class GaussianRenderer(nn.Module):
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
             gaussians = dataclasses.replace(gaussians, opacities=opacities)
-        projected = project(
-            gaussians,
-            cameras,
-            near_plane=self.near_plane,
-            eps2d=self.eps2d,
-            alpha_threshold=self.alpha_threshold,
-            colors="image" in wanted,
-            backend=self.backend,
-        )
+        rules: dict[str, Any] = {"alpha_threshold": self.alpha_threshold, "backend": self.backend}
+        image = "image" in wanted
+        projected = project(gaussians, cameras, near_plane=self.near_plane, eps2d=self.eps2d, colors=image, **rules)
         if projected.means2d.requires_grad:
             projected.means2d.retain_grad()
         features = {"image": projected.colors}
@@ -141,11 +132,10 @@ class GaussianRenderer(nn.Module):
             projected,
             torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors,
             tile_size=self.tile_size,
-            alpha_threshold=self.alpha_threshold,
             transmittance_stop=self.transmittance_stop,
             median_depth="median_depth" in wanted,
             max_bytes=self.max_bytes,
-            backend=self.backend,
+            **rules,
         )
         alpha = 1.0 - result.transmittance
         ends = accumulate((x.shape[1] for x in features.values()), initial=0)
@@ -154,7 +144,7 @@ class GaussianRenderer(nn.Module):
             covered = alpha >= 1e-6
             found["depth"] = torch.where(covered, found["depth"] / torch.where(covered, alpha, 1.0), 0.0)
         return Rendering(
-            image=blend(found["image"], result.transmittance, background) if "image" in wanted else None,
+            image=blend(found["image"], result.transmittance, background) if image else None,
             alpha=alpha if "alpha" in wanted else None,
             depth=found.get("depth"),
             median_depth=result.median_depth,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -54,13 +55,13 @@ class RasterOptions:
 
     def __post_init__(self) -> None:
         for name in ("tile_size", "max_bytes"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            value: Any = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
                 raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
         ends = {"near_plane": math.inf, "eps2d": math.inf, "alpha_threshold": 1, "transmittance_stop": 1}
         for name, most in ends.items():
             value = getattr(self, name)
-            if not isinstance(value, int | float) or not 0.0 <= value < most:
+            if not isinstance(value, Real) or not 0.0 <= float(value) < most:
                 raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 
+import numpy as np
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -191,6 +192,11 @@ def test_features_of_any_width_are_colours():
 def test_options_are_checked_in_one_place(name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected"):
         kgs.RasterOptions(**{name: value})
+
+
+def test_options_may_be_numbers_of_numpy():
+    made = kgs.RasterOptions(tile_size=np.int64(16), near_plane=np.float32(0.5))
+    assert (made.tile_size, made.near_plane) == (16, 0.5)
 
 
 def test_every_default_is_that_of_the_options():
