@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -94,3 +96,10 @@ def test_the_coarse_share_is_counted_in_steps():
 def test_shares_are_from_0_to_1(name, value):
     with pytest.raises(ValueError, match=name):
         FitConfig(**{name: value})
+
+
+def test_the_numbers_are_read_without_heavy_libraries():
+    code = "import sys, kgs.fit.config; print(sorted({'cv2', 'trimesh', 'matplotlib', 'tyro'} & set(sys.modules)))"
+    code += "\nfrom kgs.fit import FirstPoints, FitConfig, Trainer, first_points, fit_scene"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    assert result.stdout.strip() == "[]"

@@ -209,3 +209,11 @@ def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -
     with pytest.raises(DataError, match="expected at least 6x6 pixels, got 5x5"):
         fit(synthetic_scene(train_views=2, size=(5, 5)), CONFIG, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, tmp_path: Path) -> None:
+    fit(scene, CONFIG, tmp_path)
+    saved, trainer = load_fit(tmp_path), Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT)
+    assert (saved.config, saved.step, saved.request["scene"]) == (CONFIG, 3, "/photos")
+    camera = scene.test.camera(0)
+    assert torch.equal(saved.render(camera, scene.background), trainer.render(camera))

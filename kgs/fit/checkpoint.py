@@ -25,15 +25,7 @@ from kgs.json_files import parse_json
 
 from .config import FitConfig
 
-__all__ = [
-    "PLAIN",
-    "check_state",
-    "fingerprint",
-    "load_checkpoint",
-    "newest_checkpoint",
-    "previous",
-    "save_checkpoint",
-]
+__all__ = ["PLAIN", "check_state", "fingerprint", "load_checkpoint", "newest_checkpoint", "previous", "save_checkpoint"]
 
 _FORMAT = "kgs-checkpoint 3"
 _OLD = b"kgs-checkpoint "
@@ -239,20 +231,20 @@ def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
 
 def _sync_folder(folder: Path) -> None:
     """Make the new names survive a power cut, where the system has a way to."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _is_int(value: Any, least: int) -> bool:
     return type(value) is int and least <= value < 2**48
 
 
-def _is_number(value: Any, least: float = -1e300) -> bool:
+def is_number(value: Any, least: float = -1e300) -> bool:
+    """Whether a value of JSON is a number of that size, and no bool."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value < 1e300
 
 
@@ -262,17 +254,17 @@ def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
 
 def _is_point(value: Any) -> bool:
     keys = {"step", "seconds", "test_psnr", "train_psnr"}
-    return isinstance(value, dict) and value.keys() == keys and all(x is None or _is_number(x) for x in value.values())
+    return isinstance(value, dict) and value.keys() == keys and all(x is None or is_number(x) for x in value.values())
 
 
 # The plain values of a fit's state, what is expected of each, and whether it is so.
 PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "init": ("kind and number of first points", lambda v: v.keys() == {"kind", "points"} and _is_int(v["points"], 1)),
     "step": ("a number of steps", lambda v: _is_int(v, 0)),
-    "seconds": ("a number, not negative", lambda v: _is_number(v, 0)),
+    "seconds": ("a number, not negative", lambda v: is_number(v, 0)),
     "curve": ("a list of measurements", lambda v: _is_list(v, _is_point)),
     "notes": ("a list of texts", lambda v: _is_list(v, lambda x: isinstance(x, str))),
-    "extent": ("a number above 0", lambda v: _is_number(v, 1e-300)),
-    "near_plane": ("a number above 0", lambda v: _is_number(v, 1e-300)),
+    "extent": ("a number above 0", lambda v: is_number(v, 1e-300)),
+    "near_plane": ("a number above 0", lambda v: is_number(v, 1e-300)),
     "stack": ("a list of views", lambda v: _is_list(v, lambda x: _is_int(x, 0))),
 }

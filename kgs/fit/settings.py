@@ -16,7 +16,7 @@ from kgs.json_files import read_json
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .checkpoint import newest_checkpoint
+from .checkpoint import is_number, newest_checkpoint
 from .config import FitConfig
 from .folder import CHECKPOINT, recover
 
@@ -42,7 +42,7 @@ def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
     for name, what, is_right in (
         ("scene", "a path", lambda value: isinstance(value, str) and value and "\0" not in value),
         ("train_views", "a whole number above 0 or null", lambda v: v is None or (type(v) is int and v > 0)),
-        ("downscale", "a number of at least 1 or null", _is_downscale),
+        ("downscale", "a number of at least 1 or null", lambda v: v is None or is_number(v, 1)),
         *((name, f"one of {list(known)}", known.__contains__) for name, known in _CHOICES.items()),
     ):
         if name not in request or not is_right(request[name]):
@@ -52,12 +52,6 @@ def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
         return request, FitConfig.from_dict(settings["fit"])
     except ValueError as error:
         raise DataError(path, "fit", str(error)) from error
-
-
-def _is_downscale(value: Any) -> bool:
-    if value is None:
-        return True
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 1 <= value < 1e300
 
 
 @dataclass(frozen=True)
