@@ -100,13 +100,15 @@ def _find(words: list[str]) -> tuple[Callable[..., Any], str, list[str]]:
     if words[:1] == ["--version"]:
         from .fit.machine import versions
 
-        raise SystemExit(say("\n".join(f"{name} {version}" for name, version in versions().items())))
+        say("\n".join(f"{name} {version}" for name, version in versions().items()))
+        raise SystemExit(0)
     prog, (name, *rest) = "kgs", words or ["--help"]
     if name == "bench":
         prog, summaries, (name, *rest) = "kgs bench", _BENCHES, rest or ["--help"]
     if name in ("-h", "--help"):
         lines = [f"usage: {prog} COMMAND ...", "", *(f"  {each:<10} {text}" for each, text in summaries.items())]
-        raise SystemExit(say("\n".join([*lines, "", f"{prog} COMMAND --help lists the options and gives examples."])))
+        say("\n".join([*lines, "", f"{prog} COMMAND --help lists the options and gives examples."]))
+        raise SystemExit(0)
     if name not in summaries:
         raise SystemExit(f"expected a command of {prog}, one of {', '.join(summaries)}, got {name!r}")
     if prog == "kgs":

@@ -118,13 +118,13 @@ def fit(
         say(f"{megapixels:.1f} Mpx on a CPU: expect about {minutes:.0f} minutes; see --downscale")
     metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
     _print_metrics(metrics)
-    splat, renders = out / "splat.ply", out / "renders"
+    splat, renders, shrunk = out / "splat.ply", out / "renders", ("--downscale", downscale) if downscale else ()
     say(f"{splat}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if stopped_by:
         _next("the same command with --resume goes on where it stopped")
         return 128 + stopped_by
     _next(
-        f"{_line('kgs', 'render', splat, '--cameras', scene, '-o', renders)}  # pictures from every camera",
+        f"{_line('kgs', 'render', splat, '--cameras', scene, '-o', renders, *shrunk)}  # pictures from every camera",
         f"{_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
         _VIEWER.format(_line(splat)),
     )

@@ -149,7 +149,7 @@ def _features(net: str) -> nn.Sequential:
             layers += [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU()]
             channels = width
         else:
-            layers.append(nn.MaxPool2d(*part))
+            layers.append(nn.MaxPool2d(part[0], part[1]))
     return nn.Sequential(*layers)
 
 

@@ -66,20 +66,11 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 
 
 def measure_again(
-    path: Path,
-    metrics: dict[str, Any],
-    scene: Scene,
-    render: Callable[[PinholeCamera], Tensor],
-    lpips: Lpips | None = None,
+    path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
-    """The metrics.json of a fit with the measures of its renders taken again; without `lpips` those of LPIPS stay.
+    """What the metrics.json at `path` holds, with the measures of renders taken again; without `lpips` its LPIPS stays.
 
-    Args:
-        path: where the metrics are from, for messages.
-        metrics: what the file holds.
-        scene: the fit's.
-        render: as `evaluate` wants it.
-        lpips: as `evaluate` wants it.
+    `scene` is that of the fit; `render` and `lpips` are what `evaluate` takes.
 
     Raises:
         DataError: the views of the scene are not those that the metrics are about.
@@ -93,11 +84,8 @@ def measure_again(
             raise DataError(path, part, "expected the measures of a fit, got others") from error
         if set(known) != set(views.names):
             raise DataError(path, part, f"is about other views than the {len(views)} of {scene.root}: fit again")
-        if not known:
-            fresh[part] = None
-            continue
-        fresh[part] = new = evaluate(render, views, lpips)
-        if lpips is None:
+        fresh[part] = new = evaluate(render, views, lpips) if known else None
+        if new is not None and lpips is None:
             for row, before in [(new, old), *((row, known[row["name"]]) for row in new["views"])]:
                 row |= {key: before.get(key) for key in MEASURES if key.startswith("lpips")}
     return metrics | fresh
