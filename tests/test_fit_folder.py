@@ -115,6 +115,7 @@ def test_results_that_cannot_be_written_leave_the_old_ones(
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
 def test_a_kill_while_files_are_moved(scene: Any, tmp_path: Path, monkeypatch: Any, moves: int) -> None:
     fit(scene, CONFIG, tmp_path)
+    (tmp_path / "finished").mkdir()  # half removed
     plain, done = os.replace, []
 
     def killed(source: Any, target: Any) -> None:

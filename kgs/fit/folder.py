@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from kgs.errors import DataError
@@ -62,10 +62,8 @@ def publish(out: Path) -> None:
         OSError: a file cannot be moved; what is missing is moved by the next `end_move`.
     """
     new = out / UNFINISHED
-    names = [path.relative_to(new).as_posix() for path in sorted(new.rglob("*")) if path.is_file()]
-    write_json(new / _LIST, {"files": names})
-    with suppress(FileNotFoundError):
-        shutil.rmtree(out / _FINISHED)
+    write_json(new / _LIST, {"files": _results(new)})
+    shutil.rmtree(out / _FINISHED, ignore_errors=True)
     os.replace(new, out / _FINISHED)
     end_move(out)
 
@@ -82,16 +80,21 @@ def end_move(out: Path) -> None:
     done = out / _FINISHED
     if not (done / _LIST).exists():
         return
-    names = [str(name) for name in read_json(done / _LIST)["files"]]
+    names = [str(name) for name in read_json(done / _LIST).get("files", [])]  # of the moved ones as well
     (out / "test").mkdir(exist_ok=True)
     remove_others(out / "test", {Path(name).name for name in names if name.startswith("test/")})
     for name in _OPTIONAL:
         if name not in names:
             (out / name).unlink(missing_ok=True)
-    for name in names:
-        with suppress(FileNotFoundError):  # it was moved before
-            os.replace(done / name, out / name)
+    for name in _results(done):
+        os.replace(done / name, out / name)
     shutil.rmtree(done)
+
+
+def _results(folder: Path) -> list[str]:
+    """The files of a result, without what a kill left half written."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != _LIST]
+    return [path.relative_to(folder).as_posix() for path in files if path.name[0] != "." and path.suffix != ".partial"]
 
 
 def is_finished(out: Path) -> bool:
