@@ -4,8 +4,10 @@ import json
 import math
 import re
 import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -15,6 +17,7 @@ from kgs.bench.study import cells as cells_module
 from kgs.bench.study import grid, presets, study
 from kgs.bench.study.cells import BINS, FULL, coadaptation, count_over_threshold, revision, sparse_cell
 from kgs.bench.study.presets import METHODS, SCENES, sparse_cells
+from kgs.cli import main
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.starts import first_points
@@ -46,6 +49,23 @@ def tiny_cell(method="off", seed=0, start="sift"):
 
 
 # -- the cells ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "package"),
+    [*product(("study", "training"), ("pandas", "distributed", "matplotlib", "scipy")), ("study", "jinja2")],
+)
+def test_a_package_that_is_missing_is_named_before_any_work(command, package, tmp_path, monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.startswith(("kgs.bench.", "matplotlib."))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(SystemExit) as error:
+        main(["bench", command, "-o", str(tmp_path / "out"), *(["--quick"] if command == "training" else [])])
+    assert error.value.code == 2
+    said = capsys.readouterr().err
+    assert re.match(rf"kgs: {package}\S* is missing: ", said)
+    assert f"[{'app' if package in ('matplotlib', 'jinja2') else 'study'}]" in said
+    assert not list(tmp_path.rglob("*.jsonl"))
 
 
 @pytest.mark.parametrize("preset", ["quick", "cpu", "paper"])

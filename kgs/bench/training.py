@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FAST, FitConfig
@@ -128,8 +129,6 @@ def _knob(cell: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plot(path: Path, table: pd.DataFrame) -> None:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(5.5 * table.scene.nunique(), 4), layout="constrained")
     axes = figure.subplots(1, table.scene.nunique(), squeeze=False)[0]
     for axis, (scene, lines) in zip(axes, table.groupby("scene", sort=False), strict=True):

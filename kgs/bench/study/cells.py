@@ -141,9 +141,7 @@ def _full_model(scene: Scene, seed: int) -> FirstPoints:
     return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
 
 
-@lru_cache(maxsize=1)
-def _lpips(weights: str) -> Lpips:
-    return Lpips.load(weights)
+_lpips = lru_cache(maxsize=1)(Lpips.load)
 
 
 @torch.no_grad()

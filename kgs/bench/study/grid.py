@@ -20,6 +20,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from distributed import Client, KilledWorker, LocalCluster, Security, wait
+from distributed.core import rpc
+
 __all__ = ["Cell", "finished_rows", "read_rows", "run_grid"]
 
 Cell = dict[str, Any]
@@ -75,7 +78,10 @@ def run_grid(
                         failed += 1
                         say(f"failed: {_key(cell)}: {type(outcome).__name__}: {outcome}")
                     else:
-                        _append(path, {"cell": cell, "result": outcome})
+                        with path.open("a", encoding="utf-8") as file:
+                            file.write(json.dumps({"cell": cell, "result": outcome}, sort_keys=True) + "\n")
+                            file.flush()
+                            os.fsync(file.fileno())
                         say(f"{count} of {len(missing)}: {_key(cell)}")
     if failed:
         say(f"{failed} of {len(missing)} cells failed; run again to try them once more")
@@ -117,8 +123,6 @@ def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
 @contextmanager
 def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
     """A client of the scheduler at this address, or of one of our own; all that waits or runs there goes with it."""
-    from distributed import Client, LocalCluster
-
     cores = os.cpu_count() or 1
     local = {
         **{"n_workers": processes or cores, "threads_per_worker": 1, "processes": True},
@@ -140,9 +144,6 @@ def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
 
 async def _identify(address: str) -> None:
     """Asks what answers there. A Client would wait for ever for a port that is open and says nothing."""
-    from distributed.core import rpc
-    from distributed.security import Security
-
     try:
         async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
             kind = (await asyncio.wait_for(server.identity(), PATIENCE))["type"]
@@ -161,8 +162,6 @@ def _outcomes(
     A cell is tied to a free worker, and waits nowhere: Dask's own queues would have it die with another cell's worker,
     and Dask would do a finished cell again whose worker is lost.
     """
-    from distributed import KilledWorker, wait
-
     waiting, running = deque(cells), dict[Any, tuple[Cell, str]]()
     again: list[Cell] = []
     while waiting or running:
@@ -209,10 +208,3 @@ def _alone(path: Path) -> Iterator[None]:
         except BlockingIOError as error:
             raise ValueError(f"{path}: expected no other run to write this file, but one does") from error
         yield
-
-
-def _append(path: Path, row: dict[str, Any]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row, sort_keys=True) + "\n")
-        file.flush()
-        os.fsync(file.fileno())

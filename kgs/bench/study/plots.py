@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from .presets import FAMILIES, FIXED, MAIN, OFF, PAPER
 from .tables import KEYS, STARTS, difference, each, main_cells
@@ -20,6 +22,7 @@ STYLES = {OFF: ("#000000", "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^"
 for _colour, _names in zip(("#E69F00", "#CC79A7", "#009E73"), FAMILIES.values(), strict=True):
     STYLES = {**{name: (_colour, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
 _FILLS = dict(zip(STARTS, ("none", "left", "bottom", "top", "full", "right"), strict=True))  # of a start's markers
+_OTHER = ("#777777", "x")
 DPI = 110
 Draw = Callable[[Any, pd.DataFrame, dict[str, Any]], None]
 
@@ -58,23 +61,21 @@ def _forest(frame: pd.DataFrame) -> Any:
     main = main_cells(frame)
     groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in each(frame, *KEYS[:3])}
-    lines: list[tuple[str, Any]] = []
+    lines = []
     for where, cells in groups.items():
         gains = {method: difference(cells, "method", method, OFF) for method in cells.method.unique()}
-        found = [(method, gain) for method, gain in gains.items() if gain.pairs]
-        lines += [(where, None), *found] if found else []
+        lines += [
+            (f"{where}: {method} (n = {gain.pairs})", method, gain) for method, gain in gains.items() if gain.pairs
+        ]
     if not lines:
         return None
-    figure = _figure(7.5, 0.9 + 0.22 * len(lines))
+    figure = _figure(9, 0.9 + 0.2 * len(lines))
     axis = figure.subplots()
-    labels = [name if gain is None else f"{name} (n = {gain.pairs})" for name, gain in lines]
-    for label, (_, gain) in zip(axis.set_yticks(range(len(lines)), labels, fontsize=8), lines, strict=True):
-        label.label1.set_fontweight("bold" if gain is None else "normal")
-    for level, (name, gain) in enumerate(lines):
-        if gain is not None:
-            colour, marker = STYLES.get(name, ("#777777", "x"))
-            axis.plot([gain.low, gain.high], [level, level], color=colour, linewidth=1.5)
-            axis.plot(gain.mean, level, marker, color=colour, markersize=5)
+    axis.set_yticks(range(len(lines)), [label for label, _, _ in lines], fontsize=8)
+    for level, (_, method, gain) in enumerate(lines):
+        colour, marker = STYLES.get(method, _OTHER)
+        axis.plot([gain.low, gain.high], [level, level], color=colour, linewidth=1.5)
+        axis.plot(gain.mean, level, marker, color=colour, markersize=5)
     axis.axvline(0, color="#777777", linewidth=1)
     axis.set(ylim=(len(lines) - 0.5, -0.5), xlabel="test PSNR over off, same first points and views [dB]")
     axis.grid(axis="x", alpha=0.3)
@@ -118,7 +119,7 @@ def _panels(frame: pd.DataFrame, draw: Draw, x: str, y: str) -> Any:
     found: dict[str, Any] = {}
     for axis, ((scene, views), cells) in zip(axes[: len(settings)], settings, strict=True):
         for (method,), some in each(cells, "method"):
-            colour, marker = STYLES.get(method, ("#777777", "x"))
+            colour, marker = STYLES.get(method, _OTHER)
             draw(axis, some, {"color": colour, "marker": marker, "label": method})
         counts = cells.groupby(list(KEYS)).size().agg(["min", "max"]).unique()
         title = f"{scene}, {views} views, n = {' to '.join(map(str, counts))}"
@@ -136,7 +137,4 @@ def _panels(frame: pd.DataFrame, draw: Draw, x: str, y: str) -> Any:
 
 
 def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
     return Figure(figsize=(width, height), dpi=DPI, layout=ConstrainedLayoutEngine(wspace=0.08, hspace=0.08))
