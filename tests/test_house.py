@@ -1,4 +1,4 @@
-"""The house itself: who may import whom, and what every public name says."""
+"""The house itself: who may import whom, how long files are, and what every public name says."""
 
 import ast
 import functools
@@ -163,6 +163,19 @@ def test_public_names_say_what_they_take_and_return(module):
     public = importlib.import_module(module)
     values = [(f"{module}.{name}", getattr(public, name)) for name in public.__all__]
     assert not [line for name, value in values if callable(value) for line in described(name, value)]
+
+
+# -- sizes ---------------------------------------------------------------------------------------------------------
+
+
+def lines(path):
+    return len(path.read_text(encoding="utf-8").splitlines())
+
+
+def test_no_file_is_longer_than_300_lines():
+    tests = {path.relative_to(ROOT).as_posix(): path for path in (ROOT / "tests").rglob("*.py")}
+    long = {name: lines(path) for name, path in (SOURCES | tests).items() if lines(path) > 300}
+    assert not long
 
 
 # -- words ---------------------------------------------------------------------------------------------------------
