@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
 
 import numpy as np
 
@@ -41,7 +40,7 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
     """
     if train_views is None:
         return list(range(count))
-    if isinstance(train_views, bool) or not isinstance(train_views, Integral) or not 1 <= train_views <= count:
+    if isinstance(train_views, bool) or not isinstance(train_views, int | np.integer) or not 1 <= train_views <= count:
         raise ValueError(
             f"train_views (--views): expected None or a whole number from 1 to {count}, got {train_views!r}"
         )
