@@ -12,27 +12,9 @@ from .rasterization import rasterization
 from .renderer import GaussianRenderer
 from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering
 
-__all__ = [
-    "DropGaussian",
-    "drop_gaussian",
-    "GaussianRenderer",
-    "rasterization",
-    "project",
-    "composite",
-    "Gaussians",
-    "GaussianModel",
-    "Densifier",
-    "DensifyReport",
-    "camera_extent",
-    "save_ply",
-    "load_ply",
-    "PosedCamera",
-    "cameras",
-    "ProjectedGaussians",
-    "RasterOptions",
-    "Rendering",
-    "DataError",
-    "TrainingDiverged",
-]
+__all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization", "project", "composite"]
+__all__ += ["Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering", "PosedCamera", "cameras"]
+__all__ += ["GaussianModel", "Densifier", "DensifyReport", "camera_extent", "save_ply", "load_ply"]
+__all__ += ["DataError", "TrainingDiverged"]
 
 __version__ = "0.1.0"

@@ -11,8 +11,6 @@ The lists of tiles are no stage of their own: they are laid out for the kernels 
 makes its own. They decide nothing: a pixel depends on the alphas of its layers alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

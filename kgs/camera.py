@@ -1,8 +1,5 @@
 """Everything about camera models: Kornia's cameras one by one, the pixel of a point and its derivative.
 
-Convention:
-    World-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
-
 The derivative is closed form for pinhole and orthographic cameras and two reverse passes through Kornia's `project`
 for distorted ones. Far outside the field of view the first-order footprint is meaningless and grows without bound;
 as in gsplat it is taken at a point clamped to 15 % of the image size beyond its borders (perspective models without
@@ -11,8 +8,6 @@ a wide-angle mapping only). The limits are constants; the gradient follows the c
 A distorted lens sees up to the angle where the radius in the image stops growing: what lies behind this fold of the
 radial polynomial is not drawn.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -32,8 +27,7 @@ from numpy.polynomial import Polynomial
 from torch import Tensor
 
 from .full_precision import in_full_precision
-
-__all__ = ["Cameras", "Lens", "PosedCamera", "cameras", "image_size", "intrinsics", "lenses", "move_camera"]
+from .types import check_tensor
 
 _MARGIN = 0.15
 Pixels = Callable[[Tensor], Tensor]
@@ -65,8 +59,7 @@ class PosedCamera:
     def __post_init__(self) -> None:
         if not hasattr(self.model, "project") or not hasattr(self.model, "params"):
             raise TypeError(f"model: expected a kornia.sensors.camera.CameraModel, got {type(self.model).__name__}")
-        if not isinstance(self.extrinsics, Tensor):
-            raise TypeError(f"extrinsics: expected a torch.Tensor, got {type(self.extrinsics).__name__}")
+        check_tensor("extrinsics", self.extrinsics)
         shape, params = tuple(self.extrinsics.shape), self.model.params
         if len(shape) != 3 or shape[1:] != (4, 4):
             raise ValueError(f"extrinsics: expected shape (C, 4, 4), got {shape}")
@@ -93,11 +86,8 @@ def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers
 
     A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make a new one in each step.
 
-    Convention:
-        World-to-camera, OpenCV axes.
-
     Args:
-        viewmats: world-to-camera matrices, `(C, 4, 4)`, or `(4, 4)` for one.
+        viewmats: world-to-camera matrices, OpenCV axes, `(C, 4, 4)`, or `(4, 4)` for one.
         Ks: intrinsics in pixels, `(C, 3, 3)` or `(C, 4, 4)`, or one matrix for all cameras.
         width: of the images in pixels.
         height: of the images in pixels.
@@ -114,12 +104,8 @@ def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers
         >>> kgs.cameras(torch.eye(4), k, width=32, height=24, pixel_centers="half").cx
         tensor([15.5000])
     """
-    for name, value in (("viewmats", viewmats), ("Ks", Ks)):
-        if not isinstance(value, Tensor):
-            raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
-    want, got = (viewmats.dtype, viewmats.device), (Ks.dtype, Ks.device)
-    if want != got:
-        raise TypeError(f"Ks: expected {want[0]} on {want[1]} as viewmats, got {got[0]} on {got[1]}")
+    check_tensor("viewmats", viewmats)
+    check_tensor("Ks", Ks, viewmats, " as viewmats")
     if viewmats.ndim not in (2, 3) or viewmats.shape[-2:] != (4, 4):
         raise ValueError(f"viewmats: expected shape (C, 4, 4) or (4, 4), got {tuple(viewmats.shape)}")
     poses = viewmats.reshape(-1, 4, 4)
@@ -144,12 +130,7 @@ def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
-    """Height and width in pixels, the same for all cameras.
-
-    Raises:
-        TypeError: `cameras` is neither a `PinholeCamera` nor a `PosedCamera`.
-        ValueError: the cameras differ in size or have none.
-    """
+    """Height and width in pixels, the same for all cameras; checks what `cameras` is."""
     if isinstance(cameras, PosedCamera):
         sizes = {(int(cameras.model.height), int(cameras.model.width))}
     elif isinstance(cameras, PinholeCamera):
@@ -177,20 +158,19 @@ def lenses(cameras: Cameras) -> list[Lens]:
 
 
 def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
-    one = slice(c, c + 1)
-    camera = PinholeCamera(cameras.intrinsics[one], cameras.extrinsics[one], cameras.height[one], cameras.width[one])
-    k = camera.intrinsics[0, :2, :2]
-    fx, fy, cx, cy = (camera.intrinsics[0, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    limits = _tangent_limits(fx, fy, cx, cy, int(camera.height), int(camera.width))
+    matrix, pose, *size = (
+        x[c : c + 1] for x in (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+    )
+    limits = _tangent_limits(matrix[0].diagonal()[:2], matrix[0, :2, 2], *map(int, size))
 
-    def pixels(intrinsics: Tensor, extrinsics: Tensor, world: Tensor) -> Tensor:
-        pixels: Tensor = PinholeCamera(intrinsics, extrinsics, camera.height, camera.width).project(world[None])[0]
-        return pixels
+    def pixels(matrix: Tensor, pose: Tensor, world: Tensor) -> Tensor:
+        found: Tensor = PinholeCamera(matrix, pose, *size).project(world[None])[0]
+        return found
 
     return Lens(
-        extrinsics=camera.extrinsics[0],
-        project=lambda world, _: in_full_precision(pixels, camera.intrinsics, camera.extrinsics, world),
-        jacobian=lambda points: _perspective_jacobian(k, points, limits),
+        extrinsics=pose[0],
+        project=lambda world, _: in_full_precision(pixels, matrix, pose, world),
+        jacobian=lambda points: _perspective_jacobian(matrix[0, :2, :2], points, limits),
     )
 
 
@@ -203,10 +183,10 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
     height, width = int(model.height), int(model.width)
     one = CameraModelBase(model.distortion, model.projection, ImageSize(height, width), params)
     k = torch.diag(params[:2])
-    fx, fy, cx, cy = params[:4].unbind()
-    limits = _tangent_limits(fx, fy, cx, cy, height, width)
+    limits = _tangent_limits(params[:2], params[2:4], height, width)
     parallel = isinstance(model.projection, OrthographicProjection)
     plain = parallel or isinstance(model.distortion, AffineTransform)
+    brown_conrady = isinstance(model.distortion, BrownConradyTransform)
 
     def pixels(points: Tensor) -> Tensor:
         return one.project(Vector3(points)).data
@@ -216,8 +196,9 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
             return torch.cat([k, k.new_zeros(2, 1)], 1).expand(points.shape[0], 2, 3)
         if plain:
             return _perspective_jacobian(k, points, limits)
-        if isinstance(model.distortion, BrownConradyTransform):
-            points = _clamp_tangents(points, limits)
+        if brown_conrady:
+            z = points[:, 2]
+            points = torch.stack([*((points[:, i] / z).clamp(*limits[i]) * z for i in (0, 1)), z], 1)
         return _reverse_jacobian(pixels, points)
 
     return Lens(
@@ -225,7 +206,7 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
         project=lambda _, points: pixels(points),
         jacobian=jacobian,
         parallel=parallel,
-        sees=None if plain else _before_fold(params.tolist(), isinstance(model.distortion, BrownConradyTransform)),
+        sees=None if plain else _before_fold(params.tolist(), brown_conrady),
     )
 
 
@@ -252,25 +233,18 @@ def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor],
     return None if angle >= math.pi / 2 else lambda points: points[:, :2].norm(dim=1) < math.tan(angle) * points[:, 2]
 
 
-def _tangent_limits(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor, height: int, width: int) -> list[Tensor]:
-    """Lower x, upper x, lower y, upper y of x/z and y/z, without gradient; also where a focal length is negative."""
-    limits: list[Tensor] = []
-    for focal, centre, size in ((fx.detach(), cx.detach(), width), (fy.detach(), cy.detach(), height)):
-        first, last = -(centre + 0.5 + _MARGIN * size) / focal, (size - 0.5 - centre + _MARGIN * size) / focal
-        limits += [torch.minimum(first, last), torch.maximum(first, last)]
-    return limits
+def _tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Tensor:
+    """Limits of x/z and y/z in rows (lower, upper), `(2, 2)`, no gradient; also where a focal length is negative."""
+    focal, centre, size = focal.detach(), centre.detach(), focal.new_tensor([width, height])
+    first, last = -(centre + 0.5 + _MARGIN * size) / focal, (size - 0.5 - centre + _MARGIN * size) / focal
+    return torch.stack([torch.minimum(first, last), torch.maximum(first, last)], 1)
 
 
-def _clamp_tangents(points: Tensor, limits: list[Tensor]) -> Tensor:
-    x, y, z = points.unbind(1)
-    return torch.stack([(x / z).clamp(limits[0], limits[1]) * z, (y / z).clamp(limits[2], limits[3]) * z, z], 1)
-
-
-def _perspective_jacobian(k: Tensor, points: Tensor, limits: list[Tensor]) -> Tensor:
+def _perspective_jacobian(k: Tensor, points: Tensor, limits: Tensor) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
     inverse = 1.0 / points[:, 2]
-    tx, ty = (points[:, 0] * inverse).clamp(*limits[:2]), (points[:, 1] * inverse).clamp(*limits[2:])
-    last = -inverse[:, None] * in_full_precision(torch.matmul, torch.stack([tx, ty], 1), k.T)
+    tangents = [(points[:, i] * inverse).clamp(low, high) for i, (low, high) in enumerate(limits)]
+    last = -inverse[:, None] * in_full_precision(torch.matmul, torch.stack(tangents, 1), k.T)
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
 

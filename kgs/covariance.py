@@ -11,17 +11,12 @@ a sum of terms >= 0: no cancellation, never a non-positive value, for needles of
 a c - b^2 is non-positive for half of those in float32.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
-
-__all__ = ["columns", "conics", "footprint_factors", "footprint_table", "moment_gradients", "rotation_matrices"]
-__all__ += ["variances", "whitening"]
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:

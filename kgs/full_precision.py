@@ -5,8 +5,6 @@ bfloat16 where the processor has units for these: a relative error of 4e-3, two 
 the backward formulas of torch's own products.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -15,8 +13,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-
-__all__ = ["full_precision", "in_full_precision"]
 
 _BACKENDS: list[Any] = (  # torch before 2.9 has one setting for all
     [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if hasattr(torch.backends.mkldnn, "matmul") else []

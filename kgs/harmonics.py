@@ -4,15 +4,11 @@ Source: P.-P. Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2(2), 2013;
 files of Kerbl et al. 2023.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
 from .full_precision import in_full_precision
 from .types import sh_degree
-
-__all__ = ["SH_C0", "evaluate_harmonics", "harmonics_basis"]
 
 SH_C0 = 0.28209479177387814
 _C1 = 0.4886025119029199

@@ -5,7 +5,8 @@ Source: Zwicker et al. 2001 (the affine approximation at the centre), Kerbl et a
 Whatever cannot be seen is left out before anything is divided: behind the near plane, not finite, beside the image.
 """
 
-from __future__ import annotations
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,9 +16,9 @@ from .camera import Cameras, Lens, image_size, intrinsics, lenses
 from .covariance import footprint_factors, rotation_matrices, variances
 from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
-from .types import Gaussians, ProjectedGaussians, RasterOptions
+from .types import Gaussians, ProjectedGaussians, RasterOptions, check_tensor
 
-__all__ = ["cut_squared", "normals", "project"]
+Touches = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 def project(
@@ -41,7 +42,7 @@ def project(
     Args:
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        near_plane: see `kgs.types.RasterOptions`, as for the next two.
+        near_plane: see :class:`kgs.RasterOptions`, as for the next two.
         eps2d: variance in px^2 added to each footprint.
         alpha_threshold: with 0 every Gaussian in front of the camera is listed.
         colors: whether colours are wanted.
@@ -61,9 +62,7 @@ def project(
         raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
     size, means = image_size(cameras), gaussians.means
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
-        if matrix.dtype != means.dtype or matrix.device != means.device:
-            want, got = f"{means.dtype} on {means.device}", f"{matrix.dtype} on {matrix.device}"
-            raise TypeError(f"cameras: expected {want} as the Gaussians, got {got}")
+        check_tensor("cameras", matrix, means, " as the Gaussians")
     shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
     if shape[:-1] not in ((), (count,)):
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
@@ -78,20 +77,13 @@ def project_torch(
     """`project` in torch, for every camera, device and dtype; trusts its arguments."""
     device, views, finite = gaussians.means.device, lenses(cameras), _finite(gaussians)
     reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
+    touches, near = partial(_touches_image, size, options.eps2d, reach), options.near_plane
     with full_precision(device):
-        parts = [_project_one(gaussians, c, lens, size, finite, options, reach, colors) for c, lens in enumerate(views)]
-    fields = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
+        parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]
     counts = torch.tensor([part[0].shape[0] for part in parts], device=device)
-    ids, means2d, factors, depths, radii, opacities, rgb = fields
     return ProjectedGaussians(
-        camera_ids=torch.repeat_interleave(torch.arange(len(parts), device=device), counts),
-        gaussian_ids=ids,
-        means2d=means2d,
-        factors=factors,
-        depths=depths,
-        radii=radii,
-        opacities=opacities,
-        colors=rgb,
+        torch.repeat_interleave(torch.arange(len(parts), device=device), counts),
+        *(field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)),
         image_size=size,
         num_cameras=len(parts),
         num_gaussians=len(gaussians),
@@ -132,18 +124,12 @@ def cut_squared(opacities: Tensor, alpha_threshold: float) -> Tensor:
 
 
 def _project_one(
-    gaussians: Gaussians,
-    c: int,
-    lens: Lens,
-    size: tuple[int, int],
-    finite: Tensor,
-    options: RasterOptions,
-    reach: Tensor,
-    colors: bool,
+    gaussians: Gaussians, c: int, lens: Lens, finite: Tensor, touches: Touches, near_plane: float, colors: bool
 ) -> tuple[Tensor, ...]:
+    """The fields gaussian_ids to colors of `ProjectedGaussians` for one camera."""
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     with torch.no_grad():
-        front = (gaussians.means @ rotation[2] + translation[2] > options.near_plane) & finite
+        front = (gaussians.means @ rotation[2] + translation[2] > near_plane) & finite
         ids = front.nonzero()[:, 0]
         if lens.sees is not None:
             seen = lens.sees(torch.addmm(translation, _rows(gaussians.means, ids), rotation.T))
@@ -158,20 +144,20 @@ def _project_one(
 
     means, points, means2d, factors = footprints(ids)
     with torch.no_grad():
-        seen, radii, overflow = _touches_image(means2d, factors, size, options.eps2d, reach)
+        seen, radii, overflow = touches(means2d, factors)
         if bool(overflow.any()):  # these must not take part at all: their gradients would not be finite
             ids, seen, radii = (_rows(x, (~overflow).nonzero()[:, 0]) for x in (ids, seen, radii))
     if ids.shape[0] != means.shape[0]:
         means, points, means2d, factors = footprints(ids)
     with torch.no_grad():
         kept = seen.nonzero()[:, 0]
-    all_opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
+    opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
     ids, radii = _rows(ids, kept), _rows(radii, kept)
     rgb = _rows(gaussians.colors, ids) if colors else means.new_zeros(ids.shape[0], 0)
     if rgb.ndim == 3:
         rgb = evaluate_harmonics(rgb, _directions(_rows(means, kept), lens))
     projected = (_rows(x, kept) for x in (means2d, factors, points[:, 2]))
-    return ids, *projected, radii, _rows(all_opacities, ids), rgb
+    return ids, *projected, radii, _rows(opacities, ids), rgb
 
 
 def _reach(opacities: Tensor, alpha_threshold: float) -> Tensor:
@@ -181,32 +167,29 @@ def _reach(opacities: Tensor, alpha_threshold: float) -> Tensor:
 
 
 def _touches_image(
-    means2d: Tensor, factors: Tensor, size: tuple[int, int], eps2d: float, reach: Tensor
+    size: tuple[int, int], eps2d: float, reach: Tensor, means2d: Tensor, factors: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Which footprints, `reach` standard deviations wide, touch the image; their radii; which are not finite."""
     xx, xy, yy, det = variances(factors, eps2d)
     largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
-    radii = torch.ceil(3.0 * largest.sqrt())
-    x, y = means2d.unbind(1)
+    (x, y), (height, width) = means2d.unbind(1), size
     reach_x, reach_y = reach * xx.sqrt(), reach * yy.sqrt()
-    height, width = size
     seen = (x + reach_x > -0.5) & (x - reach_x < width - 0.5) & (y + reach_y > -0.5) & (y - reach_y < height - 0.5)
-    overflow = ~torch.isfinite(det + largest + x + y)
-    return seen & (det > 0), radii, overflow
+    return seen & (det > 0), torch.ceil(3.0 * largest.sqrt()), ~torch.isfinite(det + largest + x + y)
 
 
 def _directions(means: Tensor, lens: Lens) -> Tensor:
     """Unit vectors from the camera to the Gaussians, world axes; the pose may be scaled or sheared."""
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     product = rotation.detach() @ rotation.detach().T
-    turned = bool(((product - torch.eye(3, dtype=product.dtype, device=product.device)).abs() <= 1e-3).all())
+    turned = bool(((product - torch.eye(3).to(product)).abs() <= 1e-3).all())
     inverse = rotation.T if turned else torch.linalg.inv(rotation)
     if lens.parallel and turned:
         return inverse[:, 2].expand_as(means)
     camera = in_full_precision(torch.mv, inverse, translation)
     offsets = inverse[:, 2].expand_as(means) if lens.parallel else means + camera
-    lengths: Tensor = torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
-    return offsets / lengths
+    unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
+    return unit
 
 
 def _finite(gaussians: Gaussians) -> Tensor:

@@ -1,7 +1,5 @@
 """gsplat's call in tensors, for trainers that have it: the same names, order and results, in torch."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -13,8 +11,6 @@ from .projection import project
 from .raster import composite
 from .renderer import blend
 from .types import SH_SIZES, Gaussians, RasterOptions
-
-__all__ = ["rasterization"]
 
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 # what gsplat takes and kgs does not: the value with which it does nothing

@@ -7,8 +7,6 @@ used: covariances are formed and inverted, harmonics come from the recurrence of
 Forming a covariance squares its condition: footprints up to 1e4 px keep 7 digits, needles of 1e7 px only two.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

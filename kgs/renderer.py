@@ -1,7 +1,5 @@
 """The renderer: projection and compositing behind one `nn.Module`."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
@@ -14,9 +12,7 @@ from .backends import check_backend
 from .camera import Cameras
 from .projection import normals, project
 from .raster import composite
-from .types import Gaussians, RasterOptions, Rendering
-
-__all__ = ["GaussianRenderer"]
+from .types import Gaussians, RasterOptions, Rendering, check_tensor
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 
@@ -34,12 +30,7 @@ class GaussianRenderer(nn.Module):
 
     Args:
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
-        tile_size: see :class:`kgs.RasterOptions`, as for the next five.
-        near_plane: Gaussians with z <= near_plane are left out; in world units.
-        eps2d: variance in px^2 added to each footprint.
-        alpha_threshold: alphas below it are skipped. The option that trades accuracy for time: 0 is exact.
-        transmittance_stop: a pixel is done when less light than this is left.
-        max_bytes: bound for the working memory of one call.
+        tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes: see :class:`kgs.RasterOptions`.
         backend: "auto" (the fastest that covers the call) or "torch", see `kgs.backends`.
 
     Raises:
@@ -112,40 +103,41 @@ class GaussianRenderer(nn.Module):
             TypeError: an argument has another type or dtype.
             ValueError: an unknown output, or shapes that do not fit.
         """
-        wanted = _check_outputs(outputs)
+        if isinstance(outputs, str) or not outputs or set(outputs) - set(_OUTPUTS):
+            raise ValueError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
         if not isinstance(gaussians, Gaussians):
             raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
             gaussians = dataclasses.replace(gaussians, opacities=opacities)
         rules: dict[str, Any] = {"alpha_threshold": self.alpha_threshold, "backend": self.backend}
-        image = "image" in wanted
+        image = "image" in outputs
         projected = project(gaussians, cameras, near_plane=self.near_plane, eps2d=self.eps2d, colors=image, **rules)
         if projected.means2d.requires_grad:
             projected.means2d.retain_grad()
         features = {"image": projected.colors}
-        if "depth" in wanted:
+        if "depth" in outputs:
             features["depth"] = projected.depths[:, None]
-        if "normal" in wanted:
+        if "normal" in outputs:
             features["normal"] = normals(gaussians, cameras, projected)
         result = composite(
             projected,
             torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors,
             tile_size=self.tile_size,
             transmittance_stop=self.transmittance_stop,
-            median_depth="median_depth" in wanted,
+            median_depth="median_depth" in outputs,
             max_bytes=self.max_bytes,
             **rules,
         )
         alpha = 1.0 - result.transmittance
         ends = accumulate((x.shape[1] for x in features.values()), initial=0)
         found = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
-        if "depth" in wanted:
+        if "depth" in outputs:
             covered = alpha >= 1e-6
             found["depth"] = torch.where(covered, found["depth"] / torch.where(covered, alpha, 1.0), 0.0)
         return Rendering(
             image=blend(found["image"], result.transmittance, background) if image else None,
-            alpha=alpha if "alpha" in wanted else None,
+            alpha=alpha if "alpha" in outputs else None,
             depth=found.get("depth"),
             median_depth=result.median_depth,
             projected=projected,
@@ -161,34 +153,14 @@ class GaussianRenderer(nn.Module):
 
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name: str = "background") -> Tensor:
-    """The image `(C, D, H, W)` before a background that the rest of the light `(C, 1, H, W)` comes from.
-
-    Raises:
-        TypeError: the background is no tensor, or of another dtype or device.
-        ValueError: it has another shape.
-    """
+    """The image `(C, D, H, W)` before a background that the rest of the light `(C, 1, H, W)` comes from."""
     if background is None:
         return image
-    if not isinstance(background, Tensor):
-        raise TypeError(f"{name}: expected a torch.Tensor or None, got {type(background).__name__}")
-    if background.dtype != image.dtype or background.device != image.device:
-        raise TypeError(
-            f"{name}: expected {image.dtype} on {image.device}, got {background.dtype} on {background.device}"
-        )
-    cameras, channels, height, width = image.shape
-    shape = tuple(background.shape)
-    if shape in ((channels,), (cameras, channels)):
-        background = background.reshape(-1, channels, 1, 1)
-    elif shape not in ((channels, height, width), tuple(image.shape)):
-        raise ValueError(
-            f"{name}: expected shape ({channels},), ({cameras}, {channels}), {(channels, height, width)} or "
-            f"{tuple(image.shape)}, got {shape}"
-        )
+    check_tensor(name, background, image, " as the image")
+    full, shape = tuple(image.shape), tuple(background.shape)
+    if shape in (full[1:2], full[:2]):
+        background = background.reshape(*shape, 1, 1)
+    elif shape not in (full[1:], full):
+        raise ValueError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
     # an infinite background does not show where no light is left
     return image + transmittance * torch.where(background.isinf() & (transmittance == 0), 0.0, background)
-
-
-def _check_outputs(outputs: Sequence[str]) -> set[str]:
-    if isinstance(outputs, str) or not outputs or set(outputs) - set(_OUTPUTS):
-        raise ValueError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
-    return set(outputs)

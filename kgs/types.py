@@ -1,27 +1,18 @@
-"""The values that flow through kgs: frozen dataclasses of tensors, one for each arrow of the pipeline.
-
-    cameras --> project <- Gaussians
-                   | ProjectedGaussians
-                   v
-               composite --> Rendering
+"""The values that flow through kgs: Gaussians -> `project` -> ProjectedGaussians -> `composite` -> Rendering.
 
 Shapes, dtypes and devices are checked where a value is made by the user; values never are, because that would wait
 for the device. Two of them are equal where they are the same object.
 """
 
-from __future__ import annotations
-
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from .covariance import conics
-
-__all__ = ["Composited", "Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering"]
 
 SH_SIZES = (1, 4, 9, 16)
 
@@ -90,17 +81,14 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not isinstance(value, Tensor):
-                raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
+            check_tensor(name, value)
             if value.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
-            if value.dtype != self.means.dtype or value.device != self.means.device:
-                want = f"{self.means.dtype} on {self.means.device}"
-                raise TypeError(f"{name}: expected {want} as means, got {value.dtype} on {value.device}")
+            check_tensor(name, value, self.means, " as means")
         n = self.means.shape[0] if self.means.ndim else 0
-        _check_shape("means", self.means, (n, 3))
-        _check_shape("quats", self.quats, (n, 4))
-        _check_shape("scales", self.scales, (n, 3))
+        for name, width in (("means", 3), ("quats", 4), ("scales", 3)):
+            if (got := tuple(getattr(self, name).shape)) != (n, width):
+                raise ValueError(f"{name}: expected shape {(n, width)}, got {got}")
         if self.opacities.ndim not in (1, 2) or self.opacities.shape[-1] != n:
             raise ValueError(f"opacities: expected shape ({n},) or (C, {n}), got {tuple(self.opacities.shape)}")
         shape = tuple(self.colors.shape)
@@ -111,23 +99,21 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+    def __getitem__(self, index: Tensor | slice) -> Self:
         """Some of the Gaussians: those of a mask `(N,)`, of indices `(M,)` or of a slice."""
-        opacities = self.opacities[..., index]
-        return Gaussians(self.means[index], self.quats[index], self.scales[index], opacities, self.colors[index])
+        return replace(self, **{k: v[..., index] if k == "opacities" else v[index] for k, v in vars(self).items()})
 
-    def to(self, *args: Any, **kwargs: Any) -> Gaussians:
+    def to(self, *args: Any, **kwargs: Any) -> Self:
         """The Gaussians on another device or in another dtype; arguments as of `torch.Tensor.to`."""
-        fields = (self.means, self.quats, self.scales, self.opacities, self.colors)
-        return Gaussians(*(field.to(*args, **kwargs) for field in fields))
+        return replace(self, **{name: value.to(*args, **kwargs) for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedGaussians:
     """The M pairs (camera, Gaussian) that a camera can see: in front of the near plane and over the image.
 
-    Being in this list is being visible, whatever the opacity: a Gaussian that `DropGaussian` switched off is listed
-    all the same (it is never composited). The list is ordered by camera, then by Gaussian.
+    A Gaussian is listed whatever its opacity, also where `DropGaussian` switched it off (it is not composited then).
+    The list is ordered by camera, then by Gaussian.
 
     Convention:
         Pixels with integer centres: the image covers [-0.5, W - 0.5] x [-0.5, H - 0.5].
@@ -173,17 +159,11 @@ class ProjectedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Composited:
-    """The sums over layers, before background and normalisation.
+    """The sums over layers, before background and normalisation."""
 
-    Args:
-        features: sum of w times features, `(C, F, H, W)`.
-        transmittance: T behind the last layer, `(C, 1, H, W)`.
-        median_depth: `(C, 1, H, W)` without gradient, or None.
-    """
-
-    features: Tensor
-    transmittance: Tensor
-    median_depth: Tensor | None
+    features: Tensor  # sum of w times features, (C, F, H, W)
+    transmittance: Tensor  # T behind the last layer, (C, 1, H, W)
+    median_depth: Tensor | None  # (C, 1, H, W), without gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +194,9 @@ def sh_degree(colors: Tensor) -> int:
     return math.isqrt(colors.shape[1]) - 1
 
 
-def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-    if tuple(value.shape) != shape:
-        raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
+def check_tensor(name: str, value: Any, like: Tensor | None = None, whose: str = "") -> None:
+    """Raise a TypeError where the argument is no tensor, or not of the dtype and on the device of `like`."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
+    if like is not None and (value.dtype, value.device) != (like.dtype, like.device):
+        raise TypeError(f"{name}: expected {like.dtype} on {like.device}{whose}, got {value.dtype} on {value.device}")

@@ -26,16 +26,12 @@ slices, nearest first: lists are made for the tiles alone that still have light,
 listed nor sorted.
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from kgs.backends import choose, register
 from kgs.types import Composited, ProjectedGaussians, RasterOptions
 
 from .torch_passes import composite_torch
-
-__all__ = ["composite"]
 
 register("compositing", "torch", composite_torch)
 

@@ -6,8 +6,6 @@ of K entries of every tile that still has one and still lets light through; tile
 they are a fifth of it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -16,18 +14,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .tiles import Reach, TileLists
-
-__all__ = [
-    "ALPHA_MAX",
-    "Group",
-    "Rules",
-    "Slice",
-    "Step",
-    "buffer_bytes",
-    "bytes_per_entry",
-    "bytes_per_span",
-    "choose_chunk_size",
-]
 
 ALPHA_MAX = 0.99
 _STEP_PAIRS = {"cpu": 2**19, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers

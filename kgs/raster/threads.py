@@ -8,8 +8,6 @@ by one thread, whatever the number of threads, so results do not depend on it.
 back at once, so nothing changes for the rest of the process.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections import deque
@@ -18,8 +16,6 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 import torch
-
-__all__ = ["run_all"]
 
 Item = TypeVar("Item")
 _pools: dict[int, ThreadPoolExecutor] = {}

@@ -8,11 +8,10 @@ edge. Every tile of this span is touched, every other is not; no tile has to be 
 Rows of tiles are numbered through all cameras.
 """
 
-from __future__ import annotations
-
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -21,8 +20,6 @@ from torch import Tensor
 from kgs.covariance import variances
 from kgs.projection import cut_squared
 from kgs.types import ProjectedGaussians, RasterOptions
-
-__all__ = ["Reach", "Spans", "TileLists", "bin_to_tiles", "to_images", "to_tiles"]
 
 
 @dataclass(frozen=True)
@@ -64,10 +61,10 @@ class Spans:
     first: Tensor  # first column
     counts: Tensor  # columns, may be 0
 
-    def take(self, where: Tensor | slice) -> Spans:
+    def take(self, where: Tensor | slice) -> Self:
         """Some of the spans."""
-        fields = (self.ranks, self.rows, self.first, self.counts)
-        return Spans(*(x[where] if isinstance(where, slice) else x.index_select(0, where) for x in fields))
+        found = {k: x[where] if isinstance(where, slice) else x.index_select(0, where) for k, x in vars(self).items()}
+        return replace(self, **found)
 
 
 class Reach:

@@ -3,8 +3,6 @@
 One row slice is kept for the backward pass, several are made again there.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -21,8 +19,6 @@ from .tasks import Rules, Slice, buffer_bytes, bytes_per_entry, bytes_per_span, 
 from .threads import run_all
 from .tiles import Reach, TileLists, to_images, to_tiles
 from .torch_steps import Backward, Forward
-
-__all__ = ["composite_torch"]
 
 _LAYERS = 192  # entries per tile in a depth slice: few pixels see more before their light is gone
 DepthSlices = list[tuple[tuple[int, int], Slice]]  # ranks, and what was done with them

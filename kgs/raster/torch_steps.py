@@ -3,15 +3,11 @@
 The formulas are those of `kgs.raster`, the arrangement that of `tasks`.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from .tasks import ALPHA_MAX, Group, Slice, Step
-
-__all__ = ["Backward", "Forward"]
 
 _LIVE_SHARE = 0.8  # a group is compacted when fewer of its tiles than this still let light through
 
