@@ -1,7 +1,5 @@
 """Scenes as posed images: from disk in the layouts of LLFF, COLMAP, Blender and nerfstudio, or made on the spot."""
 
-from __future__ import annotations
-
 from .load import load_scene
 from .scene import Scene, Views
 from .synthetic import synthetic_scene

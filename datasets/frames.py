@@ -1,7 +1,5 @@
 """What every layout's files say about a scene: photos with lenses and poses, and how they are split."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,8 +13,6 @@ from torch import Tensor
 from kgs.errors import DataError
 
 from .images import Intrinsics
-
-__all__ = ["LARGEST", "NO_POINTS", "Frame", "FrameSet", "PointCloud", "path_inside"]
 
 LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares of them are finite in float32
 

@@ -6,8 +6,6 @@ Sources: PNG (ISO 15948, 11.2.1), JPEG (ITU T.81, B.2), WebP (RFC 9649), BMP (Wi
 BITMAPINFOHEADER), TIFF 6.0 (sections 2, 8 and 18).
 """
 
-from __future__ import annotations
-
 import mmap
 import re
 import struct
@@ -15,8 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from kgs.errors import DataError
-
-__all__ = ["image_size", "plain_jpeg", "plain_tiff"]
 
 Buffer = bytes | mmap.mmap
 

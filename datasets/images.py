@@ -1,10 +1,9 @@
 """Photos as arrays: reading, removing the lens's distortion, reducing, and the intrinsics that result."""
 
-from __future__ import annotations
-
 import mmap
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -14,9 +13,6 @@ from numpy.typing import NDArray
 from kgs.errors import DataError
 
 from .image_size import image_size, plain_jpeg, plain_tiff
-
-__all__ = ["IMAGE_SUFFIXES", "Image", "Intrinsics", "image_folder", "list_images", "read_bytes", "read_image"]
-__all__ += ["read_size", "rectification", "remap", "resize"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -52,11 +48,11 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
     fisheye: bool = False
 
-    def scaled(self, width: int, height: int) -> Intrinsics:
+    def scaled(self, width: int, height: int) -> Self:
         """The same lens on an image of another size."""
         sx, sy = width / self.width, height / self.height
-        numbers = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
-        return Intrinsics(width, height, *numbers, self.distortion, self.fisheye)
+        numbers = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        return replace(self, width=width, height=height, **numbers)
 
     def same_aspect(self, width: int, height: int) -> bool:
         """Whether an image of this size can be a resized one, each side rounded to whole pixels."""

@@ -1,7 +1,5 @@
 """`load_scene`: one function for all layouts, and the one place where a scene is built."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -21,8 +19,6 @@ from .images import read_image, read_size, rectification, remap, resize
 from .layouts import find_layout
 from .scene import Scene, Views, pinholes
 from .splits import select_evenly, split_by_name
-
-__all__ = ["load_scene"]
 
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20

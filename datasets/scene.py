@@ -1,12 +1,10 @@
 """A scene as every loader returns it: posed training and test images in one frame."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import SupportsIndex
+from typing import Self, SupportsIndex
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -14,8 +12,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kgs.errors import DataError
-
-__all__ = ["Scene", "Views", "pinholes"]
 
 
 def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
@@ -108,13 +104,14 @@ class Views:
             *(x[rows] for x in (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width))
         )
 
-    def select(self, indices: Sequence[int]) -> Views:
+    def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64, device=self.images.device)
         masks = None if self.masks is None else self.masks[rows]
-        return Views(self.camera(rows), self.images[rows], tuple(self.names[i] for i in indices), masks)
+        names = tuple(self.names[i] for i in indices)
+        return replace(self, cameras=self.camera(rows), images=self.images[rows], names=names, masks=masks)
 
-    def halved(self) -> Views:
+    def halved(self) -> Self:
         """The views at half the width and height: means of 2 x 2 pixels; an odd last row or column is left out.
 
         Images of a single row or column are a ValueError.
@@ -127,7 +124,7 @@ class Views:
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
         cameras = pinholes(intrinsics, self.cameras.extrinsics, (height, width))
         masks = None if self.masks is None else avg_pool2d(self.masks, 2)
-        return Views(cameras, avg_pool2d(self.images, 2), self.names, masks)
+        return replace(self, cameras=cameras, images=avg_pool2d(self.images, 2), masks=masks)
 
 
 @dataclass(frozen=True, eq=False)

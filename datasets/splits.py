@@ -1,12 +1,8 @@
 """Which views are for training: the splits of the sparse-view tables (RegNeRF, FSGS, DropGaussian's release)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-
-__all__ = ["BLENDER_TRAIN_FRAMES", "TEST_EVERY", "select_evenly", "split_by_name"]
 
 TEST_EVERY = 8
 BLENDER_TRAIN_FRAMES = (2, 16, 26, 55, 73, 76, 86, 93)

@@ -1,7 +1,5 @@
 """The file layouts that `load_scene` reads, one file each: from a folder to a `FrameSet`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kgs.datasets.frames import FrameSet
@@ -13,8 +11,6 @@ from .colmap import load_colmap
 from .colmap_model import find_model
 from .llff import load_llff
 from .nerfstudio import load_nerfstudio
-
-__all__ = ["find_layout"]
 
 _LAYOUTS = (
     (lambda root: (root / "poses_bounds.npy").is_file(), load_llff),

@@ -3,8 +3,6 @@
 Source: Mildenhall et al., NeRF (ECCV 2020); the eight training frames are those of DietNeRF and its followers.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch
@@ -13,8 +11,6 @@ from kgs.datasets.frames import FrameSet, PointCloud
 from kgs.datasets.splits import BLENDER_TRAIN_FRAMES
 
 from .nerfstudio import read_transforms
-
-__all__ = ["load_blender"]
 
 _RANDOM_POINTS = 10_000
 

@@ -1,7 +1,5 @@
 """Scenes with a COLMAP model: `sparse/0` beside `images/` (https://colmap.github.io/cameras.html)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import kornia.geometry as kg
@@ -13,8 +11,6 @@ from kgs.datasets.images import Intrinsics, image_folder
 from kgs.errors import DataError
 
 from .colmap_model import ColmapCamera, ColmapImage, find_model, model_file, read_cameras, read_images, read_points
-
-__all__ = ["camera_to_world", "load_colmap", "track_points"]
 
 
 def load_colmap(root: Path) -> FrameSet:

@@ -4,8 +4,6 @@ Source: https://colmap.github.io/format.html. The rigs and frames of newer versi
 not read. Every count is held against the file's length before memory of that size is taken.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,8 +15,6 @@ from numpy.typing import NDArray
 
 from kgs.datasets.images import read_bytes
 from kgs.errors import DataError
-
-__all__ = ["ColmapCamera", "ColmapImage", "find_model", "model_file", "read_cameras", "read_images", "read_points"]
 
 T = TypeVar("T")
 

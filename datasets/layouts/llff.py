@@ -1,7 +1,5 @@
 """LLFF scenes: `poses_bounds.npy` beside `images/` or `images_k/` (https://github.com/Fyusion/LLFF)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,8 +13,6 @@ from kgs.errors import DataError
 
 from .colmap import camera_to_world, track_points
 from .colmap_model import find_model, model_file, read_images
-
-__all__ = ["load_llff"]
 
 
 def load_llff(root: Path) -> FrameSet:

@@ -5,8 +5,6 @@ What a file says of a lens or a pose is used or refused; other keys that are not
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable
@@ -21,8 +19,6 @@ from kgs.datasets.frames import Frame, FrameSet, path_inside
 from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics, read_size
 from kgs.errors import DataError
 from kgs.json_files import read_json
-
-__all__ = ["load_nerfstudio", "read_transforms"]
 
 Object = dict[str, Any]
 

@@ -7,8 +7,6 @@ The world's axes are OpenCV's: x right, y down, z away from the forward-facing c
 the objects stand around (0, 0.5, 4.4). The world depends on `kind` and `seed` only, never on the cameras.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +19,6 @@ from kgs.datasets.scene import Scene, Views, pinholes
 
 from .raycast import Array, raycast
 from .world import CENTER, World, make_world, shade
-
-__all__ = ["synthetic_depths", "synthetic_scene"]
 
 FOCAL = 0.85  # focal length over the longer side of the image, as a phone's
 SUPERSAMPLING = 2  # rays along each side of a pixel

@@ -8,12 +8,8 @@ of a vertex and triangles that reach behind the camera need no clipping. Two tri
 opposite numbers for it: a closed mesh has no cracks.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
-
-__all__ = ["raycast"]
 
 Array = NDArray[np.float64]
 

@@ -4,16 +4,12 @@ A texture is a function of the point alone. Detail comes from sums of cosine wav
 (the spectral form of a stationary Gaussian field); the finest is about 4 pixels of the default synthetic scene.
 """
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-__all__ = ["Texture", "random_texture"]
 
 Array = NDArray[np.floating[Any]]
 Field = Callable[[Array], Array]

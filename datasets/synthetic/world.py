@@ -3,8 +3,6 @@
 Surfaces are matt: a point has one colour from wherever it is seen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +12,6 @@ from trimesh.transformations import euler_matrix
 
 from .raycast import Array
 from .textures import Texture, random_texture
-
-__all__ = ["CENTER", "World", "make_world", "shade"]
 
 KINDS = ("forward", "orbit")
 FLOOR = 1.2  # y of the floor
