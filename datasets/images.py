@@ -51,8 +51,8 @@ class Intrinsics:
     def scaled(self, width: int, height: int) -> Self:
         """The same lens on an image of another size."""
         sx, sy = width / self.width, height / self.height
-        numbers = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
-        return replace(self, width=width, height=height, **numbers)
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def same_aspect(self, width: int, height: int) -> bool:
         """Whether an image of this size can be a resized one, each side rounded to whole pixels."""
@@ -190,16 +190,13 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
 def _covering_zoom(intrinsics: Intrinsics) -> float:
     """The least factor from 1 to 2 on the focal length with which the pinhole's border falls inside the image."""
     width, height, matrix = intrinsics.width, intrinsics.height, intrinsics.matrix()
-    columns, rows = np.arange(float(width)), np.arange(float(height))
-    ones, project = np.ones_like, cv2.fisheye.projectPoints if intrinsics.fisheye else cv2.projectPoints
-    border = np.concatenate(
-        [np.stack([columns, y * ones(columns)], axis=1) for y in (0.0, height - 1.0)]
-        + [np.stack([x * ones(rows), rows], axis=1) for x in (0.0, width - 1.0)]
-    )
+    project = cv2.fisheye.projectPoints if intrinsics.fisheye else cv2.projectPoints
+    rows = [(x, y) for x in range(width) for y in (0, height - 1)]
+    border = np.array(rows + [(x, y) for x in (0, width - 1) for y in range(height)], np.float64)
     rays = (border - matrix[:2, 2]) / (intrinsics.fx, intrinsics.fy)
 
     def covered(zoom: float) -> bool:
-        points = np.concatenate([rays / zoom, ones(rays[:, :1])], axis=1)[:, None]
+        points = np.insert(rays / zoom, 2, 1.0, axis=1)[:, None]
         pixels = project(points, np.zeros(3), np.zeros(3), matrix, np.array(intrinsics.distortion))[0]
         return bool((np.abs(pixels * 2 - (width - 1, height - 1)) <= (width - 1 + 1e-6, height - 1 + 1e-6)).all())
 

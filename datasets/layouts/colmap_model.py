@@ -7,6 +7,7 @@ not read. Every count is held against the file's length before memory of that si
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +18,6 @@ from kgs.datasets.images import read_bytes
 from kgs.errors import DataError
 
 T = TypeVar("T")
-
 _LONGEST_NAME = 4096
 # In the order of COLMAP's model ids; the numbers of parameters of those that are read.
 _MODELS = (
@@ -65,23 +65,20 @@ def model_file(folder: Path, stem: str) -> Path:
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
-    """Read cameras.bin or cameras.txt.
-
-    Raises:
-        DataError: the file is damaged, an id occurs twice, or a camera model cannot be undistorted.
-    """
+    """Read cameras.bin or cameras.txt; damage, a repeated id or a model without undistortion is a DataError."""
     cameras: dict[int, ColmapCamera] = {}
     if path.suffix == ".bin":
         data = _Binary(path)
-        for _ in range(data.count("number of cameras", 24)):
+        for _ in data.items("number of cameras", 24):
             camera_id, model_id, width, height = data.take("<IiQQ", "camera")
             model = dict(enumerate(_MODELS.split())).get(model_id, f"number {model_id}")
             params = data.take(f"<{_parameter_count(path, camera_id, model)}d", f"camera {camera_id}")
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
-        data.finish()
     else:
         for line in filter(None, _lines(path)):
-            camera_id, model, width, height, params = _fields(path, line, (int, str, int, int, _floats))
+            camera_id, model, width, height, params = _fields(
+                path, line, (int, str, int, int, partial(_numbers, float))
+            )
             if len(params) != _parameter_count(path, camera_id, model):
                 raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
@@ -89,16 +86,16 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
-    """Read images.bin or images.txt without the 2D observations; damage, or an id that occurs twice, is a DataError."""
+    """Read images.bin or images.txt without the 2D observations; damage or a repeated id is a DataError."""
     images: dict[int, ColmapImage] = {}
     if path.suffix == ".bin":
         data = _Binary(path)
-        for _ in range(data.count("number of images", 73)):
+        for _ in data.items("number of images", 73):
             image_id, *pose, camera_id = data.take("<I7dI", "image")
             name = data.string(f"image {image_id}")
-            data.skip(f"observations of {name}", 24)
+            count = data.count(f"observations of {name}", 24)
+            data.take(f"{24 * count}x", "observations")  # passed over
             _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
-        data.finish()
     else:
         may_be_observations = False
         for line in _lines(path):
@@ -112,11 +109,7 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
 
 
 def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe.
-
-    Raises:
-        DataError: the file is damaged or a position is not finite.
-    """
+    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe."""
     rows = [row for row, track in _tracks(path) if len(image_ids.intersection(track[::2])) >= 2]
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
@@ -127,16 +120,15 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
 
 
 def _tracks(path: Path) -> Iterator[tuple[list[Any], tuple[int, ...]]]:
-    """Position and colour of each point, and its track: an image's id and an observation's number, again and again."""
+    """Position and colour of each point, and its track: pairs of an image's id and an observation's number."""
     if path.suffix == ".bin":
         data = _Binary(path)
-        for _ in range(data.count("number of points", 51)):
+        for _ in data.items("number of points", 51):
             _, *row, _ = data.take("<Q3d3Bd", "point")
             yield row, data.take(f"<{2 * data.count('track', 8)}I", "track")
-        data.finish()
     else:
         for line in filter(None, _lines(path)):
-            _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, _integers))
+            _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, partial(_numbers, int)))
             yield row, track
 
 
@@ -159,6 +151,12 @@ class _Binary:
         self._need(number * least_bytes, what)
         return int(number)
 
+    def items(self, what: str, least_bytes: int) -> Iterator[int]:
+        """As many numbers as the next count says; nothing may be left of the file behind the last."""
+        yield from range(self.count(what, least_bytes))
+        if self._at != len(self._data):
+            raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
+
     def string(self, what: str) -> str:
         """The next text, up to its zero byte."""
         end = self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)
@@ -169,16 +167,6 @@ class _Binary:
             return text.decode("utf-8")
         except UnicodeDecodeError as error:
             raise DataError(self._path, what, f"expected a name in UTF-8, got {text!r}") from error
-
-    def skip(self, what: str, size: int) -> None:
-        """Pass over things of that many bytes each, behind their count."""
-        number = self.count(what, size)
-        self._at += size * number
-
-    def finish(self) -> None:
-        """Refuse what is left."""
-        if self._at != len(self._data):
-            raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
 
     def _need(self, size: int, what: str) -> None:
         left = len(self._data) - self._at
@@ -204,19 +192,15 @@ def _fields(path: Path, line: str, kinds: Sequence[Callable[[str], Any]]) -> lis
         raise DataError(path, f"line {line[:60]!r}", f"expected {len(kinds)} fields as COLMAP writes them") from error
 
 
-def _floats(text: str) -> tuple[float, ...]:
-    return tuple(map(float, text.split()))
-
-
-def _integers(text: str) -> tuple[int, ...]:
-    return tuple(map(int, text.split()))
+def _numbers(kind: type[T], text: str) -> tuple[T, ...]:
+    return tuple(map(kind, text.split()))
 
 
 def _is_observations(line: str) -> bool:
     """Whether a line can be an image's observations: x, y and a point's id, again and again."""
     words = line.split()
     try:
-        return len(words) % 3 == 0 and bool(_floats(" ".join(words[:12])))
+        return len(words) % 3 == 0 and bool([float(word) for word in words[:12]])
     except ValueError:
         return False
 

@@ -7,7 +7,9 @@ Sources: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp'
 
 import math
 import re
-from collections.abc import Iterable
+from collections import ChainMap
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeGuard
 
@@ -21,6 +23,7 @@ from kgs.errors import DataError
 from kgs.json_files import read_json
 
 Object = dict[str, Any]
+Said = ChainMap[str, Any]  # what holds for a frame: its own object, then the whole file's
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
@@ -45,7 +48,7 @@ _GEOMETRY = re.compile(
 
 
 def load_nerfstudio(root: Path) -> FrameSet:
-    """Read `transforms.json`, see :func:`read_transforms`; damage and lenses that cannot be undone are DataErrors.
+    """Read `transforms.json`, see :func:`read_transforms`.
 
     `applied_transform` is not undone: the world is the file's. Where the file has `test_filenames` (or else
     `val_filenames`), these are the test views; training views are those of `train_filenames`, or all others.
@@ -76,19 +79,14 @@ def _listed(root: Path, data: Object, key: str, frames: list[Frame]) -> list[Fra
 
 
 def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[str, ...]]:
-    """Read such a file.
+    """The frames of such a file, at least one; the whole object; notes about what is not used.
 
     Convention:
         `transform_matrix` is camera-to-world with OpenGL axes (x right, y up, z backward). A lens's numbers stand in
         the frame or, for all frames, at the top; `camera_angle_x` and `_y` are fields of view, used where there is no
         `fl_x` or `fl_y`. Without them pixels are square, the lens is centred and has the first photo's size.
 
-    Returns:
-        The frames, at least one; the whole object; notes about what is not used.
-
-    Raises:
-        DataError: the file cannot be read, see :func:`kgs.json_files.read_json`, lacks a field, or says something
-            of lenses or poses that cannot be used.
+    A file that cannot be read, lacks a field, or says of lenses or poses what cannot be used is a DataError.
     """
     source = root / name
     data = read_json(source)
@@ -96,11 +94,11 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(source, "frames", "expected a list of objects, not empty")
     notes = _check_keys(source, [data, *entries])
-    names = [_find_photo(source, root, _text(source, "file_path", entry)) for entry in entries]
+    names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
     paths = [path_inside(source, root, name) for name in names]
     size = next((read_size(path) for path in paths if path.is_file()), (1, 1))
     frames = [
-        Frame(source, name, path, _lens(source, entry, data, size), _opencv_pose(source, entry))
+        Frame(source, name, path, _lens(source, ChainMap(entry, data), size), _opencv_pose(source, entry))
         for name, path, entry in zip(names, paths, entries, strict=True)
     ]
     return frames, data, notes
@@ -115,15 +113,14 @@ def _find_photo(source: Path, root: Path, name: str) -> str:
 
 
 def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
-    """Refuse what bears on lenses and poses and is not known; a note on other things that are not known."""
+    """Refuse what bears on lenses and poses and is not known; a note on the rest that is not known."""
     known, unused = {*_KNOWN.split(), *_HARMLESS.split()}, set()
-    for item in objects:
-        for key in item.keys() - known:
-            if not _says_nothing(item[key]):
-                if _GEOMETRY.search(key):
-                    reason = f"cannot be used: expected none, 0 or false, got {_shown(item[key])}"
-                    raise DataError(source, key[:60], reason)
-                unused.add(key[:60])
+    for key, value in chain.from_iterable(item.items() for item in objects):
+        if key in known or _says_nothing(value):
+            continue
+        if _GEOMETRY.search(key):
+            raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
+        unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
 
 
@@ -131,35 +128,30 @@ def _says_nothing(value: Any) -> bool:
     return all(map(_says_nothing, value)) if isinstance(value, list) else not value
 
 
-def _lens(source: Path, frame: Object, data: Object, size: tuple[int, ...]) -> Intrinsics:
+def _lens(source: Path, said: Said, size: tuple[int, ...]) -> Intrinsics:
     """A frame's lens; where the file does not tell the image size, it is that of the first photo."""
-
-    def number(key: str, default: float) -> float:
-        return _number(source, key, frame, data, default=default)
-
-    fisheye = _is_fisheye(source, frame, data)
-    width, height = number("w", size[0]), number("h", size[1])
+    fisheye = _is_fisheye(source, said)
+    width, height = _number(source, "w", said, size[0]), _number(source, "h", said, size[1])
     if not (width.is_integer() and height.is_integer()):
         raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
-    fx, fy = (_focal(source, axis, length, frame, data) for axis, length in (("x", width), ("y", height)))
+    fx, fy = _focal(source, "x", said, width), _focal(source, "y", said, height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
-    used = _KANNALA if fisheye else _BROWN
-    of_this_lens = (frame,) if {"camera_model", "is_fisheye"} & frame.keys() else (frame, data)
+    used, frame = _KANNALA if fisheye else _BROWN, said.maps[0]
+    of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else said
     for key in _COEFFICIENTS:
-        if key not in used and (value := _number(source, key, *of_this_lens, default=0.0)) != 0:
+        if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is no fisheye, where tools disagree on its meaning"
             raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
-    distortion = tuple(number(key, 0.0) for key in used)
-    cx, cy = number("cx", width / 2), number("cy", height / 2)
+    distortion = tuple(_number(source, key, said, 0.0) for key in used)
+    cx, cy = _number(source, "cx", said, width / 2), _number(source, "cy", said, height / 2)
     return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
 
 
-def _is_fisheye(source: Path, frame: Object, data: Object) -> bool:
+def _is_fisheye(source: Path, said: Said) -> bool:
     """Whether it is one: nerfstudio names the model; instant-ngp says `is_fisheye`."""
-    model = _text(source, "camera_model", frame, data, default="")
-    flag, known = _first("is_fisheye", (frame, data)), (*_PERSPECTIVE, _FISHEYE)
+    model, flag, known = _text(source, "camera_model", said, ""), said.get("is_fisheye"), (*_PERSPECTIVE, _FISHEYE)
     if model not in ("", *known):
         raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {', '.join(known)}")
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
@@ -169,34 +161,29 @@ def _is_fisheye(source: Path, frame: Object, data: Object) -> bool:
     return bool(flag) or model == _FISHEYE
 
 
-def _focal(source: Path, axis: str, length: float, *objects: Object) -> float | None:
+def _focal(source: Path, axis: str, said: Said, length: float) -> float | None:
     """The focal length in pixels along an axis, from `fl_` or else the field of view over a length; None without."""
-    for item in objects:
+    for item in said.maps:
         if f"fl_{axis}" in item:
-            return _number(source, f"fl_{axis}", item)
+            return _number(source, f"fl_{axis}", item, None)
         if (key := f"camera_angle_{axis}") in item:
-            angle = _number(source, key, item)
+            angle = _number(source, key, item, None)
             if not 0 < angle / 2 < math.pi / 2:
                 raise DataError(source, key, f"expected an angle between 0 and pi, got {angle:g}")
             return length / (2 * math.tan(angle / 2))
     return None
 
 
-def _number(path: Path, key: str, *objects: Object, default: float | None = None) -> float:
-    if not _is_finite(value := _first(key, objects, default)):
+def _number(path: Path, key: str, said: Mapping[str, Any], default: float | None) -> float:
+    if not _is_finite(value := said.get(key, default)):
         raise DataError(path, key, f"expected a finite number, got {_shown(value)}")
     return float(value)
 
 
-def _text(path: Path, key: str, *objects: Object, default: str | None = None) -> str:
-    if not isinstance(value := _first(key, objects, default), str):
+def _text(path: Path, key: str, said: Mapping[str, Any], default: str | None) -> str:
+    if not isinstance(value := said.get(key, default), str):
         raise DataError(path, key, f"expected a text, got {_shown(value)}")
     return value
-
-
-def _first(key: str, objects: Iterable[Object], default: Any = None) -> Any:
-    """What stands under a key in the first of the objects that has it."""
-    return next((item[key] for item in objects if key in item), default)
 
 
 def _shown(value: Any) -> str:
@@ -204,10 +191,7 @@ def _shown(value: Any) -> str:
 
 
 def _opencv_pose(path: Path, frame: Object) -> Tensor:
-    """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64.
-
-    The last row may be off 0, 0, 0, 1 by 1e-6, as an inverse has it.
-    """
+    """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64."""
     rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
@@ -215,7 +199,7 @@ def _opencv_pose(path: Path, frame: Object) -> Tensor:
         raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
     matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
     last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if float((matrix[0, 3] - last).abs().max()) > 1e-6:
+    if float((matrix[0, 3] - last).abs().max()) > 1e-6:  # an inverse is off by rounding
         raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {matrix[0, 3].tolist()}")
     matrix[0, 3] = last
     return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]
