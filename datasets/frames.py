@@ -19,28 +19,13 @@ LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One photo with its lens and its pose, its pixels not read yet.
+    """One photo with its lens and its pose, its pixels not read yet; numbers that no camera has are a DataError."""
 
-    Convention:
-        `pose` is camera-to-world with OpenCV axes (x right, y down, z forward).
-
-    Args:
-        source: the file that gives lens and pose; errors name it.
-        name: what the view is called, unique within its scene.
-        path: the photo.
-        intrinsics: in the files' half-pixel convention, for any size of the photo's aspect.
-        pose: `(4, 4)` float64.
-
-    Raises:
-        DataError: a number is not finite or beyond 1e15, a size or focal length is not above 0, or the pose is no
-            rotation and translation.
-    """
-
-    source: Path
-    name: str
+    source: Path  # the file that gives lens and pose; errors name it
+    name: str  # unique within the scene
     path: Path
-    intrinsics: Intrinsics
-    pose: Tensor
+    intrinsics: Intrinsics  # for any size of the photo's aspect
+    pose: Tensor  # (4, 4) float64, camera-to-world with OpenCV axes (x right, y down, z forward)
 
     def __post_init__(self) -> None:
         wrong = partial(DataError, self.source, self.name)
@@ -74,47 +59,29 @@ NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64, device="cpu"), tor
 
 @dataclass(frozen=True, eq=False)
 class FrameSet:
-    """All that a layout's files say.
+    """All that a layout's files say."""
 
-    Args:
-        frames: all frames, or, where the files hold some out, those to choose training views from.
-        test: the frames that the files hold out; None where they do not say: every eighth by name is held out then.
-        published: positions in `frames` of the published training views, taken when just as many are asked for.
-        points: first points that the layout always gives.
-        model_points: the points of the scene's COLMAP model that at least two of the given frames see; None where
-            there is no model.
-        notes: what the files say that is not used, one sentence each.
-    """
-
-    frames: Sequence[Frame]
-    test: Sequence[Frame] | None = None
-    published: Sequence[int] = ()
-    points: PointCloud = NO_POINTS
+    frames: Sequence[Frame]  # all, or, where the files hold some out, those to choose training views from
+    test: Sequence[Frame] | None = None  # those that the files hold out; None: every eighth by name
+    published: Sequence[int] = ()  # positions of the published training views, taken when just as many are asked for
+    points: PointCloud = NO_POINTS  # first points that the layout always gives
+    # the points of the scene's COLMAP model, if there is one, that at least two of the given frames see
     model_points: Callable[[Sequence[Frame]], PointCloud] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what the files say that is not used, one sentence each
 
 
 def path_inside(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:
-    """The path of a file that a description names, which must not lead out of the scene's folder.
+    """The path of a file that `source` names, relative to `folder` or `root`; a DataError where it leads out of `root`.
 
-    Args:
-        source: the description; errors name it.
-        root: the scene's folder.
-        name: relative to `folder`; backslashes separate folders where no file has them in its name.
-        folder: inside `root`; None is `root` itself.
-
-    Raises:
-        DataError: the name is empty, absolute, has a part "..", or passes through a link that leads out of `root`.
+    Backslashes separate folders where no file has them in its name.
     """
     wrong = partial(DataError, source, repr(name[:200]))
     given = PureWindowsPath(name)  # knows both separators and drives
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
         raise wrong("expected the name of a file inside the scene's folder")
-    path = (folder or root) / name
+    folder = folder or root
     try:
-        if not path.is_file():
-            path = (folder or root) / given.as_posix()
-        path.is_file()
+        path = folder / name if (folder / name).is_file() else folder / given.as_posix()
         target = Path(os.path.realpath(path))
     except (OSError, ValueError) as error:  # too long, or not to be written in the file system's encoding
         raise wrong(f"expected the name of a file, got an impossible one ({error})") from error

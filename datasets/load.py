@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
-from functools import lru_cache
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 
@@ -90,28 +90,19 @@ def load_scene(
         height, width = size = _common_size([*train, *test], downscale)
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
         is_finer = photos and downscale is not None and fine_downscale < downscale
-        finer = _views(train, _common_size(train, fine_downscale), offset, color, photos) if is_finer else None
-        return Scene(
-            train=_views(train, size, offset, color, photos),
-            test=_views(test, size, offset, color, photos),
-            points=(cloud.points - offset).float(),
-            point_colors=cloud.colors.float(),
-            init_kind=cloud.kind,
-            offset=offset,
-            background=color,
-            root=root,
-            finer=finer,
-            notes=found.notes,
-        )
+        views = partial(_views, offset=offset, background=color, photos=photos)
+        finer = views(train, _common_size(train, fine_downscale)) if is_finer else None
+        pictures, positions, colors = (views(train, size), views(test, size)), cloud.points - offset, cloud.colors
+        return Scene(*pictures, positions.float(), colors.float(), cloud.kind, offset, color, root, finer, found.notes)
 
 
 def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:
     """The frames to train on and those to test on, no photo in both."""
-    frames, every = found.frames, [*found.frames, *(found.test or ())]
-    times = Counter(frame.path for frame in every)
-    for frame in every:
+    frames, test_frames = found.frames, list(found.test or ())
+    times = Counter(frame.path for frame in (*frames, *test_frames))
+    for frame in (*frames, *test_frames):
         if times[frame.path] > 1:
-            both = {frame.path} <= {f.path for f in frames} & {f.path for f in found.test or ()}
+            both = {frame.path} <= {f.path for f in frames} & {f.path for f in test_frames}
             where = "in the training and in the test views" if both else "several times"
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
     if found.test is None:
@@ -122,7 +113,7 @@ def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[F
     chosen: Sequence[int] = select_evenly(len(frames), train_views)
     if train_views == len(found.published) and len(frames) > max(found.published):
         chosen = found.published
-    return [frames[i] for i in chosen], list(found.test)
+    return [frames[i] for i in chosen], test_frames
 
 
 def _check_present(root: Path, paths: Sequence[Path]) -> None:
@@ -176,17 +167,9 @@ def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, backg
             lens = lens.scaled(size[1], size[0])
         intrinsics[i, :3, :3] = torch.from_numpy(lens.matrix())
     opaque = torch.ones(1, *size, dtype=torch.float32)
-    return Views(
-        cameras=pinholes(intrinsics, _extrinsics(frames, offset), size),
-        images=images,
-        names=tuple(frame.name for frame in frames),
-        masks=torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None,
-    )
-
-
-def _extrinsics(frames: Sequence[Frame], offset: Tensor) -> Tensor:
-    """World-to-camera `(V, 4, 4)` float32 in the recentred world, the rotations made exactly orthogonal."""
+    masks = torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None
     poses = torch.stack([frame.pose for frame in frames])
-    u, _, vh = torch.linalg.svd(poses[:, :3, :3])
-    rotation, translation = kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])
-    return kg.Rt_to_matrix4x4(rotation, translation).float()
+    u, _, vh = torch.linalg.svd(poses[:, :3, :3])  # u @ vh is a rotation exactly
+    world_to_camera = kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])
+    cameras = pinholes(intrinsics, kg.Rt_to_matrix4x4(*world_to_camera).float(), size)
+    return Views(cameras, images, tuple(frame.name for frame in frames), masks)

@@ -66,27 +66,19 @@ class Views:
         return len(self.names)
 
     def __getitem__(self, index: SupportsIndex) -> dict[str, Tensor | int | str]:
-        """One view; `torch.utils.data.DataLoader` makes batches of these with its default collate function.
+        """One view as a dict, which `torch.utils.data.DataLoader` collates; an IndexError where there is none.
 
         Returns:
             image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.cameras` and `kgs.rasterization`
             take them with `pixel_centers="integer"`, index, name, and mask `(1, H, W)` where there are masks.
-
-        Raises:
-            IndexError: there is no such view.
         """
         given = operator.index(index)
         if not -len(self) <= given < len(self):
             raise IndexError(f"index: expected a whole number below {len(self)}, the number of views, got {given}")
         i = given % len(self)
-        view: dict[str, Tensor | int | str] = {
-            "image": self.images[i],
-            "extrinsics": self.cameras.extrinsics[i],
-            "intrinsics": self.cameras.intrinsics[i, :3, :3],
-            "index": i,
-            "name": self.names[i],
-        }
-        return view if self.masks is None else view | {"mask": self.masks[i]}
+        matrices = {"extrinsics": self.cameras.extrinsics[i], "intrinsics": self.cameras.intrinsics[i, :3, :3]}
+        mask = {} if self.masks is None else {"mask": self.masks[i]}
+        return {"image": self.images[i], **matrices, "index": i, "name": self.names[i], **mask}
 
     def __iter__(self) -> Iterator[dict[str, Tensor | int | str]]:
         return (self[i] for i in range(len(self)))
@@ -99,10 +91,8 @@ class Views:
         rows = torch.as_tensor(index, device=self.cameras.extrinsics.device)
         if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
             raise TypeError(f"index: expected integers, got {rows.dtype}")
-        cameras, rows = self.cameras, rows.reshape(-1).long()
-        return PinholeCamera(
-            *(x[rows] for x in (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width))
-        )
+        c, rows = self.cameras, rows.reshape(-1).long()
+        return PinholeCamera(c.intrinsics[rows], c.extrinsics[rows], c.height[rows], c.width[rows])
 
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
@@ -116,13 +106,13 @@ class Views:
 
         Images of a single row or column are a ValueError.
         """
-        height, width = self.images.shape[-2] // 2, self.images.shape[-1] // 2
-        if height == 0 or width == 0:
+        size = self.images.shape[-2] // 2, self.images.shape[-1] // 2
+        if 0 in size:
             raise ValueError(f"images: expected 2 x 2 pixels or more to halve, got {tuple(self.images.shape[-2:])}")
         intrinsics = self.cameras.intrinsics.clone()
         intrinsics[:, :2, :3] *= 0.5
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
-        cameras = pinholes(intrinsics, self.cameras.extrinsics, (height, width))
+        cameras = pinholes(intrinsics, self.cameras.extrinsics, size)
         masks = None if self.masks is None else avg_pool2d(self.masks, 2)
         return replace(self, cameras=cameras, images=avg_pool2d(self.images, 2), masks=masks)
 

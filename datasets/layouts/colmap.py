@@ -14,7 +14,7 @@ from .colmap_model import ColmapCamera, ColmapImage, find_model, model_file, rea
 
 
 def load_colmap(root: Path) -> FrameSet:
-    """Read a COLMAP model in `sparse/0` or `sparse`; a missing or damaged one is a DataError.
+    """Read the COLMAP model in `sparse/0` or `sparse`.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes already; its first pixel's centre is at (0.5, 0.5).

@@ -18,8 +18,6 @@ from .colmap_model import find_model, model_file, read_images
 def load_llff(root: Path) -> FrameSet:
     """Read `poses_bounds.npy`, one row per image in the order of the names in `images/` or else `images_k/`.
 
-    A damaged file, or one with more or fewer rows than there are images, is a DataError.
-
     Convention:
         A row is a 3x5 matrix and two depths, which are not used. Its columns are the camera's down, right and
         backward axes and its centre in the world, then height, width and focal length in pixels; the principal point
@@ -56,9 +54,7 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
 
 
 def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
-    matrix = row[:15].reshape(3, 5)
-    down, right, backward, center = matrix[:, 0], matrix[:, 1], matrix[:, 2], matrix[:, 3]
-    height, width, focal = matrix[:, 4]
+    down, right, backward, center, (height, width, focal) = row[:15].reshape(3, 5).T
     pose = np.eye(4)
     pose[:3] = np.stack([right, down, -backward, center], axis=1)
     lens = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
