@@ -5,7 +5,7 @@ gives the same within the rounding of its dtype and differentiates the same. Arg
 
     "projection"   (gaussians, cameras, image size, RasterOptions, with colours) -> ProjectedGaussians
     "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
-    "loss"         (image, target, ...), as `kgs.losses.photometric_loss` calls it -> 0-d tensor
+    "loss"         (image (1, K, H, W), its TargetMoments one by one, windows left out or None) -> mean SSIM, 0-d
 
 The lists of tiles are no stage of their own: they are laid out for the kernels that read them, so each "compositing"
 makes its own. They decide nothing: a pixel depends on the alphas of its layers alone.

@@ -4,8 +4,6 @@ Source: B. Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023, section 5.2, wi
 recipe (threshold 5e-4, pruning by opacity alone). Only here does the number of Gaussians change in a fit.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -16,24 +14,21 @@ from .covariance import rotation_matrices
 from .model import GaussianModel
 from .types import ProjectedGaussians
 
-__all__ = ["DensifyReport", "Densifier", "camera_extent"]
-
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
-_STATISTICS = ("gradient_sums", "counts", "last_gradients")
 _NOT_BY_ROWS = (torch.optim.LBFGS, torch.optim.Adafactor, torch.optim.Rprop)
 
 
 @dataclass(frozen=True)
 class DensifyReport:
-    """What one densification did.
+    """What one densification did, in Gaussians.
 
     Args:
-        cloned: Gaussians that were copied.
-        split: Gaussians that were replaced by two smaller ones.
-        pruned: Gaussians that were removed because they are transparent.
-        total: Gaussians there are now: those before + cloned + split - pruned.
-        capped: Gaussians over the threshold that were left alone because of `max_gaussians`.
+        cloned: how many were copied.
+        split: how many were replaced by two smaller ones.
+        pruned: how many were removed because they are transparent.
+        total: how many there are now: those before + cloned + split - pruned.
+        capped: how many over the threshold were left alone because of `max_gaussians`.
     """
 
     cloned: int
@@ -100,15 +95,11 @@ class Densifier:
                 raise ValueError(f"{name}: expected {expected}, got {number}")
         if isinstance(optimizer, _NOT_BY_ROWS):
             raise ValueError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
-        self.model = model
-        self.optimizer = optimizer
-        self.extent = float(extent)
-        self.grad_threshold = grad_threshold
-        self.percent_dense = percent_dense
-        self.prune_opacity = prune_opacity
+        self.model, self.optimizer, self.extent = model, optimizer, float(extent)
+        self.grad_threshold, self.percent_dense, self.prune_opacity = grad_threshold, percent_dense, prune_opacity
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
-        self._reset_statistics(torch.zeros_like(model.means[:, 0]))
+        self._observe_anew(torch.zeros_like(self.model.means[:, 0]))
         self._check()
 
     @property
@@ -117,7 +108,8 @@ class Densifier:
 
         Clones and children begin with that of what they come from.
         """
-        return (self._last_gradients + self._gradient_sums) / (1 + self._counts)
+        sums, counts, last = self._statistics.values()
+        return (last + sums) / (1 + counts)
 
     @torch.no_grad()
     def observe(self, projected: ProjectedGaussians) -> None:
@@ -139,8 +131,8 @@ class Densifier:
         height, width = projected.image_size
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         ids = projected.gaussian_ids
-        self._gradient_sums.index_add_(0, ids, norms)
-        self._counts.index_add_(0, ids, torch.ones_like(ids))
+        self._statistics["gradient_sums"].index_add_(0, ids, norms)
+        self._statistics["counts"].index_add_(0, ids, torch.ones_like(ids))
 
     @torch.no_grad()
     def step(self) -> DensifyReport:
@@ -150,9 +142,8 @@ class Densifier:
         the model and the optimizer alike, without `.grad`: call it between `optimizer.step` and the next render.
         """
         self._check()
-        model = self.model
-        before = len(model)
-        average = self._gradient_sums / self._counts.clamp(min=1)
+        model, before = self.model, len(self.model)
+        average = self._statistics["gradient_sums"] / self._statistics["counts"].clamp(min=1)
         opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # NaN stays, for the trainer to find
         hot, capped = self._choose((average >= self.grad_threshold) & opaque, average, int(opaque.sum()))
         large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
@@ -167,7 +158,7 @@ class Densifier:
         new["log_scales"][children] -= math.log(SHRINK)
         for name, parameter in list(model.named_parameters()):
             self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
-        self._reset_statistics(self.mean_gradients[torch.cat([kept, born])])
+        self._observe_anew(self.mean_gradients[torch.cat([kept, born])])
         pruned = before - len(kept) - len(split)
         return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
 
@@ -182,7 +173,7 @@ class Densifier:
 
     def state_dict(self) -> dict[str, Tensor]:
         """The statistics and the generator's state, for a checkpoint."""
-        statistics = {name: getattr(self, f"_{name}").clone() for name in _STATISTICS}
+        statistics = {name: value.clone() for name, value in self._statistics.items()}
         return statistics | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -191,20 +182,20 @@ class Densifier:
         Raises:
             ValueError: an entry is missing, or the number of Gaussians is another.
         """
-        shape, missing = (len(self.model),), {*_STATISTICS, "generator"} - state.keys()
+        shape, missing = (len(self.model),), {*self._statistics, "generator"} - state.keys()
         if missing:
             raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
-        for name in _STATISTICS:
+        for name in self._statistics:
             if state[name].shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {tuple(state[name].shape)}")
-        self._reset_statistics(self.model.means.new_zeros(shape))
-        for name in _STATISTICS:
-            getattr(self, f"_{name}").copy_(state[name])
+        self._observe_anew(self.model.means.new_zeros(shape))
+        for name, value in self._statistics.items():
+            value.copy_(state[name])
         self.generator.set_state(state["generator"].cpu())
 
     def _check(self) -> None:
         """Raise where the model, its statistics and the optimizer's state do not belong together."""
-        count, expected = len(self.model), len(self._counts)
+        count, expected = len(self.model), len(self._statistics["counts"])
         if count != expected:
             raise ValueError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
@@ -256,10 +247,10 @@ class Densifier:
             self.optimizer.state[new] = state
         setattr(self.model, name, new)
 
-    def _reset_statistics(self, last_gradients: Tensor) -> None:
-        self._last_gradients = last_gradients.detach()
-        self._gradient_sums = torch.zeros_like(self._last_gradients)
-        self._counts = torch.zeros_like(self._last_gradients, dtype=torch.int64)
+    def _observe_anew(self, last_gradients: Tensor) -> None:
+        last = last_gradients.detach()
+        counts = torch.zeros_like(last, dtype=torch.int64)
+        self._statistics = {"gradient_sums": torch.zeros_like(last), "counts": counts, "last_gradients": last}
 
 
 def camera_extent(extrinsics: Tensor) -> float:

@@ -7,18 +7,14 @@ The layer needs nothing but torch and fits any splatting pipeline: put it betwee
 rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render.
 """
 
-from __future__ import annotations
-
 import contextlib
 import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
-
-__all__ = ["DropGaussian", "drop_gaussian"]
 
 
 def drop_gaussian(
@@ -26,14 +22,14 @@ def drop_gaussian(
 ) -> Tensor:
     """Set each opacity to 0 with probability p and multiply the others by 1/(1 - p).
 
-    The semantics are those of `torch.nn.functional.dropout`, on activated opacities (never on logits: a logit of 0 is
-    an opacity of 0.5). The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
+    This is `torch.nn.functional.dropout` of activated opacities (never of logits: a logit of 0 is an opacity of 0.5).
+    The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
 
     Args:
         opacities: activated opacities of any shape and floating point dtype; each element is drawn on its own. `(N,)`
             gives one mask for all cameras, `(C, N)` one per camera.
         p: the drop rate, in [0, 1).
-        training: if False, the same tensor object comes back.
+        training: if False, nothing is dropped.
         generator: draws the mask on its own device, whatever that of `opacities`; None takes torch's default one.
 
     Returns:
@@ -74,9 +70,9 @@ SCHEDULES: dict[str, Callable[[float], float]] = {"linear": linear, "constant": 
 class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
-    The rate of a call is `p * schedule(progress)`. `progress` is a plain attribute in [0, 1] that the training loop
-    sets; it defaults to 1: a layer whose progress is never set is plain dropout at p, and warns once. So does one that
-    gets opacities outside [0, 1] on the CPU, probably logits. The `state_dict` is empty, whatever is assigned to it.
+    The rate of a call is `p * schedule(progress)`. The training loop sets `progress`, in [0, 1]; a layer whose progress
+    is never set is plain dropout at p, and warns once. So does one that gets opacities outside [0, 1] on the CPU,
+    probably logits. The `state_dict` is empty, whatever is assigned to the layer.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
@@ -106,9 +102,8 @@ class DropGaussian(nn.Module):
         super().__init__()
         if not (schedule in SCHEDULES if isinstance(schedule, str) else callable(schedule)):
             raise ValueError(f"schedule: expected one of {sorted(SCHEDULES)} or a callable, got {schedule!r}")
-        number: Any = seed
-        is_integer = isinstance(number, Integral) and not isinstance(number, bool)
-        if seed is not None and not (is_integer and -(2**63) <= number < 2**64):
+        is_integer = isinstance(seed, (int, Integral)) and not isinstance(seed, bool)
+        if seed is not None and not (is_integer and -(2**63) <= seed < 2**64):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
         self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
@@ -137,19 +132,16 @@ class DropGaussian(nn.Module):
         if not self.training:
             return opacities
         if self._progress is None and self.schedule is not constant:
-            message = (
-                f"progress was never set, so the schedule has no effect and the rate is {self.rate:g} throughout; "
-            )
-            self._warn_once(
-                "progress", message + "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
-            )
+            there = f"progress was never set, so the schedule has no effect and the rate is {self.rate:g} throughout"
+            wanted = "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
+            self._warn_once("progress", f"{there}; {wanted}")
         dropped = drop_gaussian(opacities, self.rate, True, self._stream)
         if opacities.device.type == "cpu" and not torch.compiler.is_compiling():
             with contextlib.suppress(RuntimeError, IndexError):  # none, or inside vmap: no values to look at
                 low, high = opacities.detach().aminmax()
                 if low < 0 or high > 1:
-                    message = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits, "
-                    self._warn_once("values", f"{message}got {low:.3g} to {high:.3g}")
+                    wanted = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits"
+                    self._warn_once("values", f"{wanted}, got {low:.3g} to {high:.3g}")
         return dropped
 
     def get_rng_state(self) -> Tensor:
@@ -177,8 +169,8 @@ class DropGaussian(nn.Module):
             self._warned.add(kind)
             warnings.warn(f"DropGaussian: {message}", stacklevel=3)
 
-    def _replicate_for_data_parallel(self) -> DropGaussian:
-        replica: DropGaussian = super()._replicate_for_data_parallel()
+    def _replicate_for_data_parallel(self) -> Self:
+        replica: Self = super()._replicate_for_data_parallel()
         if self._stream is not None and self.training:  # in order here; the replicas' threads would race for one stream
             seed = int(torch.randint(2**62, (), generator=self._stream, device="cpu"))
             replica._stream = torch.Generator("cpu").manual_seed(seed)

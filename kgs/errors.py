@@ -1,10 +1,6 @@
 """The errors of kgs that are not a wrong argument: a bad file, and a fit whose numbers are no longer finite."""
 
-from __future__ import annotations
-
 from os import PathLike
-
-__all__ = ["DataError", "TrainingDiverged"]
 
 
 class DataError(Exception):
@@ -18,9 +14,7 @@ class DataError(Exception):
 
     def __init__(self, path: str | PathLike[str], field: str, reason: str) -> None:
         super().__init__(path, field, reason)
-        self.path = path
-        self.field = field
-        self.reason = reason
+        self.path, self.field, self.reason = path, field, reason
 
     def __str__(self) -> str:
         where = f"{self.path}: {self.field}" if self.field else f"{self.path}"

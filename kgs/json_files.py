@@ -1,15 +1,11 @@
 """JSON from files of unknown origin: every number finite, a limit on the size, one kind of error."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
 from typing import Any
 
 from .errors import DataError
-
-__all__ = ["parse_json", "read_json"]
 
 _MOST_BYTES = 64 * 2**20
 

@@ -4,11 +4,9 @@ Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Ren
 exponential for scales, sigmoid for opacities, isotropic start with the mean distance to the three nearest points.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -17,18 +15,16 @@ from .harmonics import SH_C0
 from .neighbours import log_spacing
 from .types import SH_SIZES, Gaussians
 
-__all__ = ["GaussianModel"]
-
 INITIAL_OPACITY = 0.1
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 
 
 class GaussianModel(nn.Module):
-    """N Gaussians as parameters without bounds: log-scales, opacity logits and spherical harmonics.
+    """N Gaussians as parameters without bounds; the harmonics are two of them, with two learning rates.
 
-    The harmonics are two parameters because they have two learning rates. `state_dict()` holds the six parameters and
-    the active degree: `GaussianModel(**state_dict)` makes the same model again, and `load_state_dict` takes over the
-    number of Gaussians and both degrees. An optimiser goes on holding the parameters; load its state after them.
+    `state_dict()` holds the six parameters and the active degree: `GaussianModel(**state_dict)` makes the same model
+    again, and `load_state_dict` takes over the number of Gaussians and both degrees. An optimiser goes on holding the
+    parameters; load its state after them.
 
     Args:
         means: centres in world units, `(N, 3)`, float32 or float64.
@@ -53,13 +49,6 @@ class GaussianModel(nn.Module):
         GaussianModel(20 Gaussians, sh_degree=1 of 3, torch.float32)
     """
 
-    means: nn.Parameter
-    quats: nn.Parameter
-    log_scales: nn.Parameter
-    opacity_logits: nn.Parameter
-    sh_dc: nn.Parameter
-    sh_rest: nn.Parameter
-
     def __init__(
         self,
         means: Tensor,
@@ -76,18 +65,18 @@ class GaussianModel(nn.Module):
         for name, value in zip(PARAMETERS, values, strict=True):
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"{name}: expected float32 or float64, got {getattr(value, 'dtype', type(value))}")
-            if (value.dtype, value.device) != (means.dtype, means.device):
-                wanted = f"{means.dtype} on {means.device} as means"
-                raise TypeError(f"{name}: expected {wanted}, got {value.dtype} on {value.device}")
-        _check_shapes(values)
-        for name, value in zip(PARAMETERS, values, strict=True):
-            self.register_parameter(name, nn.Parameter(value.detach().clone()))
+            wanted, got = (f"{tensor.dtype} on {tensor.device}" for tensor in (means, value))
+            if wanted != got:
+                raise TypeError(f"{name}: expected {wanted} as means, got {got}")
+        most = _check_shapes(values)
+        parameters = [nn.Parameter(value.detach().clone()) for value in values]
+        self.means, self.quats, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest = parameters
         if sh_degree is None:
-            sh_degree = self.max_sh_degree if _extra_state is None else int(_extra_state)
+            sh_degree = most if _extra_state is None else int(_extra_state)
         self.sh_degree = sh_degree
 
     @classmethod
-    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> GaussianModel:
+    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Self:
         """Start from a coloured point cloud: one round, faint Gaussian per point, as wide as the points are apart.
 
         The standard deviation is the root of the mean squared distance to the three nearest points, at least a
@@ -106,11 +95,10 @@ class GaussianModel(nn.Module):
         if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"points: expected float32 or float64, got {getattr(points, 'dtype', type(points))}")
         if not isinstance(colors, Tensor) or not colors.is_floating_point():
-            got = getattr(colors, "dtype", type(colors))
-            raise TypeError(f"colors: expected floating point values in [0, 1], got {got}")
+            raise TypeError(f"colors: expected floating point values, got {getattr(colors, 'dtype', type(colors))}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
-            got = f"{tuple(points.shape)} and {tuple(colors.shape)}"
-            raise ValueError(f"points, colors: expected two of shape (N, 3), got {got}")
+            shapes = f"{tuple(points.shape)} and {tuple(colors.shape)}"
+            raise ValueError(f"points, colors: expected two of shape (N, 3), got {shapes}")
         for name, value in (("points", points), ("colors", colors)):
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
@@ -139,9 +127,8 @@ class GaussianModel(nn.Module):
     def forward(self) -> Gaussians:
         """The Gaussians with activated values and the active bands only."""
         colors: Tensor = self.sh_dc
-        if self.sh_degree > 0:
-            active = self.sh_rest.narrow(1, 0, SH_SIZES[self.sh_degree] - 1)
-            colors = torch.cat([self.sh_dc, active], dim=1)
+        if self.sh_degree > 0:  # else sh_rest has no gradient at all, and an optimiser leaves it alone
+            colors = torch.cat([self.sh_dc, self.sh_rest[:, : SH_SIZES[self.sh_degree] - 1]], dim=1)
         # where exp is infinite (that Gaussian is not drawn) its gradient would be 0 times infinity
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)

@@ -1,17 +1,12 @@
 """How far apart the points of a cloud are: the scale of Gaussians that start there."""
 
-from __future__ import annotations
-
 import math
 
 import torch
 from torch import Tensor
 
-__all__ = ["log_spacing"]
-
 NEIGHBOURS = 3
 MIN_RELATIVE_SPACING = 1e-3
-CHUNK_ELEMENTS = 1 << 24
 
 
 def log_spacing(points: Tensor) -> Tensor:
@@ -43,26 +38,10 @@ def log_spacing(points: Tensor) -> Tensor:
 
 def _mean_squared(points: Tensor) -> Tensor:
     """The mean of the squared distances to the nearest three points, or to all others where they are fewer, `(N,)`."""
-    count = min(NEIGHBOURS, len(points) - 1)
-    ids = (_nearest_on_cpu if points.device.type == "cpu" else _nearest)(points.float(), count)
-    return (points[ids] - points[:, None, :]).square().sum(dim=-1).mean(dim=-1)
-
-
-def _nearest_on_cpu(points: Tensor, count: int) -> Tensor:
-    """Indices of the nearest other points, `(N, count)`, by OpenCV's exact single k-d tree."""
     import cv2
 
-    data = points.numpy()  # the index refers to this array, it makes no copy
-    index = cv2.flann_Index(data, {"algorithm": 4})  # type: ignore[attr-defined]  # not in the stubs
-    found, _ = index.knnSearch(data, count + 1, params={})
-    return torch.from_numpy(found[:, 1:]).long()  # the first is at distance 0: the point itself or its double
-
-
-def _nearest(points: Tensor, count: int) -> Tensor:
-    """Indices of the nearest other points, `(N, count)`, from all distances, a chunk of rows at a time."""
-    rows = max(1, CHUNK_ELEMENTS // len(points))
-    found = [
-        torch.cdist(chunk, points, compute_mode="donot_use_mm_for_euclid_dist").topk(count + 1, largest=False)[1]
-        for chunk in points.split(rows)
-    ]
-    return torch.cat(found)[:, 1:]
+    data = points.float().cpu().numpy()  # the index refers to this array, it makes no copy
+    index = cv2.flann_Index(data, {"algorithm": 4})  # type: ignore[attr-defined]  # an exact k-d tree; not in the stubs
+    found, _ = index.knnSearch(data, min(NEIGHBOURS + 1, len(data)), params={})
+    ids = torch.from_numpy(found[:, 1:]).long().to(points.device)  # the first is the point itself or its double
+    return (points[ids] - points[:, None, :]).square().sum(dim=-1).mean(dim=-1)

@@ -4,12 +4,8 @@ Source: H. Park, G. Ryu, W. Kim, "DropGaussian" (CVPR 2025) compares dropping wi
 distance" and defines neither. The weighting by ranks is this project's reading.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
-
-__all__ = ["opacity_l1"]
 
 
 def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:

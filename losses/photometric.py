@@ -11,8 +11,6 @@ with m and s the mean, variance and covariance under the window around a pixel. 
 except that Kornia clamps (1 - SSIM) / 2 to [0, 1], which acts only where rounding leaves that range.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -23,14 +21,12 @@ from kornia.filters import get_gaussian_kernel1d
 from kornia.losses import ssim_loss
 from torch import Tensor
 
-__all__ = ["TargetMoments", "photometric_loss", "target_moments"]
+from kgs.backends import choose, register
 
 WINDOW = 11
 RADIUS = WINDOW // 2
 SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
-EPS = 1e-12
+C1, C2, EPS = 0.01**2, 0.03**2, 1e-12
 
 
 @dataclass(frozen=True)
@@ -84,10 +80,9 @@ def photometric_loss(
         >>> float(photometric_loss(target, target)) < 1e-4
         True
     """
-    if isinstance(target, TargetMoments):
-        moments = target
     _check_images(image, image)
     shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
+    moments = target if isinstance(target, TargetMoments) else moments
     known = None if moments is None else (tuple(moments.mean.shape), moments.mean.dtype, moments.mean.device)
     if known not in (None, (shape, image.dtype, image.device)):
         raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
@@ -113,8 +108,8 @@ def photometric_loss(
     moments = target_moments(target) if moments is None else moments
     if outside is not None:
         outside = outside.expand_as(image).reshape(shape)
-    # the one place where another implementation of the loss would be chosen
-    mean_ssim: Tensor = _MeanSsim.apply(image.reshape(shape), moments.padded, moments.mean, moments.variance, outside)
+    arguments = (image.reshape(shape), moments.padded, moments.mean, moments.variance, outside)
+    mean_ssim: Tensor = choose("loss", "auto", *arguments)(*arguments)
     return loss + dssim_weight * (1.0 - mean_ssim)
 
 
@@ -172,14 +167,17 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        # once_differentiable would stay silent here: the incoming gradient of a loss is a constant.
         if torch.is_grad_enabled():
+            # once_differentiable would stay silent: the incoming gradient of a loss is a constant
             raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
         padded, target, by_mean, by_square, by_product = ctx.saved_tensors
         by_pixel = _blur_adjoint(by_mean)
         by_pixel.addcmul_(padded, _blur_adjoint(by_square), value=2.0)
         by_pixel.addcmul_(target, _blur_adjoint(by_product))
         return _fold(by_pixel).mul_(grad / ctx.count), None, None, None, None
+
+
+register("loss", "torch", _MeanSsim.apply)
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
@@ -205,7 +203,6 @@ def _outside(mask: Tensor, image: Tensor) -> Tensor:
 
 
 def _pad(image: Tensor) -> Tensor:
-    """The image with the border that Kornia's filters see."""
     return F.pad(image, [RADIUS] * 4, mode="reflect")
 
 

@@ -9,7 +9,7 @@ import trimesh
 from factories import random_cloud as cloud
 
 from kgs.model import GaussianModel
-from kgs.neighbours import _nearest, log_spacing
+from kgs.neighbours import log_spacing
 
 
 def test_scale_is_the_root_of_the_mean_of_squared_distances():
@@ -31,12 +31,13 @@ def test_scales_agree_with_scipy(dtype):
     assert np.allclose(scales.detach().numpy(), expected[:, None], rtol=1e-6)
 
 
-def test_neighbours_from_all_distances_agree_with_scipy(monkeypatch):
-    spatial = pytest.importorskip("scipy.spatial", reason="scipy is the oracle for nearest neighbours")
-    monkeypatch.setattr("kgs.neighbours.CHUNK_ELEMENTS", 10_000)  # several chunks, the last one shorter
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_the_spacing_on_a_gpu_is_that_on_the_cpu():
     points, _ = cloud(501)
-    _, expected = spatial.cKDTree(points.numpy()).query(points.numpy(), k=4)
-    assert np.array_equal(_nearest(points, 3).numpy(), expected[:, 1:])
+    spacing = log_spacing(points.cuda())
+    assert spacing.device.type == "cuda"
+    torch.testing.assert_close(spacing.cpu(), log_spacing(points), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("unit", [1e-15, 1e-3, 1e6, 1e15])
