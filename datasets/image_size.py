@@ -15,18 +15,12 @@ from pathlib import Path
 from kgs.errors import DataError
 
 Buffer = bytes | mmap.mmap
-
 _WIDTH, _HEIGHT, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPLES = 256, 257, 274, 277, 322, 323, 338
 
 
 def image_size(path: Path, data: Buffer) -> tuple[int, int]:
-    """Width and height as the header of a PNG, JPEG, WebP, BMP or TIFF image says; errors name `path`.
-
-    Raises:
-        DataError: it is none of these formats, its header is cut short, or decoding would take memory out of all
-            proportion to the file.
-    """
-    read = next((read for signature, read in _READERS if data[: len(signature)] == signature), None)
+    """Width and height as an image's header says; a DataError about `path` where it should not be decoded."""
+    read = next((read for signature, read in _READERS.items() if data[: len(signature)] == signature), None)
     if read is None:
         raise DataError(path, "", "cannot be decoded: expected a PNG, JPEG, WebP, BMP or TIFF image")
     try:
@@ -35,27 +29,20 @@ def image_size(path: Path, data: Buffer) -> tuple[int, int]:
         raise DataError(path, "header", "cannot be decoded: the image's header is damaged or cut short") from error
     if width < 1 or height < 1:
         raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
+    # Photos have fewer than 20 pixels per byte, a plain PNG 1032. Any file may have 2^21 (48 MiB while decoded), plain
+    # images 2^24 (384 MiB); more, up to 2^28, need a byte for every 32.
+    most = min(2**28, max(2**21, min(2**24, 2048 * len(data)), 32 * len(data)))
     for wide, high in ((width, height), tile or (1, 1)):
-        if wide * high > _most_pixels(len(data)):
+        if wide * high > most:
             claim = f"claims {wide}x{high} pixels in {len(data)} bytes"
             raise DataError(path, "header", f"{claim}: a decompression bomb, not decoded")
     return width, height
 
 
-def _most_pixels(size: int) -> int:
-    """The most pixels that a file of so many bytes may have: photos have fewer than 20 a byte, a plain PNG 1032.
-
-    Any file may have 2^21 (48 MiB while they are decoded). Up to 2^24 (384 MiB) plain images are read; larger ones,
-    up to 2^28 pixels, need a byte for every 32 of them.
-    """
-    return min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
-
-
 def plain_jpeg(data: bytes) -> bytes:
-    """A JPEG up to the end of its first image: some phones put a video or a second picture behind it.
+    """A JPEG up to the end of its first image, behind which some phones put a video; a ValueError without that end.
 
-    Scan parameters that only progressive images need are set right in others: some phones leave them 0. A file that
-    ends before its image does is a ValueError.
+    Scan parameters that only progressive images need are set right in others: some phones leave them 0.
     """
     parts, sequential = bytearray(data), False
     for marker, at in _markers(data):
@@ -149,10 +136,7 @@ def _tiff(data: Buffer) -> tuple[int, ...]:
 
 
 def _tags(data: Buffer) -> dict[int, tuple[int, int]]:
-    """The first image's tags that are whole numbers: the first value of each, and where it stands in the file.
-
-    Where a tag occurs twice the larger value counts, so that no size is larger than it seems.
-    """
+    """The first image's tags that are whole numbers: the first value of each, and where it stands in the file."""
     order = "<" if data[:1] == b"I" else ">"
     start = struct.unpack_from(f"{order}I", data, 4)[0]
     tags: dict[int, tuple[int, int]] = {}
@@ -163,15 +147,10 @@ def _tags(data: Buffer) -> dict[int, tuple[int, int]]:
             at += 8
             if count * size > 4:
                 at = struct.unpack_from(f"{order}I", data, at)[0]
+            # of a tag that occurs twice the larger value counts, so that no size is larger than it seems
             tags[tag] = max(tags.get(tag, (0, 0)), (struct.unpack_from(order + form, data, at)[0], at))
     return tags
 
 
-_READERS = (
-    (b"\x89PNG\r\n\x1a\n", _png),
-    (b"\xff\xd8", _jpeg),
-    (b"RIFF", _webp),
-    (b"BM", _bmp),
-    (b"II*\0", _tiff),
-    (b"MM\0*", _tiff),
-)
+_TIFF = {b"II*\0": _tiff, b"MM\0*": _tiff}
+_READERS = {b"\x89PNG\r\n\x1a\n": _png, b"\xff\xd8": _jpeg, b"RIFF": _webp, b"BM": _bmp, **_TIFF}

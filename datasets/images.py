@@ -18,25 +18,17 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 Image = NDArray[np.float32]
 Maps = tuple[Image, Image]
-
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
 _LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A lens and the image size that its numbers refer to.
+    """A lens and the image size that its numbers refer to, all in pixels.
 
     Convention:
         The files' half-pixel convention: the first pixel's centre is at (0.5, 0.5), so that the numbers of a resized
         image are these times the ratio of the sizes. `matrix` has kgs's integer pixel centres.
-
-    Args:
-        width, height: in pixels, > 0.
-        fx, fy: focal lengths in pixels, > 0.
-        cx, cy: principal point in pixels.
-        distortion: coefficients in OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6); empty for a pinhole.
-        fisheye: the coefficients are those of `cv2.fisheye`, (k1, k2, k3, k4).
     """
 
     width: int
@@ -45,8 +37,8 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()
-    fisheye: bool = False
+    distortion: tuple[float, ...] = ()  # in OpenCV's order, k1, k2, p1, p2, k3, k4, k5, k6; empty for a pinhole
+    fisheye: bool = False  # the coefficients are those of `cv2.fisheye`, k1, k2, k3, k4
 
     def scaled(self, width: int, height: int) -> Self:
         """The same lens on an image of another size."""
@@ -99,16 +91,11 @@ def read_size(path: Path) -> tuple[int, int]:
 def read_image(path: Path) -> Image:
     """Read an 8 or 16 bit PNG, JPEG, WebP, BMP or TIFF as it is stored: a rotation in its metadata is not applied.
 
-    Returns:
-        RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
-
-    Raises:
-        DataError: the file cannot be read, is of another format, truncated or a decompression bomb, is a JPEG that
-            libjpeg finds damage in, or holds other numbers than 8 or 16 bit integers.
+    Returns RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
+    A file of another kind, a truncated or damaged one and a decompression bomb are a DataError.
     """
-    data = read_bytes(path)
+    data, premultiplied = read_bytes(path), False
     size = image_size(path, data)
-    premultiplied = False
     try:
         if data.startswith((b"II", b"MM")):
             data, premultiplied = plain_tiff(data)
@@ -163,13 +150,8 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
     """The pinhole with the principal point of a lens, and where its pixels lie in the lens's image.
 
     The focal length stays too, unless that would leave pixels blank (pincushion distortion): then it grows, the same
-    on both axes, until every pixel is covered by the image.
-
-    Returns:
-        The pinhole and the x and y of its pixels, `(H, W)` each, None where there is no distortion.
-
-    Raises:
-        ValueError: the coefficients fold the image or map it outside itself, or the image is too long for OpenCV.
+    on both axes, until every pixel is covered by the image. The x and y of the pixels are `(H, W)` each, None without
+    distortion. Coefficients that fold the image, and an image too long for OpenCV, are a ValueError.
     """
     if not intrinsics.fisheye and not any(intrinsics.distortion):
         return replace(intrinsics, distortion=()), None
@@ -179,8 +161,8 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
     rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap
-    coefficients = np.array(intrinsics.distortion)
-    x, y = rectify(intrinsics.matrix(), coefficients, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)
+    matrix, distortion = intrinsics.matrix(), np.array(intrinsics.distortion)
+    x, y = rectify(matrix, distortion, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)
     inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
     if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
         raise ValueError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")

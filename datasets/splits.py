@@ -12,12 +12,7 @@ def split_by_name(names: Sequence[str], train_views: int | None = None) -> tuple
     """Hold out every eighth name for testing and choose training views evenly among the others.
 
     Names are sorted by code point ("img10" before "img2"), as the published splits were; the first one is a test view.
-
-    Returns:
-        Positions in `names` of the training and of the test views, both in the order of the sorted names.
-
-    Raises:
-        ValueError: as :func:`select_evenly`, for the views that are not held out.
+    Positions in `names` of the training and of the test views come back, both in the order of the sorted names.
     """
     order = sorted(range(len(names)), key=lambda i: names[i])
     test = order[::TEST_EVERY]
@@ -29,10 +24,7 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
     """Choose positions evenly among `count`, the first and the last included.
 
     The increasing positions are linspace(0, count - 1, train_views), rounded half to even: other roundings give other
-    views. None takes all.
-
-    Raises:
-        ValueError: train_views is no whole number in [1, count].
+    views. None takes all; what is no whole number in [1, count] is a ValueError.
     """
     if train_views is None:
         return list(range(count))

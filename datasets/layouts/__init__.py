@@ -25,11 +25,7 @@ _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
 def find_layout(root: Path) -> FrameSet:
-    """What the files of a scene's folder say, whatever layout it has.
-
-    Raises:
-        DataError: the folder is no scene (the message says what it is and what to do), or its files are damaged.
-    """
+    """What the files of a scene's folder say; where it is no scene, a DataError says what it is and what to do."""
     if not root.is_dir():
         raise DataError(root, "", _about_file(root))
     for is_there, load in _LAYOUTS:

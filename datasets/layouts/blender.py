@@ -18,17 +18,12 @@ _RANDOM_POINTS = 10_000
 def load_blender(root: Path) -> FrameSet:
     """Read the two json files, see :func:`read_transforms`, as NeRF's scenes and your own have them.
 
-    All frames of the test file are test views. Eight training views are the published ones (2, 16, 26, 55, 73, 76,
-    86, 93 in the file's order). First points are random in [-1, 1]^3. A missing or damaged file is a DataError.
+    All frames of the test file are test views. Eight training views are the published ones, positions in the file.
+    First points are random in [-1, 1]^3, which holds the objects, the same ones each time.
     """
     train, _, notes = read_transforms(root, "transforms_train.json")
     test, _, more = read_transforms(root, "transforms_test.json")
-    return FrameSet(train, test, BLENDER_TRAIN_FRAMES, _random_points(), notes=notes + more)
-
-
-def _random_points() -> PointCloud:
-    """Uniform in the cube that holds the objects, of a colour near grey; the same ones each time."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(_RANDOM_POINTS, 3, generator=generator, dtype=torch.float64) * 2 - 1
-    colors = 0.45 + 0.1 * torch.rand(_RANDOM_POINTS, 3, generator=generator, dtype=torch.float32)
-    return PointCloud(points, colors, "random")
+    colors = 0.45 + 0.1 * torch.rand(_RANDOM_POINTS, 3, generator=generator, dtype=torch.float32)  # near grey
+    return FrameSet(train, test, BLENDER_TRAIN_FRAMES, PointCloud(points, colors, "random"), notes=notes + more)

@@ -50,10 +50,8 @@ class ColmapImage:
 
 def find_model(root: Path) -> Path | None:
     """The folder of a scene that holds a COLMAP model, `sparse/0` or `sparse`; None where there is none."""
-    for folder in (root / "sparse" / "0", root / "sparse"):
-        if any((folder / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return folder
-    return None
+    files = (root / f"{folder}/images.{suffix}" for folder in ("sparse/0", "sparse") for suffix in ("bin", "txt"))
+    return next((file.parent for file in files if file.is_file()), None)
 
 
 def model_file(folder: Path, stem: str) -> Path:
@@ -206,10 +204,10 @@ def _is_observations(line: str) -> bool:
 
 
 def _parameter_count(path: Path, camera_id: int, model: str) -> int:
-    if model not in _PARAMETERS:
-        reason = f"camera model {model} cannot be read, only {', '.join(_PARAMETERS)}"
-        raise DataError(path, f"camera {camera_id}", reason)
-    return _PARAMETERS[model]
+    if model in _PARAMETERS:
+        return _PARAMETERS[model]
+    known = ", ".join(_PARAMETERS)
+    raise DataError(path, f"camera {camera_id}", f"camera model {model} cannot be read, only {known}")
 
 
 def _add(path: Path, what: str, table: dict[int, T], key: int, value: T) -> None:

@@ -29,12 +29,10 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 _FISHEYE = "OPENCV_FISHEYE"
 _BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")  # in OpenCV's order
 _COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
+# What is used; then how tools sort, frame or normalise a scene and what they did to the world, which stays the file's.
 _KNOWN = """
     frames file_path transform_matrix train_filenames val_filenames test_filenames
     camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
-"""
-# How a tool sorts, frames or normalises a scene, and what it did to the world, which stays the file's.
-_HARMLESS = """
     aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
     applied_transform applied_scale orientation_override auto_scale_poses_override
 """
@@ -114,7 +112,7 @@ def _find_photo(source: Path, root: Path, name: str) -> str:
 
 def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
     """Refuse what bears on lenses and poses and is not known; a note on the rest that is not known."""
-    known, unused = {*_KNOWN.split(), *_HARMLESS.split()}, set()
+    known, unused = set(_KNOWN.split()), set()
     for key, value in chain.from_iterable(item.items() for item in objects):
         if key in known or _says_nothing(value):
             continue

@@ -1,7 +1,7 @@
 """A synthetic scene with exact poses and exact depth: textured objects before a textured background.
 
 Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing
-of kgs takes part in making the images. Four rays per pixel are averaged. Surfaces are matt.
+of kgs takes part in making the images. Four rays per pixel are averaged.
 
 The world's axes are OpenCV's: x right, y down, z away from the forward-facing cameras. The floor is at y = 1.2 and
 the objects stand around (0, 0.5, 4.4). The world depends on `kind` and `seed` only, never on the cameras.
@@ -27,11 +27,7 @@ ORBIT = (4.2, 2.6)  # radius and mean height above `CENTER` of the orbit
 
 
 def synthetic_scene(
-    kind: str = "forward",
-    train_views: int = 3,
-    test_views: int = 6,
-    size: tuple[int, int] = (126, 168),
-    seed: int = 0,
+    kind: str = "forward", train_views: int = 3, test_views: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Scene:
     """Make a scene of about 20 objects in a second or two, without any file.
 
@@ -45,10 +41,7 @@ def synthetic_scene(
         train_views: at least 1.
         test_views: at least 0.
         size: (height, width) of all images in pixels. The field of view is 61 degrees along the longer side.
-        seed: of places, textures and cameras, at least 0. The same seed gives the same scene.
-
-    Returns:
-        The scene, without points (`init_kind` "none").
+        seed: of places, textures and cameras, at least 0. The same seed gives the same scene, without points.
 
     Raises:
         ValueError: the kind is unknown, or a number is out of range.
@@ -94,8 +87,7 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 
 
 
 def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> Views:
-    height, width = size
-    count = len(eyes)
+    (height, width), count = size, len(eyes)
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
     intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = FOCAL * max(size)
     intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2

@@ -12,32 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 MARGIN = 1e-6  # px by which bounding boxes are widened, so that rounding never loses a pixel on an edge
 
 
 def raycast(
     triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[int, int]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Intersect the ray through each pixel centre with triangles, seen from both sides, and keep the nearest hit.
+    """The nearest triangle `(F, 3, 3)` that the ray through each pixel centre hits, seen from both sides.
+
+    Returns the hit's z in the camera frame, `(H, W)`, 0 where there is none, and the triangle, int64, -1 for none.
 
     Convention:
         Kornia's: world-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
-
-    Args:
-        triangles: corners in world units, `(F, 3, 3)`; another shape is a ValueError.
-        intrinsics: pinhole matrix in pixels, `(3, 3)` or `(4, 4)`.
-        extrinsics: world-to-camera matrix, `(4, 4)`.
-        size: (height, width) in pixels.
-
-    Returns:
-        depths: z in the camera frame, float64 `(H, W)`; 0 where no triangle is hit.
-        faces: the triangle that is hit, int64 `(H, W)`; -1 where there is none.
     """
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
         raise ValueError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")
-    height, width = size
-    intrinsics = intrinsics[:3, :3]
+    (height, width), intrinsics = size, intrinsics[:3, :3]
     corners = triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
     a, b, c = corners
     normals = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])

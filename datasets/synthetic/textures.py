@@ -4,15 +4,14 @@ A texture is a function of the point alone. Detail comes from sums of cosine wav
 (the spectral form of a stationary Gaussian field); the finest is about 4 pixels of the default synthetic scene.
 """
 
-import colorsys
 from collections.abc import Callable
+from colorsys import hsv_to_rgb
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
-Field = Callable[[Array], Array]
 Texture = Callable[[Array], Array]
 
 NUM_WAVES = 40
@@ -20,16 +19,7 @@ BRICK_TABLE = 64  # the shades of bricks repeat after so many
 
 
 def random_texture(kind: str, rng: np.random.Generator) -> Texture:
-    """Draw a texture of one kind, with all its randomness from `rng`; an unknown kind is a ValueError.
-
-    Args:
-        kind: "stone", "marble", "rings", "spots", "leaf", "tiles" (cubes with a side of 0.2), "wall" (bricks in the
-            x-y plane) or "floor" (slabs in the x-z plane).
-        rng: the stream.
-
-    Returns:
-        A function from points `(n, 3)` float32 in the object's own frame, in world units, to colours `(n, 3)` float32.
-    """
+    """Draw a texture: from points `(n, 3)` float32 in the object's own frame, in world units, to colours `(n, 3)`."""
     coarse, fine = _field(rng, 0.32, 1.2), _field(rng, 0.1, 0.32)
     ramp, other = _ramp(rng), _ramp(rng)
     earthy = rng.uniform(0.0, 0.15)  # a hue between red and yellow
@@ -45,7 +35,7 @@ def random_texture(kind: str, rng: np.random.Generator) -> Texture:
         green = _ramp(rng, hue=rng.uniform(0.22, 0.4))
         return lambda p: green(0.5 * np.sin(60.0 * p[:, 0]) + fine(p))
     if kind == "tiles":
-        return _bricks(rng, (0.2, 0.2, 0.2), 0.02, lambda p: 0.8 * fine(p))
+        return _bricks(rng, (0.2, 0.2, 0.2), 0.02, lambda p: 0.8 * fine(p))  # cubes
     if kind == "wall":
         return _bricks(rng, (0.62, 0.3, np.inf), 0.035, lambda p: 0.3 * coarse(p) + 0.7 * fine(0.65 * p), earthy)
     if kind == "floor":
@@ -53,7 +43,7 @@ def random_texture(kind: str, rng: np.random.Generator) -> Texture:
     raise ValueError(f"kind: expected a kind of texture, got {kind!r}")
 
 
-def _field(rng: np.random.Generator, shortest: float, longest: float) -> Field:
+def _field(rng: np.random.Generator, shortest: float, longest: float) -> Texture:
     """A random field of unit variance with wavelengths between the given ones, the longer ones a little stronger."""
     wavelengths = np.exp(rng.uniform(np.log(shortest), np.log(longest), size=NUM_WAVES))
     directions = rng.normal(size=(3, NUM_WAVES))
@@ -65,7 +55,7 @@ def _field(rng: np.random.Generator, shortest: float, longest: float) -> Field:
 
 
 def _bricks(
-    rng: np.random.Generator, sides: tuple[float, float, float], joint: float, grain: Field, hue: float | None = None
+    rng: np.random.Generator, sides: tuple[float, float, float], joint: float, grain: Texture, hue: float | None = None
 ) -> Texture:
     """Boxes of the given sides, each of its own shade, odd rows shifted by half a side, with joints between them."""
     shades = rng.normal(size=(BRICK_TABLE,) * 3).astype(np.float32)
@@ -91,9 +81,8 @@ def _ramp(rng: np.random.Generator, hue: float | None = None) -> Texture:
     hues = (hue + rng.uniform(-0.08, 0.08, size=3)) % 1.0
     saturations = rng.uniform([0.2, 0.2, 0.05], [0.7, 0.6, 0.3])
     values = rng.uniform([0.12, 0.5, 0.85], [0.3, 0.7, 1.0])
-    dark, middle, light = (
-        np.array(colorsys.hsv_to_rgb(*hsv), dtype=np.float32) for hsv in zip(hues, saturations, values, strict=True)
-    )
+    colors = (hsv_to_rgb(*hsv) for hsv in zip(hues, saturations, values, strict=True))
+    dark, middle, light = (np.array(color, dtype=np.float32) for color in colors)
 
     def ramp(value: Array) -> Array:
         s = _step(value)[:, None]

@@ -26,8 +26,8 @@ class World:
     triangles: Array  # (F, 3, 3)
     normals: Array  # (F, 3), unit
     owners: NDArray[np.int64]  # (F,), the part a triangle belongs to
-    frames: list[Array]  # a (4, 4) rigid matrix for each part, from its own frame to the world
-    textures: list[Texture]
+    frames: tuple[Array, ...]  # a (4, 4) rigid matrix for each part, from its own frame to the world
+    textures: tuple[Texture, ...]
     balls: Array  # (B, 4), centre and radius of a ball as large as each of the first B parts: they shade what is near
 
 
@@ -35,12 +35,9 @@ _Part = tuple[trimesh.Trimesh, Array, Texture]
 
 
 def make_world(kind: str, seed: int) -> World:
-    """Build the world: "forward" in a room that fills the view, "orbit" on a square of floor with nothing around it.
+    """The world: "forward" in a room that fills the view, "orbit" on a square of floor with nothing around it.
 
-    An unknown kind or a negative seed is a ValueError.
-
-    Convention:
-        OpenCV's axes: x right, y down, z away from the forward-facing cameras, which stand around the origin.
+    Its axes are OpenCV's; the forward-facing cameras stand around the origin. An unknown kind is a ValueError.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
@@ -51,23 +48,16 @@ def make_world(kind: str, seed: int) -> World:
         parts += [_wall(rng), _floor((-9.0, 9.0), (0.8, 7.5), rng)]
     else:
         parts += [_floor((-3.2, 3.2), (CENTER[2] - 3.2, CENTER[2] + 3.2), rng)]
-    return World(
-        triangles=np.concatenate([mesh.triangles for mesh, _, _ in parts]),
-        normals=np.concatenate([mesh.face_normals for mesh, _, _ in parts]),
-        owners=np.repeat(np.arange(len(parts)), [len(mesh.faces) for mesh, _, _ in parts]),
-        frames=[frame for _, frame, _ in parts],
-        textures=[texture for _, _, texture in parts],
-        balls=np.array(balls),
-    )
+    meshes, frames, textures = zip(*parts, strict=True)
+    triangles = np.concatenate([mesh.triangles for mesh in meshes])
+    normals = np.concatenate([mesh.face_normals for mesh in meshes])
+    owners = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+    return World(triangles, normals, owners, frames, textures, np.array(balls))
 
 
 def shade(world: World, points: Array, faces: NDArray[np.int64]) -> Array:
-    """Colour surface points: the texture, lit by the sky and by one distant light (Lambert).
-
-    From points `(n, 3)` in world units and the triangle on which each lies, `(n,)`, to RGB in [0, 1], `(n, 3)`.
-    """
-    owners = world.owners[faces]
-    normals = world.normals[faces]
+    """Colours `(n, 3)` of points `(n, 3)` on triangles `(n,)`, lit by the sky and one distant light (Lambert)."""
+    owners, normals = world.owners[faces], world.normals[faces]
     albedo = np.empty((len(points), 3))
     for owner in np.unique(owners):
         rows = np.flatnonzero(owners == owner)
