@@ -41,18 +41,18 @@ class DensifyReport:
 class Densifier:
     """Adds Gaussians where the image wants them and removes transparent ones, together with their Adam state.
 
-    The statistic is the norm of the loss gradient with respect to the projected centre in normalised device
-    coordinates (pixels over half the width and half the height), averaged over the times a Gaussian was seen since the
-    last `step`. A Gaussian that `DropGaussian` switched off is seen with gradient 0, as in the method's release.
+    The statistic is the norm of the loss gradient by the projected centre in normalised device coordinates (pixels over
+    half the width and height), averaged over the times a Gaussian was seen since the last `step`. One that
+    `DropGaussian` switched off is seen with gradient 0, as in the method's release.
 
     Convention:
-        The loss is a mean over cameras: the gradients of a call with C cameras are multiplied by C, so that the
-        threshold means the same for any C.
+        The loss is a mean over cameras; the gradients are multiplied by their number C, so that the threshold means the
+        same for any C.
 
     Args:
         model: the Gaussians.
-        optimizer: holds each of the model's parameters, and other ones that are left alone. Its state for a parameter
-            is made of scalars and tensors of its shape that begin at 0: Adam, SGD, RMSprop; not LBFGS or Adafactor.
+        optimizer: holds each of the model's parameters, and others that are left alone. Its state for a parameter is
+            made of scalars and tensors of its shape that begin at 0: Adam, SGD, RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
@@ -104,10 +104,7 @@ class Densifier:
 
     @property
     def mean_gradients(self) -> Tensor:
-        """The statistic of each Gaussian since the last `step`, `(N,)`; its value then counts as one more observation.
-
-        Clones and children begin with that of what they come from.
-        """
+        """The statistic since the last `step`, `(N,)`; its value then, or a parent's, counts as one observation."""
         sums, counts, last = self._statistics.values()
         return (last + sums) / (1 + counts)
 
@@ -116,8 +113,7 @@ class Densifier:
         """Take the gradients of one render into account, of which every listed pair counts as seen.
 
         Raises:
-            ValueError: `projected.means2d` has no gradient (call it after `backward`), or the number of Gaussians is
-                another.
+            ValueError: `projected.means2d` has no gradient yet, or the number of Gaussians is another.
         """
         self._check()
         count, expected = projected.num_gaussians, len(self.model)
@@ -147,10 +143,8 @@ class Densifier:
         opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # NaN stays, for the trainer to find
         hot, capped = self._choose((average >= self.grad_threshold) & opaque, average, int(opaque.sum()))
         large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
-        cloned = (hot & ~large).nonzero().squeeze(1)
-        split = (hot & large).nonzero().squeeze(1)
-        kept = (opaque & ~(hot & large)).nonzero().squeeze(1)
-
+        masks = (hot & ~large, hot & large, opaque & ~(hot & large))
+        cloned, split, kept = (mask.nonzero().squeeze(1) for mask in masks)
         born = torch.cat([cloned, split.repeat(CHILDREN)])
         new = {name: parameter.index_select(0, born) for name, parameter in model.named_parameters()}
         children = slice(len(cloned), None)
@@ -159,8 +153,7 @@ class Densifier:
         for name, parameter in list(model.named_parameters()):
             self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
         self._observe_anew(self.mean_gradients[torch.cat([kept, born])])
-        pruned = before - len(kept) - len(split)
-        return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
+        return DensifyReport(len(cloned), len(split), before - len(kept) - len(split), len(model), capped)
 
     @torch.no_grad()
     def reset_opacity(self, ceiling: float = 0.01) -> None:
@@ -177,11 +170,7 @@ class Densifier:
         return statistics | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state_dict` returned; the model must hold as many Gaussians as it did then.
-
-        Raises:
-            ValueError: an entry is missing, or the number of Gaussians is another.
-        """
+        """Continue from what `state_dict` returned; a ValueError unless it is whole and of as many Gaussians."""
         shape, missing = (len(self.model),), {*self._statistics, "generator"} - state.keys()
         if missing:
             raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
@@ -214,10 +203,8 @@ class Densifier:
         room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - remaining)
         if wanted <= room:
             return hot, 0
-        order = torch.where(hot, average, -1.0).sort(descending=True, stable=True).indices
-        chosen = torch.zeros_like(hot)
-        chosen[order[:room]] = True
-        return chosen, wanted - room
+        order = torch.where(hot, average, -1.0).argsort(descending=True, stable=True)
+        return torch.zeros_like(hot).index_fill(0, order[:room], True), wanted - room
 
     def _sample_offsets(self, ids: Tensor) -> Tensor:
         """Draw, for each id, a place relative to the centre from that Gaussian's own distribution."""
@@ -258,11 +245,8 @@ def camera_extent(extrinsics: Tensor) -> float:
 
     Source: the normalisation of NeRF++ (Zhang et al., 2020) as 3D Gaussian Splatting uses it; over training cameras.
 
-    Convention:
-        World-to-camera matrices [R | t] with a rotation R: the centre is -R^T t.
-
     Args:
-        extrinsics: `(C, 4, 4)`, C >= 1, else a ValueError.
+        extrinsics: world-to-camera matrices [R | t] with a rotation R, `(C, 4, 4)`, C >= 1, else a ValueError.
 
     Returns:
         The extent in world units; 0 for a single camera.

@@ -26,8 +26,8 @@ def drop_gaussian(
     The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
 
     Args:
-        opacities: activated opacities of any shape and floating point dtype; each element is drawn on its own. `(N,)`
-            gives one mask for all cameras, `(C, N)` one per camera.
+        opacities: of any shape and floating point dtype; each element is drawn on its own. `(N,)` gives one mask for
+            all cameras, `(C, N)` one per camera.
         p: the drop rate, in [0, 1).
         training: if False, nothing is dropped.
         generator: draws the mask on its own device, whatever that of `opacities`; None takes torch's default one.
@@ -78,20 +78,17 @@ class DropGaussian(nn.Module):
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
         seed: None draws from torch's default generator of the tensor's device, as `nn.Dropout` does. An integer gives
-            the layer a stream of its own, the same on every device, kept through `.to`, deepcopy and pickle. The
-            replicas of `nn.DataParallel` get streams that are drawn from it; in `DistributedDataParallel` give each
-            rank another seed. Such a layer must not run inside `torch.utils.checkpoint`, which restores only the
-            default generators before it recomputes.
+            the layer a stream of its own, the same on every device, kept through `.to`, deepcopy and pickle; replicas
+            of `nn.DataParallel` draw theirs from it, in `DistributedDataParallel` give each rank another seed. Such a
+            layer must not run inside `torch.utils.checkpoint`, which restores only the default generators.
 
     Raises:
-        ValueError: p or the resulting rate is outside [0, 1), the schedule's name is unknown, or the seed is no integer
-            from -2^63 to 2^64 - 1.
+        ValueError: p or the rate is outside [0, 1), the schedule is unknown, or the seed not from -2^63 to 2^64 - 1.
 
     Examples:
         >>> drop = DropGaussian(p=0.2)
-        >>> for step in range(1, 4):
-        ...     drop.progress = step / 3
-        ...     opacities = drop(torch.full((5,), 0.5))
+        >>> drop.progress = 1 / 3  # step / total_steps, in a training loop
+        >>> opacities = drop(torch.full((5,), 0.5))
         >>> drop.eval()(opacities) is opacities
         True
     """
@@ -132,9 +129,8 @@ class DropGaussian(nn.Module):
         if not self.training:
             return opacities
         if self._progress is None and self.schedule is not constant:
-            there = f"progress was never set, so the schedule has no effect and the rate is {self.rate:g} throughout"
             wanted = "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
-            self._warn_once("progress", f"{there}; {wanted}")
+            self._warn_once("progress", f"progress was never set, so the rate is {self.rate:g} throughout; {wanted}")
         dropped = drop_gaussian(opacities, self.rate, True, self._stream)
         if opacities.device.type == "cpu" and not torch.compiler.is_compiling():
             with contextlib.suppress(RuntimeError, IndexError):  # none, or inside vmap: no values to look at

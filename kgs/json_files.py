@@ -11,11 +11,7 @@ _MOST_BYTES = 64 * 2**20
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object from UTF-8 text: integers of any size; of a key that is repeated, the last value.
-
-    Raises:
-        DataError: the file is missing, larger than 64 MiB, not an object, or what :func:`parse_json` refuses.
-    """
+    """Read a JSON object; a DataError where the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
@@ -30,7 +26,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(text: bytes) -> Any:
-    """The value that UTF-8 text stands for, which may begin with a byte order mark.
+    """The value of UTF-8 text, which may begin with a byte order mark.
 
     Raises:
         ValueError: it is no JSON (NaN and Infinity are none), nested too deep, or holds a number beyond float64.

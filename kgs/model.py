@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from .harmonics import SH_C0
 from .neighbours import log_spacing
-from .types import SH_SIZES, Gaussians
+from .types import SH_SIZES, Gaussians, check_tensor
 
 INITIAL_OPACITY = 0.1
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -43,9 +43,7 @@ class GaussianModel(nn.Module):
     Examples:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
         >>> model.sh_degree = 1
-        >>> other = GaussianModel.from_points(torch.rand(5, 3), torch.rand(5, 3), sh_degree=0)
-        >>> _ = other.load_state_dict(model.state_dict())
-        >>> other
+        >>> GaussianModel(**model.state_dict())
         GaussianModel(20 Gaussians, sh_degree=1 of 3, torch.float32)
     """
 
@@ -65,22 +63,19 @@ class GaussianModel(nn.Module):
         for name, value in zip(PARAMETERS, values, strict=True):
             if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"{name}: expected float32 or float64, got {getattr(value, 'dtype', type(value))}")
-            wanted, got = (f"{tensor.dtype} on {tensor.device}" for tensor in (means, value))
-            if wanted != got:
-                raise TypeError(f"{name}: expected {wanted} as means, got {got}")
+            check_tensor(name, value, means, " as means")
         most = _check_shapes(values)
         parameters = [nn.Parameter(value.detach().clone()) for value in values]
         self.means, self.quats, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest = parameters
-        if sh_degree is None:
-            sh_degree = most if _extra_state is None else int(_extra_state)
-        self.sh_degree = sh_degree
+        known = most if _extra_state is None else int(_extra_state)
+        self.sh_degree = known if sh_degree is None else sh_degree
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Self:
-        """Start from a coloured point cloud: one round, faint Gaussian per point, as wide as the points are apart.
+        """Start from a coloured point cloud: one round Gaussian of opacity 0.1 per point, its colour without direction.
 
         The standard deviation is the root of the mean squared distance to the three nearest points, at least a
-        thousandth of the cloud's median one (points may coincide); the opacity is 0.1, the colour has no direction.
+        thousandth of the cloud's median one (points may coincide).
 
         Args:
             points: `(N, 3)` in world units, N >= 4, float32 or float64; the model takes their dtype and device.

@@ -5,13 +5,12 @@ x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3. Scales are loga
 w x y z, and f_rest runs through one colour channel after the other.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import uuid
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,8 +22,6 @@ from torch import Tensor
 from .errors import DataError
 from .model import GaussianModel
 from .types import SH_SIZES
-
-__all__ = ["load_ply", "save_ply"]
 
 MAX_HEADER = 1 << 16
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -38,13 +35,13 @@ SCALARS = {
 def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None) -> None:
     """Write a model as a 3DGS PLY file, all harmonics included; the file appears whole or not at all.
 
-    Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit,
-    float64 values are rounded. Where float32 would move more than a tenth of the Gaussians by more than a thousandth of
-    their largest axis (a scene in map coordinates, millions of metres from its origin) x, y and z are doubles. A viewer
-    that reads floats alone cannot show such a scene: write it without the offset. The active degree is a comment.
+    Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit.
+    Where float32 would move more than a tenth of the Gaussians by more than a thousandth of their largest axis (a scene
+    in map coordinates, millions of metres from its origin) x, y and z are doubles. A viewer that reads floats alone
+    cannot show such a scene: write it without the offset. The active degree is a comment.
 
     Args:
-        path: the file to write; its folder exists. Where it is a symbolic link, the file it leads to is written.
+        path: the file to write, or a link to it; its folder exists.
         model: the Gaussians.
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
 
@@ -63,17 +60,15 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
     bad = np.flatnonzero(~np.isfinite(columns).all(axis=0))
     if len(bad):
         raise ValueError(f"model: expected values that are finite in float32, got others in {names[bad[0]]}")
-    double = _float32_moves(means, values["log_scales"])
-    if double:
-        columns = np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
-    kinds = ("double" if double and name in "xyz" else "float" for name in names)
+    position = "float"
+    if _float32_moves(means, values["log_scales"]):
+        position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
     header = f"ply\nformat binary_little_endian 1.0\ncomment kgs sh_degree {model.sh_degree}\nelement vertex {n}\n"
-    header += "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, names, strict=True)) + "end_header\n"
+    header += "".join(f"property {position if name in 'xyz' else 'float'} {name}\n" for name in names) + "end_header\n"
     target = Path(os.path.realpath(path))
     unfinished = target.with_name(f".kgs-{uuid.uuid4().hex}.tmp")
     try:
-        with open(unfinished, "wb") as file:
-            file.write(header.encode("ascii") + columns.tobytes())
+        unfinished.write_bytes(header.encode("ascii") + columns.tobytes())
         os.replace(unfinished, target)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -82,43 +77,42 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
 def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> GaussianModel:
     """Read a 3DGS PLY file: ascii or binary, properties in any order and of any scalar type, harmonics of degree 0-3.
 
-    Properties and elements that are not those of a splat are skipped. The active degree is the one that kgs wrote
-    down, else that of the harmonics in the file. Warns where float32 cannot hold the positions and `origin` would help.
+    Other properties and elements are skipped. The active degree is the one that kgs wrote down, else that of the
+    harmonics in the file. Warns where float32 cannot hold the positions and `origin` would help.
 
     Args:
         path: the file to read.
-        origin: subtracted in float64 from the positions before they are rounded, `(3,)`: the `offset` that
-            :func:`save_ply` added. None: nothing.
+        origin: subtracted in float64 before the positions are rounded, `(3,)`: the `offset` of :func:`save_ply`.
 
     Returns:
         A float32 model on the CPU.
 
     Raises:
-        DataError: the file cannot be read or is no 3DGS PLY: wrong header, a property missing, fewer or more bytes
-            than the header says, or a value that is not finite.
+        DataError: the file cannot be read, its header is wrong, a property is missing, the number of bytes is not what
+            the header says, or a value is not finite.
         ValueError: `origin` has another shape or is not finite.
     """
     path, start = Path(path), np.zeros(3) if origin is None else _vector("origin", origin)
     try:
         with open(path, "rb") as file:
             order, elements, degree = _read_header(path, file)
-            vertices = [element for element in elements if element.name == "vertex"]
-            if len(vertices) != 1:
-                raise DataError(path, "vertex", f"expected one element of that name, got {len(vertices)}")
-            rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices[0].properties)
+            places = [place for place, element in enumerate(elements) if element.name == "vertex"]
+            if len(places) != 1:
+                raise DataError(path, "vertex", f"expected one element of that name, got {len(places)}")
+            vertex = elements[places[0]]
+            rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
             sizes = [3 * (k - 1) for k in SH_SIZES]
             if rest not in sizes:
                 raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
             names = [*"xyz", *_splat_names(rest)]
             for name in names:
-                if name not in vertices[0].properties:
+                if name not in vertex.codes:
                     raise DataError(path, name, "expected this property of a splat, got none")
-            columns = _read_columns(path, order, elements, elements.index(vertices[0]), file)
+            columns = _read_columns(path, order, elements, places[0], file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
-        raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertices[0].count}") from error
-
+        raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
     means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - start
     with np.errstate(over="ignore"):
         table = np.stack([*means.astype(np.float32).T, *(columns[name].astype(np.float32) for name in names[3:])], 1)
@@ -130,10 +124,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     if _float32_moves(means, scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
-    sh_rest = sh_rest.unflatten(1, (3, rest // 3)).mT
-    return GaussianModel(
-        means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, sh_degree=min(degree, sizes.index(rest))
-    )
+    sh_rest, degree = sh_rest.unflatten(1, (3, rest // 3)).mT, min(degree, sizes.index(rest))
+    return GaussianModel(means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, degree)
 
 
 def _vector(name: str, value: Tensor) -> NDArray[np.float64]:
@@ -156,15 +148,7 @@ def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[A
 class _Element:
     name: str
     count: int
-    properties: dict[str, str]  # name to numpy type code
-    has_list: bool = False
-
-    def dtype(self, order: str) -> np.dtype[np.void]:
-        return np.dtype([(name, BYTE_ORDERS[order] + code) for name, code in self.properties.items()])
-
-    def size(self, order: str) -> int:
-        """How many bytes, or words of text, all of it takes."""
-        return self.count * (len(self.properties) if order == "ascii" else self.dtype(order).itemsize)
+    codes: dict[str, str] = field(default_factory=dict)  # of each property numpy's code, O for a list
 
 
 def _splat_names(rest: int) -> list[str]:
@@ -188,11 +172,11 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
             case ["format", name, "1.0"] if name in BYTE_ORDERS and order is None:
                 order = name
             case ["element", name, digits] if re.fullmatch("[0-9]{1,18}", digits):
-                elements.append(_Element(name, int(digits), {}))
-            case ["property", "list", _, _, _] if elements:
-                elements[-1].has_list = True
-            case ["property", kind, name] if elements and kind in SCALARS and name not in elements[-1].properties:
-                elements[-1].properties[name] = SCALARS[kind]
+                elements.append(_Element(name, int(digits)))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1].codes[name] = "O"
+            case ["property", kind, name] if elements and kind in SCALARS and name not in elements[-1].codes:
+                elements[-1].codes[name] = SCALARS[kind]
             case ["comment", "kgs", "sh_degree", digits] if re.fullmatch("[0-9]", digits):
                 degree = int(digits)
             case ["comment" | "obj_info", *_] | []:
@@ -209,12 +193,13 @@ def _read_columns(
     path: Path, order: str, elements: list[_Element], place: int, file: BinaryIO
 ) -> dict[str, NDArray[np.generic]]:
     """The properties of the element in that place; binary data are read after the file is known to be long enough."""
-    vertex, is_text = elements[place], order == "ascii"
-    if any(element.has_list for element in elements[: place + 1]):
+    vertex, is_text, begin = elements[place], order == "ascii", file.tell()
+    dtypes = [np.dtype([(name, BYTE_ORDERS[order] + code) for name, code in e.codes.items()]) for e in elements]
+    if any(dtype.hasobject for dtype in dtypes[: place + 1]):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
-    sizes = [element.size(order) for element in elements]
-    start, end, total = sum(sizes[:place]), sum(sizes[: place + 1]), sum(sizes)
-    begin = file.tell()
+    widths = [len(dtype.names or ()) if is_text else dtype.itemsize for dtype in dtypes]
+    ends = [0, *accumulate(element.count * width for element, width in zip(elements, widths, strict=True))]
+    start, end, total = ends[place], ends[place + 1], ends[-1]
     available = os.fstat(file.fileno()).st_size - begin
     if is_text:
         with warnings.catch_warnings(action="error"):
@@ -223,12 +208,11 @@ def _read_columns(
             except (DeprecationWarning, ValueError) as error:
                 raise DataError(path, "vertex", "expected nothing but numbers after the header") from error
         available = len(numbers)
-    if available < end or (available != total and not any(element.has_list for element in elements)):
+    if available < end or (available != total and not any(dtype.hasobject for dtype in dtypes)):
         unit = "numbers" if is_text else "bytes"
         raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
     if is_text:
-        table = numbers[start:end].reshape(vertex.count, len(vertex.properties))
-        return dict(zip(vertex.properties, table.T, strict=True))
+        return dict(zip(vertex.codes, numbers[start:end].reshape(vertex.count, widths[place]).T, strict=True))
     file.seek(begin + start)
-    rows = np.fromfile(file, vertex.dtype(order), vertex.count)
-    return {name: rows[name] for name in vertex.properties}
+    rows = np.fromfile(file, dtypes[place], vertex.count)
+    return {name: rows[name] for name in vertex.codes}

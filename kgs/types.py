@@ -99,6 +99,9 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __bool__(self) -> bool:
+        return True  # also without Gaussians
+
     def __getitem__(self, index: Tensor | slice) -> Self:
         """Some of the Gaussians: those of a mask `(N,)`, of indices `(M,)` or of a slice."""
         return replace(self, **{k: v[..., index] if k == "opacities" else v[index] for k, v in vars(self).items()})

@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:
-    """The mean of the opacities, each weighted by the rank of its score, from near 0 for the lowest to near 1.
+    """The mean of the opacities, each weighted by (rank - 1/2) / N with the rank of its score from 1 to N.
 
-    The weight is (rank - 1/2) / N with ranks from 1 to N; equal scores share the mean of their ranks. So the weights
-    have mean 1/2 whatever the scores are, and nothing depends on the order of the Gaussians.
+    Equal scores share the mean of their ranks. So the weights have mean 1/2 whatever the scores are, and nothing
+    depends on the order of the Gaussians.
 
     Args:
         opacities: activated, in [0, 1], `(N,)` (else a ValueError); the gradient goes to these alone.
@@ -29,8 +29,7 @@ def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:
         raise ValueError(f"opacities: expected shape (N,), got {tuple(opacities.shape)}")
     if scores.shape != opacities.shape:
         raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
-    scores = scores.detach()
-    ordered = scores.sort().values
-    below, not_above = torch.searchsorted(ordered, scores), torch.searchsorted(ordered, scores, right=True)
+    ordered = scores.detach().sort().values
+    below, not_above = (torch.searchsorted(ordered, scores.detach(), right=right) for right in (False, True))
     weights = (below + not_above).to(opacities.dtype) / (2 * max(len(scores), 1))
     return (weights * opacities).sum() / max(len(opacities), 1)

@@ -23,9 +23,8 @@ from torch import Tensor
 
 from kgs.backends import choose, register
 
-WINDOW = 11
+WINDOW, SIGMA = 11, 1.5
 RADIUS = WINDOW // 2
-SIGMA = 1.5
 C1, C2, EPS = 0.01**2, 0.03**2, 1e-12
 
 
@@ -116,11 +115,10 @@ def photometric_loss(
 @torch.inference_mode(False)  # else a training step could not save what is made in inference mode
 @torch.no_grad()
 def target_moments(target: Tensor) -> TargetMoments:
-    """The part of the SSIM that depends on the target alone, for :func:`photometric_loss` with this target or for it.
+    """The part of the SSIM that depends on the target alone, for :func:`photometric_loss`; no gradient flows to it.
 
     Args:
-        target: `(B, C, H, W)`, H, W >= 6 (else a ValueError), float32 or float64 (else a TypeError). No gradient flows
-            to it.
+        target: `(B, C, H, W)`, H, W >= 6 (else a ValueError), float32 or float64 (else a TypeError).
     """
     _check_images(target, target)
     if min(target.shape[-2:]) <= RADIUS:
@@ -133,8 +131,7 @@ def target_moments(target: Tensor) -> TargetMoments:
 class _MeanSsim(torch.autograd.Function):
     """Mean SSIM of an image `(1, K, H, W)` and a target given by its moments, over the windows that are not `outside`.
 
-    The derivatives of the map by the image's local mean, square and product with the target are pointwise; one more
-    blur, the adjoint of the first, brings them to the pixels.
+    Its derivatives by local mean, square and product with the target are pointwise; a blur takes them to the pixels.
     """
 
     @staticmethod
@@ -207,24 +204,18 @@ def _pad(image: Tensor) -> Tensor:
 
 
 def _fold(grad: Tensor) -> Tensor:
-    """Adjoint of the reflected border: add the gradient of each border pixel to that of the pixel it copies.
-
-    `F.pad` has the same backward, but sums in no fixed order on CUDA.
-    """
+    """Adjoint of the reflected border, that of `F.pad` but for CUDA, where it sums in no fixed order."""
     for dim in (-1, -2):
         size = grad.shape[dim] - 2 * RADIUS
-        inner = grad.narrow(dim, RADIUS, size).clone()
-        inner.narrow(dim, 1, RADIUS).add_(grad.narrow(dim, 0, RADIUS).flip(dim))
-        inner.narrow(dim, size - RADIUS - 1, RADIUS).add_(grad.narrow(dim, size + RADIUS, RADIUS).flip(dim))
-        grad = inner
+        before, inner, after = grad.split([RADIUS, size, RADIUS], dim)
+        grad = inner.clone()
+        grad.narrow(dim, 1, RADIUS).add_(before.flip(dim))
+        grad.narrow(dim, size - RADIUS - 1, RADIUS).add_(after.flip(dim))
     return grad
 
 
 def _blur(maps: Tensor) -> Tensor:
-    """Window each map, which loses 5 pixels on each side: `(..., H + 10, W + 10)` to `(..., H, W)`.
-
-    Shifted sums add in the order of a convolution, in little memory, with no TF32 and no autocast.
-    """
+    """Window each map, `(..., H + 10, W + 10)` to `(..., H, W)`, by shifted sums: no TF32, no autocast."""
     weights = get_gaussian_kernel1d(WINDOW, SIGMA, device=torch.device("cpu"), dtype=maps.dtype).flatten().tolist()
     for dim in (-1, -2):
         size = maps.shape[dim] - 2 * RADIUS

@@ -42,6 +42,7 @@ def model(kind=CameraModelType.PINHOLE, batch=()):
 def test_harmonics_of_degree_0_to_3_are_taken(n, bands, degree, dtype):
     gaussians = Gaussians(**fields(n, bands, dtype))
     assert len(gaussians) == n
+    assert gaussians, "true as a model is, also where n is 0"
     assert sh_degree(gaussians.colors) == degree
 
 
