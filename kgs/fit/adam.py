@@ -1,7 +1,5 @@
 """Adam with a learning rate for each parameter of the Gaussians, and its moments by their names."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -11,22 +9,14 @@ from kgs.model import GaussianModel
 
 from .config import Recipe
 
-__all__ = ["adam", "load_moments", "moments_of"]
-
-_RATES = {
-    "means": "lr_means",
-    "quats": "lr_quats",
-    "log_scales": "lr_scales",
-    "opacity_logits": "lr_opacity",
-    "sh_dc": "lr_sh_dc",
-    "sh_rest": "lr_sh_rest",
-}
+_RATES = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacity"}
+_RATES |= {"sh_dc": "sh_dc", "sh_rest": "sh_rest"}
 
 
 def adam(model: GaussianModel, recipe: Recipe) -> torch.optim.Adam:
     """The optimiser of a model: one group per parameter, that of the means first."""
     groups = [
-        {"params": [model.get_parameter(name)], "lr": getattr(recipe, rate), "name": name}
+        {"params": [model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
         for name, rate in _RATES.items()
     ]
     return torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
@@ -48,7 +38,7 @@ def load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Any]) -> N
         shape, state = held["params"][0].shape, moments[group["name"]]
         if state:
             shapes = {"step": (), "exp_avg": shape, "exp_avg_sq": shape}
-            negative = [name for name in ("step", "exp_avg_sq") if bool((state[name] < 0).any())]
+            negative = any(bool((state[name] < 0).any()) for name in ("step", "exp_avg_sq"))
             if negative or {name: tuple(value.shape) for name, value in state.items()} != shapes:
                 raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
             found[group["params"][0]] = state

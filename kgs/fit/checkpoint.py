@@ -5,8 +5,6 @@ metadata under "state", beside the format and the SHA-256 of the tensors and the
 makes tensors and plain values and nothing else.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -24,8 +22,6 @@ from kgs.errors import DataError
 from kgs.json_files import parse_json
 
 from .config import FitConfig
-
-__all__ = ["PLAIN", "check_state", "fingerprint", "load_checkpoint", "newest_checkpoint", "previous", "save_checkpoint"]
 
 _FORMAT = "kgs-checkpoint 3"
 _OLD = b"kgs-checkpoint "
@@ -131,14 +127,11 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
     """SHA-256 sums by which any change of a photo, mask, pose, intrinsics or the background is noticed and named."""
 
     def of(views: Views) -> dict[str, Any]:
-        masks, cameras = views.masks, views.cameras
-        return {
-            "names": list(views.names),
-            "photos": [_digest(image) for image in views.images],
-            "masks": None if masks is None else [_digest(mask) for mask in masks],
-            "poses": [_digest(pose) for pose in cameras.extrinsics],
-            "intrinsics": [_digest(matrix) for matrix in cameras.intrinsics],
-        }
+        cameras = views.cameras
+        tensors = {"photos": views.images, "masks": views.masks}
+        tensors |= {"poses": cameras.extrinsics, "intrinsics": cameras.intrinsics}
+        sums = {what: None if values is None else list(map(_digest, values)) for what, values in tensors.items()}
+        return {"names": list(views.names), **sums}
 
     return {"training": of(scene.train), "test": of(scene.test), "background": _digest(scene.background)}
 
@@ -150,16 +143,13 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
         Notes for the user: what it means that the fit goes on for more steps than it was begun with, if it does.
 
     Raises:
-        ValueError: an entry is missing or wrong, or the scene or the configuration is another.
+        KeyError, TypeError, ValueError: an entry is missing or wrong, or the scene or the configuration is another.
     """
     for name, (expected, is_right) in PLAIN.items():
-        if name not in state or not is_right(state[name]):
-            got = f"{str(state[name])[:80]!r}" if name in state else "none"
-            raise ValueError(f"{name}: expected {expected}, got {got}")
+        if not is_right(state[name]):
+            raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
-    if not _is_int(steps, done):
-        raise ValueError(f"step: expected at most the {steps!r} of the configuration, got {done}")
     if steps == done < config.steps:
         asked["steps"] = steps
         notes.append(
@@ -167,7 +157,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
             f"densification and resets are those of {config.steps} steps, so that the result differs from a fit of "
             f"{config.steps} steps from the start"
         )
-    elif steps != config.steps:
+    elif steps != config.steps or done > steps:
         wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
         raise ValueError(f"--steps: expected {wanted} got {config.steps}")
     _compare_settings(state["config"], asked)
@@ -188,14 +178,14 @@ def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], flag: str = 
 
 
 def _compare_scenes(saved: Any, asked: dict[str, Any]) -> None:
-    expected = "expected those that the fit was begun with, got others"
     for part in ("training", "test"):
         for what, values in asked[part].items():
             before = saved[part][what]
             if before != values:
                 both = zip(asked[part]["names"], before or [], values or [], strict=False)
                 changed = ", ".join(name for name, one, other in both if one != other)
-                raise ValueError(f"{what} of the {part} views: {expected}" + f" for {changed:.200}" * bool(changed))
+                which = f"{what} of the {part} views: expected those that the fit was begun with, got others"
+                raise ValueError(which + f" for {changed:.200}" * bool(changed))
     if saved["background"] != asked["background"]:
         raise ValueError("--background: expected the one that the fit was begun with, got another")
 
@@ -239,13 +229,13 @@ def _sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _is_int(value: Any, least: int) -> bool:
-    return type(value) is int and least <= value < 2**48
-
-
-def is_number(value: Any, least: float = -1e300) -> bool:
+def is_number(value: Any, least: float = -1e300, whole: bool = False) -> bool:
     """Whether a value of JSON is a number of that size, and no bool."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value < 1e300
+    return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
+
+
+def _is_count(value: Any) -> bool:
+    return is_number(value, 0, whole=True)
 
 
 def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
@@ -254,17 +244,17 @@ def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
 
 def _is_point(value: Any) -> bool:
     keys = {"step", "seconds", "test_psnr", "train_psnr"}
-    return isinstance(value, dict) and value.keys() == keys and all(x is None or is_number(x) for x in value.values())
+    return value.keys() == keys and all(x is None or is_number(x) for x in value.values())
 
 
 # The plain values of a fit's state, what is expected of each, and whether it is so.
 PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "init": ("kind and number of first points", lambda v: v.keys() == {"kind", "points"} and _is_int(v["points"], 1)),
-    "step": ("a number of steps", lambda v: _is_int(v, 0)),
+    "init": ("kind and number of first points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),
+    "step": ("a number of steps", _is_count),
     "seconds": ("a number, not negative", lambda v: is_number(v, 0)),
     "curve": ("a list of measurements", lambda v: _is_list(v, _is_point)),
     "notes": ("a list of texts", lambda v: _is_list(v, lambda x: isinstance(x, str))),
     "extent": ("a number above 0", lambda v: is_number(v, 1e-300)),
     "near_plane": ("a number above 0", lambda v: is_number(v, 1e-300)),
-    "stack": ("a list of views", lambda v: _is_list(v, lambda x: _is_int(x, 0))),
+    "stack": ("a list of views", lambda v: _is_list(v, _is_count)),
 }

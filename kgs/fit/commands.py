@@ -181,9 +181,9 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     """
     from kgs.json_files import read_json
 
+    from .folder import load_fit
     from .metrics import measure_again
     from .outputs import write_json
-    from .settings import load_fit
 
     lpips = _prepare(device, lpips=lpips_weights)
     saved, path = load_fit(out, device), out / "metrics.json"

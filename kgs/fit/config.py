@@ -4,18 +4,12 @@ Source: the official release of "DropGaussian" (CVPR 2025) for the recipe, which
 another densification threshold and without pruning by size.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
-
-__all__ = ["DEMO", "FAST", "FitConfig", "Recipe", "Timetable", "timetable"]
-
-_MIN_DENSIFICATIONS = 20
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 
 class _Range(NamedTuple):
@@ -26,16 +20,17 @@ class _Range(NamedTuple):
     ends: str = "[]"
 
     def holds(self, value: float) -> bool:
-        above = self.least <= value if self.ends[0] == "[" else self.least < value
-        return above and (value <= self.most if self.ends[1] == "]" else value < self.most)
+        is_end = (value == self.least and self.ends[0] != "[") or (value == self.most and self.ends[1] != "]")
+        return self.least <= value <= self.most and not is_end
 
     def __str__(self) -> str:
         if self.most == 1e300:
-            return f"of at least {self.least:g}" if self.ends[0] == "[" else f"above {self.least:g}"
+            return f"{'of at least' if self.ends[0] == '[' else 'above'} {self.least:g}"
         return f"in {self.ends[0]}{self.least:.12g}, {self.most:.12g}{self.ends[1]}"
 
 
 _Steps = Annotated[int, _Range(1, 10_000_000)]
+_Count = Annotated[int, _Range(0, 10_000_000)]
 _Positive = Annotated[float, _Range(0, ends="(]")]
 _Weight = Annotated[float, _Range(0)]
 _Share = Annotated[float, _Range(0, 1)]
@@ -79,14 +74,14 @@ class Recipe:
     adam_eps: _Weight = 1e-15
     sh_interval: _Steps = 1000
     dssim_weight: _Weight = 0.2
-    densify_from: Annotated[int, _Range(0, 10_000_000)] = 500
+    densify_from: _Count = 500
     densify_interval: _Steps = 100
     grad_threshold: _Weight = 5e-4
     percent_dense: _Positive = 0.01
     prune_opacity: _Share = 0.005
     reset_interval: _Steps = 3000
     reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
-    reset_recovery: Annotated[int, _Range(0, 10_000_000)] = 300
+    reset_recovery: _Count = 300
     near_plane: _Positive = 0.05
 
     def __post_init__(self) -> None:
@@ -157,7 +152,7 @@ class FitConfig:
         return asdict(self) | {"init_file": None if self.init_file is None else str(self.init_file)}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> FitConfig:
+    def from_dict(cls, values: dict[str, Any]) -> Self:
         """The inverse of `to_dict`.
 
         Raises:
@@ -169,23 +164,14 @@ class FitConfig:
             raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
 
 
-@dataclass(frozen=True)
-class Timetable:
-    """The steps at which things happen in a fit of a given length.
+class Timetable(NamedTuple):
+    """The steps at which things happen in a fit of a given length."""
 
-    Args:
-        sh: before these steps one more degree of harmonics is switched on.
-        densify: after these steps Gaussians are cloned, split and pruned.
-        reset: after these steps all opacities are lowered.
-        evaluate: after these steps the curve is measured (before a densification).
-        coarse: up to this step the training views are seen at half their width.
-    """
-
-    sh: tuple[int, ...]
-    densify: tuple[int, ...]
-    reset: tuple[int, ...]
-    evaluate: tuple[int, ...]
-    coarse: int
+    sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
+    densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
+    reset: tuple[int, ...]  # after these all opacities are lowered
+    evaluate: tuple[int, ...]  # after these the curve is measured (before a densification)
+    coarse: int  # up to this one the training views are seen at half their width
 
 
 def timetable(config: FitConfig) -> Timetable:
@@ -197,16 +183,18 @@ def timetable(config: FitConfig) -> Timetable:
     """
     recipe, steps = config.recipe, config.steps
     scale = steps / recipe.steps
-    interval = max(10, round(min(recipe.densify_interval, steps / _MIN_DENSIFICATIONS) * max(1.0, scale)))
-    begin = round(recipe.densify_from * scale)
-    densify = tuple(step for step in range(interval, steps, interval) if step > begin)
+    interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
     spacing = max(1, round(recipe.reset_interval * scale))
-    resets = list(range(spacing, steps, spacing))
-    reset = tuple(step for step, then in pairwise([*resets, steps]) if then - step >= recipe.reset_recovery)
-    sh = [round(recipe.sh_interval * scale * k) for k in range(1, config.sh_degree + 1)]
-    evaluate = {max(1, round(steps * k / config.evaluations)) for k in range(1, config.evaluations + 1)}
     return Timetable(
-        tuple(max(1, step) for step in sh), densify, reset, tuple(sorted(evaluate)), round(config.coarse * steps)
+        sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, config.sh_degree + 1)),
+        densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
+        reset=tuple(
+            s for s, then in pairwise([*range(spacing, steps, spacing), steps]) if then - s >= recipe.reset_recovery
+        ),
+        evaluate=tuple(
+            sorted({max(1, round(steps * k / config.evaluations)) for k in range(1, config.evaluations + 1)})
+        ),
+        coarse=round(config.coarse * steps),
     )
 
 
@@ -225,16 +213,14 @@ def _plain(value: Any, hint: Any) -> tuple[Any, str]:
     """The value as the hint has it, None where it does not fit; and what the hint expects, in words."""
     if get_origin(hint) is Literal:
         return value if isinstance(value, str) and value in get_args(hint) else None, f"one of {list(get_args(hint))}"
+    if hint == Path | None:
+        return Path(value) if isinstance(value, (str, PathLike)) and str(value) else None, "a path"
     if get_origin(hint) is not Annotated:
-        if hint == Path | None:
-            return Path(value) if isinstance(value, (str, PathLike)) and str(value) else None, "a path"
         return value if isinstance(value, hint) else None, "a name" if hint is str else f"a {hint.__name__}"
     kind, limits = get_args(hint)
-    is_whole = kind is not float
-    expected = f"a {'whole' if is_whole else 'finite'} number {limits}"
-    is_number = isinstance(value, Integral if is_whole else Real) and not isinstance(value, bool)
-    as_python: Any = int if is_whole else float
-    return as_python(value) if is_number and limits.holds(value) else None, expected
+    abstract, python, word = (Real, float, "finite") if kind is float else (Integral, int, "whole")
+    fits = isinstance(value, abstract) and not isinstance(value, bool) and limits.holds(value)
+    return python(value) if fits else None, f"a {word} number {limits}"
 
 
 # A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps at twice the

@@ -1,15 +1,11 @@
 """Where a fit leaves the finite numbers: what is wrong, and with which parameter of which Gaussian, in words."""
 
-from __future__ import annotations
-
 import math
 
 import torch
 from torch import Tensor
 
 from kgs.model import GaussianModel
-
-__all__ = ["gradient_fault", "parameter_fault", "scale_fault"]
 
 _LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
 
@@ -48,5 +44,5 @@ def scale_fault(model: GaussianModel, extent: float) -> str:
 
 
 def _first_row(value: Tensor) -> int | None:
-    rows = (~torch.isfinite(value)).flatten(1).any(1) if value.ndim > 1 else ~torch.isfinite(value)
-    return int(rows.nonzero()[0, 0]) if bool(rows.any()) else None
+    rows = (~torch.isfinite(value)).nonzero()
+    return int(rows[0, 0]) if len(rows) else None

@@ -1,10 +1,8 @@
-"""The folder of a fit: one fit at a time, and an old result that stays whole until the new one is.
+"""The folder of a fit: one fit at a time, an old result that stays whole until the new one is, and what is read again.
 
 A fit writes to `unfinished`, its checkpoints included. When all is there the folder is renamed to `finished`, and its
 files are moved to their places. Whoever opens the folder after a kill in between ends the move first.
 """
-
-from __future__ import annotations
 
 import os
 import shutil
@@ -12,14 +10,21 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.camera import move_camera
 from kgs.errors import DataError
 from kgs.json_files import read_json
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
 
-from .checkpoint import previous
+from .checkpoint import is_number, newest_checkpoint, previous
+from .config import FitConfig
 from .outputs import remove_others, write_json
-
-__all__ = ["CHECKPOINT", "RESULTS", "UNFINISHED", "end_move", "is_finished", "locked", "publish", "recover"]
 
 CHECKPOINT = "checkpoint.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png")
@@ -47,9 +52,8 @@ def locked(out: Path) -> Iterator[None]:
 
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as error:
-            raise DataError(
-                out, "", "another fit is at work in this folder: wait for it or choose another --out"
-            ) from error
+            reason = "another fit is at work in this folder: wait for it or choose another --out"
+            raise DataError(out, "", reason) from error
         except OSError:
             pass  # a file system without locks
         yield
@@ -66,13 +70,6 @@ def publish(out: Path) -> None:
     shutil.rmtree(out / _FINISHED, ignore_errors=True)
     os.replace(new, out / _FINISHED)
     end_move(out)
-
-
-def recover(out: Path) -> None:
-    """End the move that a kill stopped, if there is one."""
-    if (out / _FINISHED / _LIST).exists():
-        with locked(out):
-            end_move(out)
 
 
 def end_move(out: Path) -> None:
@@ -103,3 +100,78 @@ def is_finished(out: Path) -> bool:
         return bool(read_json(out / "metrics.json")["steps"] >= read_json(out / "config.json")["fit"]["steps"])
     except (DataError, KeyError, TypeError):
         return False
+
+
+def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
+    """Read the config.json that `kgs fit` wrote.
+
+    Returns:
+        The arguments of `load_scene` (scene, train_views, downscale, background, points), and the configuration.
+
+    Raises:
+        DataError: the file is missing or damaged, or an entry is missing or wrong.
+    """
+    settings = read_json(path)
+    for name in ("request", "fit"):
+        if not isinstance(settings.get(name), dict):
+            raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
+    request = {"points": "none", **settings["request"]}
+    for name, expected, is_right in (
+        ("scene", "a path", lambda v: isinstance(v, str) and v and "\0" not in v),
+        ("train_views", "a whole number above 0 or null", lambda v: v is None or is_number(v, 1, whole=True)),
+        ("downscale", "a number of at least 1 or null", lambda v: v is None or is_number(v, 1)),
+        ("background", "one of ['black', 'white']", lambda v: v in ("black", "white")),
+        ("points", "one of ['none', 'model-points']", lambda v: v in ("none", "model-points")),
+    ):
+        if name not in request or not is_right(request[name]):
+            got = f"{request[name]!r}"[:60] if name in request else "none"
+            raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
+    try:
+        return request, FitConfig.from_dict(settings["fit"])
+    except ValueError as error:
+        raise DataError(path, "fit", str(error)) from error
+
+
+class SavedFit(NamedTuple):
+    """A fit for pictures and measures, without what training needs.
+
+    Args:
+        request: the arguments of `load_scene`, see :func:`read_settings`.
+        config: what the fit was asked to do.
+        model: the Gaussians, in the frame of the scene (world coordinates less `Scene.offset`).
+        near_plane: that of the fit's renders, in world units.
+        step: how many steps are done.
+    """
+
+    request: dict[str, Any]
+    config: FitConfig
+    model: GaussianModel
+    near_plane: float
+    step: int
+
+    @torch.no_grad()
+    def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
+        """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
+        renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=self.config.max_bytes).eval()
+        device = self.model.means.device
+        image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
+        return image
+
+
+def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
+    """Read what a fit left in its folder, without optimiser, densifier and the scene.
+
+    Raises:
+        DataError: config.json or the checkpoint is missing or damaged.
+    """
+    if (out / _FINISHED / _LIST).exists():  # a kill stopped the move
+        with locked(out):
+            end_move(out)
+    request, config = read_settings(out / "config.json")
+    path = out / CHECKPOINT
+    state, _ = newest_checkpoint(path)
+    try:
+        model = GaussianModel(**state["model"]).to(device)
+        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error

@@ -1,14 +1,11 @@
 """One fit from a scene to its files: trains with a progress line, evaluates, writes everything."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +25,18 @@ from .progress import Stage, each, progress, say, silent
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
-__all__ = ["CHECKPOINT", "choose_points", "fit_scene", "measure", "train"]
-
 _SAVE_SECONDS = 60.0
+_STARTS = {
+    "model-points": "points seen in training views, but their positions were refined with test views",
+    "scene": "first points that come with the layout",
+    "file": "first points of a file",
+}
+_CONVENTIONS = {
+    "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
+    "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
+    "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
+    "test_views_used_for": "metrics and the curve only; no early stopping",
+}
 
 
 def fit_scene(
@@ -101,9 +107,17 @@ def fit_scene(
                 new.mkdir()
                 trainer.save(new / CHECKPOINT)  # first points may have taken a minute
                 trainer.saved = saved
-            write_json(new / "config.json", _settings(trainer, request or {}))
+            settings = {"request": request or {}, "fit": config.to_dict(), "timetable": trainer.times._asdict()}
+            settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
+            write_json(new / "config.json", settings)
             stopped_by = train(trainer, new / CHECKPOINT)
-            metrics = _write_results(trainer, new, names, lpips)
+            save_ply(new / "splat.ply", trainer.model, offset=scene.offset)
+            write_curve(new / "curve.png", {"": trainer.curve})
+            (new / "test").mkdir(exist_ok=True)
+            for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
+                write_png(new / "test" / names[name], trainer.render(scene.test.camera(i))[0])
+            metrics = measure(trainer, lpips)
+            write_json(new / "metrics.json", metrics)
         except BaseException:
             if not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)
@@ -133,33 +147,11 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
     return None, out
 
 
-def _settings(trainer: Trainer, request: dict[str, Any]) -> dict[str, Any]:
-    """What config.json holds."""
-    return {
-        "request": request,
-        "fit": trainer.config.to_dict(),
-        "timetable": asdict(trainer.times),
-        "max_gaussians": trainer.max_gaussians,
-        "near_plane": trainer.renderer.near_plane,
-        "extent": trainer.extent,
-    }
-
-
-def _write_results(trainer: Trainer, new: Path, names: dict[str, str], lpips: Lpips | None) -> dict[str, Any]:
-    scene = trainer.scene
-    save_ply(new / "splat.ply", trainer.model, offset=scene.offset)
-    write_curve(new / "curve.png", {"": trainer.curve})
-    (new / "test").mkdir(exist_ok=True)
-    for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
-        write_png(new / "test" / names[name], trainer.render(scene.test.camera(i))[0])
-    metrics = measure(trainer, lpips)
-    write_json(new / "metrics.json", metrics)
-    return metrics
-
-
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     """What metrics.json holds of one run; None stands for what was not measured."""
-    scene = trainer.scene
+    scene, config = trainer.scene, trainer.config
+    start = _STARTS.get(config.init, "first points from training views alone")
+    poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     return {
         "test": evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None,
         "train": evaluate(trainer.render, scene.train, lpips),
@@ -168,10 +160,17 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
         "peak_rss_mb": peak_rss_mb() or None,
         "gaussians": len(trainer.model),
         "steps": trainer.step,
-        "seed": trainer.config.seed,
-        "drop": trainer.config.drop,
+        "seed": config.seed,
+        "drop": config.drop,
         "init": trainer.init,
-        "protocol": _protocol(scene, trainer.config),
+        "protocol": {
+            "train": list(scene.train.names),
+            "test": list(scene.test.names),
+            "image_size": list(scene.train.images.shape[-2:]),
+            "background": scene.background.tolist(),
+            "init": f"{config.init}: {start}; {poses}",
+            **_CONVENTIONS,
+        },
         "versions": versions(),
     }
 
@@ -207,12 +206,11 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
     def save() -> None:
         nonlocal saved
         saved = time.monotonic()
-        if checkpoint is None:
-            return
-        try:
-            trainer.save(checkpoint)
-        except OSError as error:
-            trainer.notes.append(f"step {trainer.step}: no checkpoint: {error}")
+        if checkpoint is not None:
+            try:
+                trainer.save(checkpoint)
+            except OSError as error:
+                trainer.notes.append(f"step {trainer.step}: no checkpoint: {error}")
 
     with _interruptible() as stopped, progress(trainer.config.steps, title, trainer.step) as advance:
 
@@ -227,30 +225,6 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
     return stopped[0] if stopped else 0
 
 
-_STARTS = {
-    "model-points": "points seen in training views, but their positions were refined with test views",
-    "scene": "first points that come with the layout",
-    "file": "first points of a file",
-}
-
-
-def _protocol(scene: Scene, config: FitConfig) -> dict[str, Any]:
-    """The conditions under which the figures of a run hold."""
-    height, width = scene.train.images.shape[-2:]
-    return {
-        "train": list(scene.train.names),
-        "test": list(scene.test.names),
-        "image_size": [height, width],
-        "background": scene.background.tolist(),
-        "init": f"{config.init}: {_STARTS.get(config.init, 'first points from training views alone')}; "
-        "poses as given (estimated with all views in real scenes, the field's protocol)",
-        "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
-        "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
-        "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
-        "test_views_used_for": "metrics and the curve only; no early stopping",
-    }
-
-
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
     """The signals that came: Ctrl-C, SIGTERM and SIGHUP are only noted; a second one acts as usual.
@@ -258,10 +232,12 @@ def _interruptible() -> Iterator[list[int]]:
     One that is ignored (SIGHUP under nohup) stays so.
     """
     came: list[int] = []
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     is_main = threading.current_thread() is threading.main_thread()
-    found = {number: signal.getsignal(number) for number in numbers if is_main}
-    before = {number: handler for number, handler in found.items() if handler not in (None, signal.SIG_IGN)}
+    names = ("SIGINT", "SIGTERM", "SIGHUP") if is_main else ()  # Python lets no other thread handle them
+    handlers = {
+        getattr(signal, name): signal.getsignal(getattr(signal, name)) for name in names if hasattr(signal, name)
+    }
+    before = {number: handler for number, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
 
     def note(number: int, _: object) -> None:
         came.append(number)

@@ -4,8 +4,6 @@ Source: "DropGaussian" (CVPR 2025) compares random dropping with a selection and
 distance" and defines none of them. These are this project's readings, in both directions.
 """
 
-from __future__ import annotations
-
 import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
@@ -14,8 +12,6 @@ from kgs.densify import Densifier
 from kgs.drop import DropGaussian
 
 from .starts.triangulate import camera_centers
-
-__all__ = ["SelectiveDrop", "gaussian_scores"]
 
 
 class SelectiveDrop(DropGaussian):
@@ -58,9 +54,9 @@ def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Ten
         densifier: holds the Gaussians and what was observed of them.
         camera: of the present step.
     """
-    if by in ("high-gradient", "low-gradient"):
-        gradients = densifier.mean_gradients
-        return gradients if by == "high-gradient" else -gradients
-    means = densifier.model.means.detach()
-    distances: Tensor = (means - camera_centers(camera).to(means)).norm(dim=1)
-    return distances if by == "far" else -distances
+    if by.endswith("gradient"):
+        scores = densifier.mean_gradients
+    else:
+        means = densifier.model.means.detach()
+        scores = (means - camera_centers(camera).to(means)).norm(dim=1)
+    return scores if by in ("high-gradient", "far") else -scores

@@ -4,14 +4,12 @@ Random numbers come from three streams that never mix: the order of views, the c
 DropGaussian. Two fits that differ in the drop rate alone therefore see the same views in the same order.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -33,8 +31,6 @@ from .divergence import gradient_fault, parameter_fault, scale_fault
 from .machine import check_device
 from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
-
-__all__ = ["Trainer"]
 
 # Measured, with some room; the first is what libraries load when they are used for the first time.
 _BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
@@ -75,10 +71,9 @@ class Trainer:
         """All that follows from the scene and the configuration alone."""
         self.scene, self.config, self.device = scene, config, check_device(config.device)
         self.times = timetable(config)
-        self.step, self.seconds = 0, 0.0
+        self.step, self.seconds, self.saved = 0, 0.0, ""
         self.curve: list[dict[str, float | None]] = []
         self.notes: list[str] = []
-        self.saved = ""
         self.stack: list[int] = []
         self._fingerprint = fingerprint(scene)
         self._background = scene.background.to(self.device, torch.float32)
@@ -86,28 +81,26 @@ class Trainer:
         self._coarse_views = self._targets(scene.train.halved()) if self.times.coarse else []
 
     def _build(self, model: GaussianModel) -> None:
-        config, recipe, most = self.config, self.config.recipe, self.config.max_gaussians
-        self.max_gaussians = max(10 * config.steps, 2 * int(self.init["points"])) if most is None else most
+        config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
+        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 2 * int(self.init["points"]))
         self.model = model.to(self.device)
         self.optimizer = adam(self.model, recipe)
-        self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=10 * config.seed + 1) if config.drop else None
+        self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=seed + 1) if config.drop else None
         self.renderer = GaussianRenderer(self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes).train()
         self.densifier = Densifier(
             self.model,
             self.optimizer,
             self.extent,
-            grad_threshold=recipe.grad_threshold,
-            percent_dense=recipe.percent_dense,
-            prune_opacity=recipe.prune_opacity,
             max_gaussians=self.max_gaussians,
-            generator=torch.Generator().manual_seed(10 * config.seed + 2),
+            generator=torch.Generator().manual_seed(seed + 2),
+            **{name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")},
         )
-        self.order = torch.Generator().manual_seed(10 * config.seed + 3)
+        self.order = torch.Generator().manual_seed(seed + 3)
 
     def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
         """What a step needs of each view: its camera, its image and what D-SSIM wants of that."""
         images = [views.images[i : i + 1].to(self.device, torch.float32) for i in range(len(views))]
-        cameras = [move_camera(views.camera(i), self.device) for i in range(len(views))]
+        cameras = (move_camera(views.camera(i), self.device) for i in range(len(views)))
         return [(camera, image, target_moments(image)) for camera, image in zip(cameras, images, strict=True)]
 
     @property
@@ -121,7 +114,7 @@ class Trainer:
         loss = images[:1].nbytes * _IMAGES_OF_THE_LOSS
         return _BYTES_AT_FIRST_USE + self.config.max_bytes + gaussians + loss + 4 * images.nbytes
 
-    def fit(self, callback: Callable[[Trainer, float], bool] | None = None) -> None:
+    def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
         """Train to the end.
 
         Args:
@@ -232,7 +225,7 @@ class Trainer:
         self.saved = f"{path} of step {self.step}"
 
     @classmethod
-    def resume(cls, scene: Scene, config: FitConfig, path: Path) -> Trainer:
+    def resume(cls, scene: Scene, config: FitConfig, path: Path) -> Self:
         """Continue from a checkpoint bit for bit; where it is damaged from the one before, and `notes` says so.
 
         Raises:
