@@ -73,7 +73,7 @@ def publish(out: Path) -> None:
 
 
 def end_move(out: Path) -> None:
-    """The same within `locked`: what is left goes to its place, and what belonged to the result before goes away."""
+    """Within `locked`, end a move that a kill may have stopped: what is left goes to its place, and what belonged to the result before goes away."""
     done = out / _FINISHED
     if not (done / _LIST).exists():
         return
