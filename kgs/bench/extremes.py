@@ -8,12 +8,11 @@ analysis. In float64 those of needles and of scales up to 1000 are the reference
 2e-15. In float32 the exponent holds ln o: |ln o| times the rounding; coordinates of 2048 pixels are rounded to 1.2e-4.
 """
 
-from __future__ import annotations
-
 import csv
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -23,21 +22,17 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-import kgs.reference
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
-from .output import markdown_table, write_results
-from .scenes import DTYPES, Scene, cast, centred_camera, gradients, relative_errors
+from .output import Row, markdown_table, write_results
+from .scenes import DTYPES, Scene, cast, centred_camera, exact, gradients, relative_errors
 from .timing import take_turns
-
-__all__ = ["SCENES", "camera", "errors", "extremes", "gaussians", "ordinary", "render"]
 
 SIZE, FOCAL, COUNT = (48, 48), 60.0, 200
 SHAPE = torch.tensor([1.0, 0.6, 0.3], dtype=torch.float64)  # of Gaussians that are not round: round ones cannot turn
 OPACITIES = torch.tensor([1e-30, 1.0, 1.25, 0.5] * (COUNT // 4))
 NUMBERS = ("forward_float32", "gradient_float32", "forward_float64", "gradient_float64", "near_plane")
-Row = dict[str, Any]
 
 
 def extremes(*, out: Path, quick: bool = False) -> int:
@@ -84,12 +79,11 @@ def render(scene: Scene, dtype: torch.dtype, **options: Any) -> tuple[Tensor, di
 def errors(case: Row, dtype: str) -> Row:
     """One row: errors against the dense reference, which gets the rounded numbers."""
     scene, near_plane = SCENES[case["case"]](), case["near_plane"]
-    inputs, rounded = cast(cast(scene, DTYPES[dtype]), torch.float64)
-    exact = kgs.reference.render(inputs, rounded, None, 0.0, 0.0, near_plane)
+    expected, expected_gradients = exact(cast(scene, DTYPES[dtype]), near_plane)
     image, got = render(scene, DTYPES[dtype], near_plane=near_plane)
+    found = {"forward": float((image - expected).abs().max())}
+    found["gradient"] = relative_errors(got, expected_gradients).max().item()
     row = {name: case[name] for name in ("case", "stiff", "treatment")} | {"dtype": dtype}
-    found = {"forward": float((image - exact.detach()).abs().max())}
-    found["gradient"] = relative_errors(got, gradients(exact, inputs)).max().item()
     for name, error in found.items():
         row |= {name: error, f"{name}_bound": case[f"{name}_{dtype}"]}
     met = all(row[name] <= row[f"{name}_bound"] for name in found)  # NaN misses
@@ -126,14 +120,13 @@ def camera(size: tuple[int, int] = SIZE) -> PinholeCamera:
 def gaussians(count: int = COUNT, seed: int = 0, **changes: Tensor | float) -> Gaussians:
     """An ordinary cloud before `camera`: two to six units deep, one to five pixels wide, harmonics of degree 1."""
     generator = torch.Generator().manual_seed(seed)
-    uniform = partial(_uniform, generator=generator)
-    depth = uniform(2.0, 6.0, count)
-    place = uniform(-1.1, 1.1, count, 2) * (SIZE[1] / 2 / FOCAL)
+    depth = _uniform(2.0, 6.0, count, generator=generator)
+    place = _uniform(-1.1, 1.1, count, 2, generator=generator) * (SIZE[1] / 2 / FOCAL)
     values: dict[str, Tensor] = {
         "means": torch.cat([place * depth[:, None], depth[:, None]], 1),
         "quats": torch.randn(count, 4, generator=generator, dtype=torch.float64),
-        "scales": uniform(1.0, 5.0, count, 3) * depth[:, None] / FOCAL,
-        "opacities": uniform(0.05, 0.9, count),
+        "scales": _uniform(1.0, 5.0, count, 3, generator=generator) * depth[:, None] / FOCAL,
+        "opacities": _uniform(0.05, 0.9, count, generator=generator),
         "colors": 0.5 * torch.randn(count, 4, 3, generator=generator, dtype=torch.float64),
     }
     for name, value in changes.items():
@@ -141,9 +134,9 @@ def gaussians(count: int = COUNT, seed: int = 0, **changes: Tensor | float) -> G
     return Gaussians(**values)
 
 
-def ordinary(count: int = COUNT, size: tuple[int, int] = SIZE) -> Scene:
-    """What a case's time is compared with."""
-    return gaussians(count), camera(size)
+def ordinary(count: int = COUNT, size: tuple[int, int] = SIZE, **changes: Tensor | float) -> Scene:
+    """What a case's time is compared with; `changes` make a case of it."""
+    return gaussians(count, **changes), camera(size)
 
 
 def _uniform(low: float, high: float, *shape: int, generator: torch.Generator | None = None) -> Tensor:
@@ -153,61 +146,58 @@ def _uniform(low: float, high: float, *shape: int, generator: torch.Generator | 
 
 def _at_the_near_plane() -> Scene:
     """Three world units wide in the picture's plane are thousands of pixels here."""
-    depth = 0.01 * (1 + torch.logspace(-6, 1, COUNT, dtype=torch.float64))
-    place = _uniform(-0.4, 0.4, COUNT, 2) * depth[:, None]
-    return gaussians(means=torch.cat([place, depth[:, None]], 1), scales=0.05 * SHAPE), camera()
+    depth = 0.01 * (1 + torch.logspace(-6, 1, COUNT, dtype=torch.float64)[:, None])
+    return ordinary(means=torch.cat([_uniform(-0.4, 0.4, COUNT, 2) * depth, depth], 1), scales=0.05 * SHAPE)
 
 
 def _off_axis() -> Scene:
     tangent, angle, depth = _uniform(0.8, 5.0, COUNT), _uniform(0, 2 * math.pi, COUNT), gaussians().means[:, 2]
-    place = torch.stack([tangent * angle.cos(), tangent * angle.sin()], 1) * depth[:, None]
-    return gaussians(means=torch.cat([place, depth[:, None]], 1), scales=_uniform(0.1, 3.0, COUNT, 3)), camera()
+    rays = torch.stack([tangent * angle.cos(), tangent * angle.sin(), torch.ones_like(depth)], 1)
+    return ordinary(means=rays * depth[:, None], scales=_uniform(0.1, 3.0, COUNT, 3))
 
 
 def _stretched(ratio: float, pancake: bool = False) -> Scene:
     """The small axes are a fiftieth of a pixel: what is seen of them is the dilation."""
     small = 0.02 / FOCAL * gaussians().means[:, 2:]
-    scales = torch.cat([small * ratio, small * ratio if pancake else small, small], 1)
-    return gaussians(scales=scales, opacities=0.3), camera()
+    return ordinary(scales=torch.cat([small * ratio, small * ratio if pancake else small, small], 1), opacities=0.3)
 
 
 def _scales_of_any_size() -> Scene:
     sizes = torch.tensor(list(itertools.product((0.0, 1e-45, 1e-30, 1e-6, 1.0, 1e3), repeat=3)), dtype=torch.float64)
-    return gaussians(len(sizes), scales=sizes, opacities=_uniform(0.02, 0.1, len(sizes))), camera()
+    return ordinary(len(sizes), scales=sizes, opacities=_uniform(0.02, 0.1, len(sizes)))
 
 
 def _layers(count: int, opacity: float, size: tuple[int, int]) -> Scene:
     """Wider than the picture, one behind the other."""
-    depth = torch.linspace(2.0, 6.0, count, dtype=torch.float64)
-    means = torch.stack([torch.zeros_like(depth), torch.zeros_like(depth), depth], 1)
-    return gaussians(count, means=means, scales=2.0 * depth[:, None] * SHAPE, opacities=opacity), camera(size)
+    means = torch.zeros(count, 3, dtype=torch.float64)
+    means[:, 2] = torch.linspace(2.0, 6.0, count, dtype=torch.float64)
+    return ordinary(count, size, means=means, scales=2.0 * means[:, 2:] * SHAPE, opacities=opacity)
 
 
 def _ties() -> Scene:
     means = gaussians().means.clone()
     means[:, 2] = 4.0
-    return gaussians(means=means), camera()
+    return ordinary(means=means)
 
 
 def _quaternions() -> Scene:
     quats = gaussians().quats * torch.logspace(-30, 30, COUNT, dtype=torch.float64)[:, None]
     quats[::20] = 0.0
-    return gaussians(quats=quats), camera()
+    return ordinary(quats=quats)
 
 
 def _beside_the_camera() -> Scene:
     """The direction of the colour turns by radians within a pixel's reach, and meets all poles."""
     axes = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 1e-3], [0.0, 1.0, 1e-3], [1e-20, 0.0, 1.0]], dtype=torch.float64)
-    means = (axes.repeat(COUNT // 4, 1) * _uniform(0.0101, 0.05, COUNT, 1)).clamp_min(-1)
+    means = axes.repeat(COUNT // 4, 1) * _uniform(0.0101, 0.05, COUNT, 1)
     means[:, 2] = means[:, 2].clamp_min(0.0101)
     colors = torch.randn(COUNT, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     cloud = gaussians(means=means, scales=1e-3 * SHAPE, opacities=_uniform(0.05, 0.3, COUNT))
-    return Gaussians(cloud.means, cloud.quats, cloud.scales, cloud.opacities, 0.3 * colors), camera()
+    return replace(cloud, colors=0.3 * colors), camera()
 
 
 def _in_units(unit: float) -> Scene:
-    cloud = gaussians()
-    return gaussians(means=cloud.means * unit, scales=cloud.scales * unit), camera()
+    return ordinary(means=gaussians().means * unit, scales=gaussians().scales * unit)
 
 
 def _far_from_the_origin(distance: float) -> Scene:
@@ -224,9 +214,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     **{f"needles, {ratio:.0e} : 1": partial(_stretched, ratio) for ratio in (1e3, 1e5, 1e6)},
     "pancakes, 1e+06 : 1": partial(_stretched, 1e6, pancake=True),
     "scales 0 to 1000": _scales_of_any_size,
-    "a hundredth of a pixel": lambda: (gaussians(scales=0.01 / 20 * SHAPE), camera()),
-    "a thousand pixels": lambda: (gaussians(scales=60.0 * SHAPE, opacities=0.05), camera()),
-    "opacities 1e-30, 1 and 1.25": lambda: (gaussians(opacities=OPACITIES), camera()),
+    "a hundredth of a pixel": partial(ordinary, scales=0.01 / 20 * SHAPE),
+    "a thousand pixels": partial(ordinary, scales=60.0 * SHAPE, opacities=0.05),
+    "opacities 1e-30, 1 and 1.25": partial(ordinary, opacities=OPACITIES),
     "20 000 faint layers": partial(_layers, 20_000, 1 / 255, (8, 8)),
     "opaque wall": partial(_layers, COUNT, 0.999, SIZE),
     "one depth for all": _ties,

@@ -1,7 +1,5 @@
 """What the benchmarks write: tables in Markdown, CSV and JSON, and a mean with its spread."""
 
-from __future__ import annotations
-
 import csv
 import math
 import statistics
@@ -14,18 +12,11 @@ import torch
 from kgs.fit.machine import versions
 from kgs.fit.outputs import write_json
 
-__all__ = ["markdown_table", "mean_sd", "write_results"]
+Row = dict[str, Any]
 
 
 def markdown_table(title: str, columns: Iterable[object], rows: Iterable[Iterable[object]], first: str = "") -> str:
-    """A title, a table and an empty line.
-
-    Args:
-        title: the line before the table.
-        columns: heads of all columns but the first.
-        rows: the cells of each line, its name first.
-        first: head of the first column.
-    """
+    """A title, a table and an empty line; `columns` are the heads of all columns but the first, which is `first`."""
     cells = [[first, *map(str, columns)], *([str(cell) for cell in row] for row in rows)]
     cells.insert(1, ["---"] * len(cells[0]))
     return "\n".join([f"{title}:", "", *(f"| {' | '.join(row)} |" for row in cells), "", ""])
@@ -40,7 +31,7 @@ def mean_sd(values: Iterable[float], decimals: int) -> str:
     return f"{statistics.fmean(numbers):.{decimals}f}{spread}"
 
 
-def write_results(path: Path, rows: list[dict[str, Any]], tables: str, **more: Any) -> None:
+def write_results(path: Path, rows: list[Row], tables: str, **more: Any) -> None:
     """Write a benchmark's .csv, .json and .md file, and print the tables.
 
     Args:

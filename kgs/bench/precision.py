@@ -4,29 +4,23 @@ Errors are against `kgs.reference`: dense, in float64, both thresholds 0. Scenes
 for float32, so that rounding is part of the float32 error.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-import kgs.reference
 from kgs.projection import project
 from kgs.raster import composite
 from kgs.types import Gaussians, RasterOptions
 
-from .output import markdown_table, write_results
-from .scenes import DTYPES, PARAMETERS, Scene, cast, centred_camera, gradients, layered_scene, relative_errors
+from .output import Row, markdown_table, write_results
+from .scenes import DTYPES, PARAMETERS, Scene, cast, centred_camera, exact, gradients, layered_scene, relative_errors
 from .timing import take_turns
-
-__all__ = ["DEFAULT", "EXACT", "KNOBS", "SCENES", "Setting", "precision"]
 
 LEVELS = {"half a grey level, 2e-3": (2e-3, "--"), "float32 floor, 1.4e-6": (1.4e-6, ":")}
 
@@ -81,32 +75,33 @@ def precision(*, out: Path, quick: bool = False) -> None:
     write_results(out / "precision", rows, _markdown(rows))
 
 
-class _Measured:
-    """Gaussians in float64 before one camera, black background."""
+class Measured:
+    """A scene in float64 that is rendered in both dtypes, black background."""
 
     def __init__(self, scene: Scene, near_plane: float = RasterOptions.near_plane) -> None:
         self.near_plane, self.inputs = near_plane, {name: cast(scene, dtype) for name, dtype in DTYPES.items()}
 
     def image(self, s: Setting, grad: bool = False) -> Tensor:
+        """The image alone, with or without its graph."""
         options = {name: value for name, value in asdict(s).items() if name != "dtype"}
         with torch.set_grad_enabled(grad):
             projected = project(*self.inputs[s.dtype], near_plane=self.near_plane, alpha_threshold=s.alpha_threshold)
             return composite(projected, projected.colors, **options).features
 
     def backward(self, s: Setting) -> dict[str, Tensor]:
+        """The gradients of the image."""
         return gradients(self.image(s, grad=True), self.inputs[s.dtype][0])
 
-    def measure(self, repeats: int) -> list[dict[str, Any]]:
+    def measure(self, repeats: int) -> list[Row]:
         """One row per setting: the setting, errors, median seconds and their range."""
-        exact = kgs.reference.render(*self.inputs["float64"], None, 0.0, 0.0, self.near_plane)
-        expected = gradients(exact, self.inputs["float64"][0])
+        expected, expected_gradients = exact(self.inputs["float64"], self.near_plane)
         settings = list(dict.fromkeys(s for knob in KNOBS.values() for s in knob))
         forward = take_turns({str(s): partial(self.image, s) for s in settings}, repeats + 2)
         backward = take_turns({str(s): partial(self.backward, s) for s in settings}, repeats)
         rows = []
         for s in settings:
-            error = (self.image(s) - exact.detach()).abs()
-            parts = relative_errors(self.backward(s), expected)
+            error = (self.image(s) - expected).abs()
+            parts = relative_errors(self.backward(s), expected_gradients)
             row = {**asdict(s), "max_error": float(error.max()), "rmse": float(error.square().mean().sqrt())}
             row |= {"gradient": float(parts.max())}
             row |= {f"gradient_{name}": float(part) for name, part in zip(PARAMETERS, parts, strict=True)}
@@ -116,7 +111,7 @@ class _Measured:
         return rows
 
 
-def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> _Measured:
+def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> Measured:
     """As training leaves it; in other units, or turned and moved `far` from the origin together with the camera."""
     model, camera = layered_scene(count, (size, size))
     with torch.no_grad():
@@ -127,10 +122,10 @@ def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> _Me
         pose[:3, 3] = -pose[:3, :3] @ (far * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64))
     camera.extrinsics.copy_(pose)
     means = (unit * g.means - pose[:3, 3]) @ pose[:3, :3]
-    return _Measured((replace(g, means=means, scales=unit * g.scales), camera), RasterOptions.near_plane * unit)
+    return Measured((replace(g, means=means, scales=unit * g.scales), camera), RasterOptions.near_plane * unit)
 
 
-def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, float]) -> _Measured:
+def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, float]) -> Measured:
     """A cloud that fills the picture; `spread`: longest standard deviation in pixels, `ratios`: to the others."""
     bounds = {"depths": (2.0, 6.0), "spread": (1.0, 5.0), "ratios": (1.0, 4.0), "opacities": (0.05, 0.95), **changes}
     n, rng, half = count // 2, np.random.default_rng([7, count]), math.tan(math.radians(angle) / 2)
@@ -141,10 +136,10 @@ def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, 
     means = np.concatenate([rng.uniform(-1.1, 1.1, (n, 2)) * half * z, z], 1)
     opacities = rng.uniform(*bounds["opacities"], n)
     parts = (means, rng.normal(size=(n, 4)), scales, opacities, rng.uniform(0, 1, (n, 3)))
-    return _Measured((Gaussians(*map(torch.from_numpy, parts)), centred_camera((size, size), size / 2 / half)))
+    return Measured((Gaussians(*map(torch.from_numpy, parts)), centred_camera((size, size), size / 2 / half)))
 
 
-SCENES: dict[str, Callable[[int, int], _Measured]] = {
+SCENES: dict[str, Callable[[int, int], Measured]] = {
     "ordinary": _ordinary,
     "3-view": partial(_random, spread=(4.0, 30.0), ratios=(2.0, 50.0), opacities=(0.1, 0.7)),
     "needles": partial(_random, spread=(5.0, 40.0), ratios=(1e3, 1e6)),
@@ -156,11 +151,11 @@ SCENES: dict[str, Callable[[int, int], _Measured]] = {
 }
 
 
-def _find(rows: list[dict[str, Any]], scene: str, setting: Setting) -> dict[str, Any]:
+def _find(rows: list[Row], scene: str, setting: Setting) -> Row:
     return next(row for row in rows if row["scene"] == scene and row.items() >= asdict(setting).items())
 
 
-def _markdown(rows: list[dict[str, Any]]) -> str:
+def _markdown(rows: list[Row]) -> str:
     lines = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         found = (_find(rows, scene, setting) for setting in _COLUMNS.values())
@@ -169,7 +164,7 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
     return markdown_table(title, _COLUMNS, lines)
 
 
-def _plot_scenes(path: Path, rows: list[dict[str, Any]], error: str, seconds: str, label: str) -> None:
+def _plot_scenes(path: Path, rows: list[Row], error: str, seconds: str, label: str) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, ScalarFormatter
 

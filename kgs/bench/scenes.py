@@ -1,6 +1,4 @@
-"""Scenes to measure on: one made of seeded random numbers, and whether those of a folder are there."""
-
-from __future__ import annotations
+"""Scenes to measure on, and what they are measured against: the dense reference in float64."""
 
 import math
 from collections.abc import Iterable
@@ -12,14 +10,12 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+import kgs.reference
 from kgs.camera import cameras
 from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
 from kgs.types import Gaussians
-
-__all__ = ["DTYPES", "PARAMETERS", "SYNTHETIC", "Scene", "cast", "centred_camera", "check_scenes", "gradients"]
-__all__ += ["layered_scene", "relative_errors"]
 
 SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
@@ -33,16 +29,9 @@ _SHARES = np.array([0.10, 0.18, 0.22, 0.20, 0.16, 0.14])
 def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0) -> tuple[GaussianModel, PinholeCamera]:
     """A forward-facing scene such as training ends with: six blurred layers of depth, 15 % wider than the image.
 
-    The footprints' standard deviations have a median of 2.3 pixels whatever the count and the size, so the pairs of
-    pixel and Gaussian are proportional to the count; about a quarter of the centres lie beside the image.
-
-    Args:
-        count: Gaussians, with harmonics of degree 3.
-        size: height and width in pixels.
-        seed: of everything.
-
-    Returns:
-        The model in float32, and one camera.
+    Its float32 Gaussians have harmonics of degree 3. The footprints' standard deviations have a median of 2.3 pixels
+    whatever the count and the size (height, width), so the pairs of pixel and Gaussian are proportional to the count;
+    about a quarter of the centres lie beside the image.
     """
     height, width = size
     rng = np.random.default_rng([seed, count])
@@ -91,17 +80,20 @@ def gradients(image: Tensor, gaussians: Gaussians) -> dict[str, Tensor]:
     return dict(zip(PARAMETERS, found, strict=True))
 
 
+def exact(scene: Scene, near_plane: float) -> tuple[Tensor, dict[str, Tensor]]:
+    """Image and gradients of the dense reference in float64, both thresholds 0."""
+    gaussians, camera = cast(scene, torch.float64)
+    image = kgs.reference.render(gaussians, camera, None, 0.0, 0.0, near_plane)
+    return image.detach(), gradients(image, gaussians)
+
+
 def relative_errors(got: dict[str, Tensor], expected: dict[str, Tensor]) -> Tensor:
     """The largest error of each parameter's gradient over its largest value, `(5,)` float64; NaN stays."""
     return torch.stack([((got[p] - expected[p]).abs().max() / expected[p].abs().max()).double() for p in PARAMETERS])
 
 
 def check_scenes(data: Path, scenes: Iterable[str]) -> None:
-    """Make sure that the folder of KGS_DATA has these scenes.
-
-    Raises:
-        DataError: it lacks one.
-    """
+    """DataError where the folder of KGS_DATA lacks one of these scenes."""
     for scene in scenes:
         if not (data / scene).is_dir():
             raise DataError(data, scene, "expected this scene in the folder of KGS_DATA")

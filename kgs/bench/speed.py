@@ -1,12 +1,11 @@
 """Time and memory of the renderer and of a training step on this machine, and how they grow."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,9 @@ from kgs.raster.tiles import bin_to_tiles
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
-from .output import markdown_table, write_results
+from .output import Row, markdown_table, write_results
 from .scenes import PARAMETERS, layered_scene
-from .timing import Times, seconds_of_exp, take_turns, time_parts
-
-__all__ = ["SIZE", "TARGETS", "Cases", "speed"]
+from .timing import CPU, seconds_of_exp, take_turns, time_parts
 
 SIZE = (378, 504)
 # What kgs is held to on two cores, by count of Gaussians: seconds, and MiB over what importing takes.
@@ -37,7 +34,7 @@ TARGETS = {
     "training step": {10_000: 0.125, 50_000: 0.330, 200_000: 0.540},
     "peak memory": {10_000: 250.0, 50_000: 450.0, 200_000: 900.0},
 }
-Row = dict[str, Any]
+Change = Callable[[Gaussians], dict[str, Tensor]]
 
 
 def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
@@ -60,30 +57,24 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     where = check_device(device)
     out.mkdir(parents=True, exist_ok=True)
     repeats, counts = (3, (2_000, 10_000)) if quick else (7, (10_000, 50_000, 200_000))
-    unit, rows = seconds_of_exp(where), []
-
-    def note(table: str, cases: Cases, found: dict[str, Times]) -> None:
-        for name, times in found.items():
-            row = {"table": table, "case": name, "gaussians": cases.count}
-            row |= {"height": cases.size[0], "width": cases.size[1], "pairs_millions": cases.pairs}
-            row |= {f"{key}_s": value for key, value in times._asdict().items()} | {"repeats": repeats}
-            row["target_s"] = TARGETS[name].get(cases.count) if table == "main" else None
-            rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / unit})
-
-    for count in counts:
-        print(f"{count} Gaussians at {SIZE[1]}x{SIZE[0]} ...")
-        cases = Cases(count, SIZE, where)
-        main = dict(zip(TARGETS, (cases.forward, cases.both, cases.train), strict=False))
-        note("main", cases, take_turns(main, repeats, where))
-        note("stages", cases, time_parts(cases.stages, repeats, where))
-        if count == counts[1]:
-            note("left out", cases, take_turns(cases.savings(), repeats, where))
-    memory = {count: _memory_of_its_own(count) for count in counts if where.type == "cpu"}
     sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
-    for count, size in dict.fromkeys(scaled):
-        cases = Cases(count, size, where)
-        note("scaling", cases, take_turns({"forward + backward": cases.both}, repeats, where))
+    plan = [(table, count, SIZE) for count in counts for table in ("main", "stages")]
+    plan += [("left out", counts[1], SIZE), *(("scaling", *scene) for scene in dict.fromkeys(scaled))]
+    unit, rows = seconds_of_exp(where), []
+    for table, count, (height, width) in plan:
+        print(f"{table}: {count} Gaussians at {width}x{height} ...")
+        cases = Cases(count, (height, width), where)
+        if table == "stages":
+            found = time_parts(cases.stages, repeats, where)
+        else:
+            found = take_turns(cases.of(table), repeats, where)
+        for name, times in found.items():
+            row = {"table": table, "case": name, "gaussians": count, "height": height, "width": width}
+            row |= {"pairs_millions": cases.pairs} | {f"{key}_s": value for key, value in times._asdict().items()}
+            row |= {"repeats": repeats, "target_s": TARGETS[name].get(count) if table == "main" else None}
+            rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / unit})
+    memory = {count: _memory_of_its_own(count) for count in counts if where.type == "cpu"}
     points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
     exponents = {name: _exponent(of) for name, of in points.items()}
     more = {"peak_memory_mb": memory, "exp_s": unit, "exponents": exponents, "device": device}
@@ -108,15 +99,24 @@ class Cases:
             bins = bin_to_tiles(project(self.model(), self.camera))
         self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6
 
+    def of(self, table: str) -> dict[str, Callable[[], object]]:
+        """What a table compares."""
+        if table == "left out":
+            return self.savings()
+        return {"forward + backward": self.both} | (
+            {"forward, no gradient": self.forward, "training step": self.train} if table == "main" else {}
+        )
+
     def forward(self) -> Tensor:
         """Render without gradient."""
         with torch.no_grad():
             image: Tensor = self.renderer(self.model(), self.camera).image
         return image
 
-    def both(self, gaussians: Gaussians | None = None, outputs: tuple[str, ...] = ("image",)) -> None:
-        """Render, and go back to all parameters that the Gaussians hang on."""
-        rendering = self.renderer(gaussians or self.model(), self.camera, outputs=outputs)
+    def both(self, change: Change = lambda _: {}, outputs: tuple[str, ...] = ("image",)) -> None:
+        """Render, some of the Gaussians' tensors changed, and go back to all parameters that they hang on."""
+        gaussians = self.model()
+        rendering = self.renderer(replace(gaussians, **change(gaussians)), self.camera, outputs=outputs)
         picture = rendering.image if rendering.image is not None else rendering.alpha
         (picture * self.weights[:, : picture.shape[1]]).sum().backward()
         self.model.zero_grad()
@@ -153,29 +153,22 @@ class Cases:
     def savings(self) -> dict[str, Callable[[], object]]:
         """Forward + backward with one thing less each time."""
 
-        def frozen(*names: str) -> Callable[[], None]:
-            return changed(lambda g: {name: getattr(g, name).detach() for name in names})
-
-        def changed(change: Callable[[Gaussians], dict[str, Tensor]]) -> Callable[[], None]:
-            def run() -> None:
-                gaussians = self.model()
-                self.both(replace(gaussians, **change(gaussians)))
-
-            return run
+        def frozen(*names: str) -> Change:
+            return lambda g: {name: getattr(g, name).detach() for name in names}
 
         half = (torch.arange(self.count, device=self.device) % 2).float()
         behind = torch.tensor([0.0, 0.0, -100.0], device=self.device) * (1 - half)[:, None]
-        return {
-            "everything": self.both,
-            "no gradient at all": self.forward,
+        changes: dict[str, Change] = {
             "colours frozen": frozen("colors"),
             "geometry frozen": frozen("means", "quats", "scales"),
             "all but colours frozen": frozen(*PARAMETERS[:4]),
-            "harmonics of degree 0": changed(lambda _: {"colors": self.model.sh_dc}),
-            "alpha only": lambda: self.both(outputs=("alpha",)),
-            "half of the Gaussians dropped": changed(lambda g: {"opacities": g.opacities * half}),
-            "half of the Gaussians behind the camera": changed(lambda g: {"means": g.means + behind}),
+            "harmonics of degree 0": lambda _: {"colors": self.model.sh_dc},
+            "half of the Gaussians dropped": lambda g: {"opacities": g.opacities * half},
+            "half of the Gaussians behind the camera": lambda g: {"means": g.means + behind},
         }
+        whole = {"everything": self.both, "no gradient at all": self.forward}
+        whole |= {"alpha only": partial(self.both, outputs=("alpha",))}
+        return whole | {name: partial(self.both, change) for name, change in changes.items()}
 
 
 def _memory_of_its_own(count: int) -> float:
@@ -185,7 +178,7 @@ def _memory_of_its_own(count: int) -> float:
 
 
 def _memory(count: int) -> float:
-    before, cases = peak_rss_mb(), Cases(count, SIZE, torch.device("cpu"))
+    before, cases = peak_rss_mb(), Cases(count, SIZE, CPU)
     for _ in range(3):
         cases.both()
     return peak_rss_mb() - before
@@ -197,7 +190,7 @@ def _scaling(rows: list[Row], fewest: int) -> dict[str, np.ndarray]:
     fixed = [row for row in rows if row["gaussians"] == fewest]
     points = {
         "Gaussians": [(row["gaussians"], row["wall_s"]) for row in full],
-        "pairs": [(row["pairs_millions"], row["wall_s"]) for row in full],
+        "pairs": [(1e6 * row["pairs_millions"], row["wall_s"]) for row in full],
         "pixels": [(row["height"] * row["width"], row["wall_s"]) for row in fixed],
     }
     return {name: np.array(sorted(of)) for name, of in points.items()}
@@ -248,9 +241,7 @@ def _plot(path: Path, points: dict[str, np.ndarray]) -> None:
     axes = figure.subplots(1, 3, sharey=True)
     for axis, (name, of) in zip(axes, points.items(), strict=True):
         axis.loglog(*of.T, "o-", markersize=4)
-        axis.set_xlabel(
-            {"pairs": "evaluated pairs [million]", "pixels": "pixels, the fewest Gaussians"}.get(name, name)
-        )
+        axis.set_xlabel(name)
         axis.xaxis.set_minor_formatter("")
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("forward + backward [s]")

@@ -1,11 +1,8 @@
 """The first points of a fit where the depths are known: how wrong, how complete and how slow each kind of them is."""
 
-from __future__ import annotations
-
 import os
 import time
 import warnings
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,13 +13,11 @@ from torch import Tensor
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.fit.starts import FirstPoints, first_points
+from kgs.fit.starts import first_points
 from kgs.fit.starts.triangulate import camera_centers, project_all, unproject
 
-from .output import markdown_table, mean_sd, write_results
+from .output import Row, markdown_table, mean_sd, write_results
 from .scenes import check_scenes
-
-__all__ = ["complete_pixels", "depth_errors", "model_errors", "seen_twice", "starts"]
 
 ALL_POINTS, RANDOM_POINTS = 10**6, 10_000
 QUICK, SMALL, LARGE = (126, 168), (189, 252), (378, 504)  # height, width
@@ -33,18 +28,15 @@ REAL = [("llff/fern", 3), ("llff/flower", 3), ("colmap/trex", 3), ("blender/lego
 REAL += [("llff/flower", views) for views in (6, 9, 24)]
 NEAR, CLOSE = 0.01, 0.02  # relative depth errors that are counted
 HIDDEN = 0.05  # a point so much farther than the surface before it is hidden there, not wrong
-REACH, MODEL_REACH = 2.0, 1.5  # pixels, from a point to the pixel it stands for, and to a point of COLMAP's
+REACH = 2  # pixels, from a point to those it completes
 EDGE = 1.05  # ratio of depths of neighbouring pixels above which nothing is interpolated between them
 # Columns of the tables: head, decimals, factor.
 _POINTS = {"points": ("points", 0, 1)}
-_ERRORS = {"median_error": ("median error", 2, 100), "bias": ("median signed", 2, 100)}
 _SHARES = {"within_1": "within 1 %", "within_2": "within 2 %", "complete": "complete"}
 _SHARES |= {"complete_twice": "of those seen twice", "seen_twice": "pixels that two views see"}
-_MEASURES = _ERRORS | {name: (head, 1, 100) for name, head in _SHARES.items()}
+_MEASURES = {"median_error": ("median error", 2, 100), "bias": ("median signed", 2, 100)}
+_MEASURES |= {name: (head, 1, 100) for name, head in _SHARES.items()}
 _SECONDS = {"wall_seconds": ("wall s", 1, 1), "cpu_seconds": ("CPU s", 1, 1)}
-_OF_MODEL = {"model_pairs": ("pairs", 0, 1), "model_error": ("median error", 2, 100)}
-_OF_MODEL |= {"model_within_2": ("within 2 %", 1, 100)}
-Row = dict[str, Any]
 
 
 def starts(*, out: Path, quick: bool = False) -> None:
@@ -56,8 +48,7 @@ def starts(*, out: Path, quick: bool = False) -> None:
 
     Writes starts.csv, starts.json and starts.md in 20 minutes, with --quick in 10 seconds.
     The synthetic scene has exact depths. Real scenes, in the folder of the environment variable KGS_DATA, have counts
-    and times; three views are also compared with the points of a COLMAP model where there is one, which were refined
-    with the test views too and are not exact. (Most of many views that such a point projects into do not observe it.)
+    and times.
 
     Args:
         out: folder for the results, made if it is not there.
@@ -76,56 +67,46 @@ def starts(*, out: Path, quick: bool = False) -> None:
     for kind, count, size in [("forward", 3, QUICK)] if quick else SYNTHETIC:
         for seed in range(1 if quick or count > FEW or size == LARGE else SEEDS):
             print(f"{kind}, {count} views of {size[1]}x{size[0]}, seed {seed} ...")
-            rows += _synthetic_rows(kind, count, size, seed)
+            views = synthetic_scene(kind, count, 0, size, seed).train
+            rows += _rows(kind, views, seed, synthetic_depths(views.cameras, kind, seed)[:, 0])
     for name, count in REAL if data is not None else ():
         print(f"{name}, {count} views ...")
-        rows += _real_rows(Path(data or ""), name, count)
+        rows += _rows(name, load_scene(Path(data or "") / name, count).train)
     write_results(out / "starts", rows, _markdown(rows))
 
 
-def _find(views: Views, asked: str, seed: int) -> tuple[FirstPoints, Row]:
+def _rows(scene: str, views: Views, seed: int = 0, truth: Tensor | None = None) -> list[Row]:
+    """One per kind of start; `truth`: the exact depths, where they are known."""
+    height, width = views.images.shape[-2:]
+    about, rows = {"scene": scene, "views": len(views), "width": width, "height": height, "seed": seed}, []
+    twice = None if truth is None else seen_twice(views, truth)
+    for asked in ("dense", "sift") if truth is None or (height, width) == LARGE else ("dense", "sift", "random"):
+        points, row = _find(views, asked, seed)
+        row |= dict.fromkeys(_MEASURES)
+        if truth is not None and twice is not None:
+            errors, complete, surface = (
+                depth_errors(points, views, truth),
+                complete_pixels(points, views, truth),
+                truth > 0,
+            )
+            shares = (errors.abs() <= NEAR, errors.abs() <= CLOSE, complete[surface], complete[twice], twice[surface])
+            values = (errors.abs().median(), errors.median(), *(share.double().mean() for share in shares))
+            row |= dict(zip(_MEASURES, map(float, values), strict=True))
+        rows.append(about | row)
+    return rows
+
+
+def _find(views: Views, asked: str, seed: int) -> tuple[Tensor, Row]:
     """The points, all that there are (10 000 if random), and the columns about how they came."""
-    count = ALL_POINTS if asked == "dense" else RANDOM_POINTS
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         wall, cpu = time.perf_counter(), time.process_time()
-        found = first_points(views, asked, seed=seed, count=count)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    if found.kind == "random":
-        found = FirstPoints(found.points[:RANDOM_POINTS], found.colors[:RANDOM_POINTS], "random")
+        found = first_points(views, asked, seed=seed, count=ALL_POINTS if asked == "dense" else RANDOM_POINTS)
+        seconds = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+    points = found.points[:RANDOM_POINTS] if found.kind == "random" else found.points
     fallback = "; ".join(str(warning.message) for warning in caught)
-    seconds = {"wall_seconds": round(wall, 2), "cpu_seconds": round(cpu, 2)}
-    return found, {"asked": asked, "came": found.kind, "fallback": fallback, "points": len(found.points), **seconds}
-
-
-def _synthetic_rows(kind: str, count: int, size: tuple[int, int], seed: int) -> list[Row]:
-    views = synthetic_scene(kind, count, 0, size, seed).train
-    truth = synthetic_depths(views.cameras, kind, seed)[:, 0]
-    surface, twice = truth > 0, seen_twice(views, truth)
-    rows = []
-    for asked in ("dense", "sift") if size == LARGE else ("dense", "sift", "random"):
-        found, row = _find(views, asked, seed)
-        errors, complete = depth_errors(found.points, views, truth), complete_pixels(found.points, views, truth)
-        shares = (errors.abs() <= NEAR, errors.abs() <= CLOSE, complete[surface], complete[twice], twice[surface])
-        values = [errors.abs().median(), errors.median(), *(share.double().mean() for share in shares)]
-        row |= dict(zip(_MEASURES, map(float, values), strict=True)) | dict.fromkeys(_OF_MODEL)
-        rows.append({"scene": kind, "views": count, "width": size[1], "height": size[0], "seed": seed, **row})
-    return rows
-
-
-def _real_rows(data: Path, name: str, count: int) -> list[Row]:
-    has_model = count <= 3 and name.startswith(("llff", "colmap"))
-    scene = load_scene(data / name, count, points="model-points" if has_model else "none")
-    height, width = scene.train.images.shape[-2:]
-    rows = []
-    for asked in ("dense", "sift"):
-        found, row = _find(scene.train, asked, 0)
-        row |= dict.fromkeys((*_MEASURES, *_OF_MODEL))
-        if has_model and len(errors := model_errors(found.points, scene.points, scene.train).abs()):
-            share = float((errors <= CLOSE).double().mean())
-            row |= {"model_pairs": len(errors), "model_error": float(errors.median()), "model_within_2": share}
-        rows.append({"scene": name, "views": count, "width": width, "height": height, "seed": 0, **row})
-    return rows
+    row = {"asked": asked, "came": found.kind, "fallback": fallback, "points": len(points)}
+    return points, row | {name: round(value, 2) for name, value in seconds.items()}
 
 
 def _markdown(rows: list[Row]) -> str:
@@ -142,17 +123,12 @@ def _markdown(rows: list[Row]) -> str:
                 values = (mean_sd((f * row[name] for row in of), d) for name, (_, d, f) in columns.items())
                 lines.append([*about, asked if came == asked else f"{asked}: {came}", len(of), *values])
         heads = ("views", "size", "start", "n", *(head for head, _, _ in columns.values()))
-        return markdown_table(title, heads, lines, first="scene") if lines else ""
+        return markdown_table(f"{title}; mean (standard deviation over n seeds)", heads, lines, first="scene")
 
-    errors, spread = "in percent: relative depth errors", "mean (standard deviation over n seeds)"
-    shares = "and the share of the pixels with a surface that have a point within 2 pixels and 2 % of the depth"
-    return (
-        table(f"Points, at most a million, against exact depths, {errors}, {shares}; {spread}", _MEASURES)
-        + table(f"Seconds that the points take, threads of torch: {torch.get_num_threads()}; {spread}", _SECONDS)
-        + table(
-            f"Points against those of the COLMAP model, {errors} where a view has both within 1.5 pixels", _OF_MODEL
-        )
-    )
+    errors = "Points, at most a million, against exact depths, in percent: relative depth errors, and the share of the"
+    errors += " pixels with a surface that have a point within 2 pixels and 2 % of the depth"
+    seconds = f"Seconds that the points take, threads of torch: {torch.get_num_threads()}"
+    return table(errors, _MEASURES) + table(seconds, _SECONDS)
 
 
 def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
@@ -185,9 +161,13 @@ def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
 def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     """Which pixels have a point within 2 pixels and 2 % of their exact depth, `(V, H, W)`; see `depth_errors`."""
     found = torch.zeros_like(truth, dtype=torch.bool)
+    limits = torch.tensor([truth.shape[2], truth.shape[1]])
     for view, exact in enumerate(truth):
-        pixels, depths = _in_image(points, views, view)
-        for inside, x, y, _ in _around(pixels, truth.shape[-2:], REACH):
+        pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
+        for offset in product(range(-REACH, REACH + 1), repeat=2):
+            places = pixels.round() + torch.tensor(offset)
+            inside = ((places >= 0) & (places < limits)).all(1) & ((places - pixels).norm(dim=1) <= REACH)
+            x, y = places[inside].long().unbind(1)
             close = (depths[inside] / exact[y, x] - 1).abs() <= CLOSE
             found[view, y[close], x[close]] = True
     return found
@@ -205,38 +185,6 @@ def seen_twice(views: Views, truth: Tensor) -> Tensor:
     return found
 
 
-def model_errors(points: Tensor, model: Tensor, views: Views) -> Tensor:
-    """Relative depth errors where a view has points within 1.5 pixels of a point of a COLMAP model, `(M, 3)`.
-
-    A pixel's depth is that of the first of the points in it, and a model's point is compared with the nearest pixel
-    that has any. All views that a model's point projects into count, also those where something hides it.
-
-    Returns:
-        Depth over the model's depth less 1, one number per pair of a model's point and a view, float64.
-    """
-    errors = [torch.zeros(0, dtype=torch.float64)]
-    for view in range(len(views)):
-        front = _front_depths(points, views, view)
-        pixels, depths = _in_image(model, views, view)
-        nearest, found = torch.full_like(depths, torch.inf), torch.full_like(depths, torch.inf)
-        for inside, x, y, distances in _around(pixels, front.shape, MODEL_REACH):
-            better = front[y, x].isfinite() & (distances < nearest[inside])
-            found[inside[better]] = front[y, x][better]
-            nearest[inside[better]] = distances[better]
-        errors.append((found / depths - 1)[found.isfinite()])
-    return torch.cat(errors)
-
-
-def _front_depths(points: Tensor, views: Views, view: int) -> Tensor:
-    """The least depth of the points in each pixel of one view, `(H, W)`; infinite where there is none."""
-    height, width = views.images.shape[-2:]
-    pixels, depths = _in_image(points, views, view)
-    x, y = pixels.round().long().unbind(1)
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    empty = torch.full((height * width,), torch.inf, dtype=torch.float64)
-    return empty.scatter_reduce(0, (y * width + x)[inside], depths[inside], "amin").reshape(height, width)
-
-
 def _view_errors(points: Tensor, views: Views, truth: Tensor, view: int) -> Tensor:
     """Depth over the surface's depth less 1 in one view, `(P,)`; NaN where the point is not in its image."""
     pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
@@ -252,22 +200,3 @@ def _view_errors(points: Tensor, views: Views, truth: Tensor, view: int) -> Tens
     own = corners.gather(0, weights.argmax(0, keepdim=True))[0]
     smooth = corners.amax(0) <= EDGE * corners.amin(0)
     return torch.where(inside, depths * torch.where(smooth, (weights * corners).sum(0), own) - 1, torch.nan)
-
-
-def _in_image(points: Tensor, views: Views, view: int) -> tuple[Tensor, Tensor]:
-    """Pixels `(Q, 2)` and depths `(Q,)` of the points that are in the image of one view, or at most 2 pixels out."""
-    pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
-    height, width = views.images.shape[-2:]
-    limits = torch.tensor([width - 1, height - 1])
-    inside = (depths > 0) & ((pixels >= -REACH) & (pixels <= limits + REACH)).all(1)
-    return pixels[inside], depths[inside]
-
-
-def _around(pixels: Tensor, size: torch.Size, reach: float) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """For each place of a disc: which of the pixels `(Q, 2)` it is in the image for, its x and y, and how far it is."""
-    for offset in product((-2, -1, 0, 1, 2), repeat=2):
-        places = pixels.round() + torch.tensor(offset)
-        distances = (places - pixels).norm(dim=1)
-        inside = ((places >= 0) & (places < torch.tensor([size[1], size[0]]))).all(1) & (distances <= reach)
-        x, y = places[inside].long().unbind(1)
-        yield inside.nonzero()[:, 0], x, y, distances[inside]

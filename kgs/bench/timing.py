@@ -1,15 +1,13 @@
 """Measuring time on a machine that others use too: cases take turns, medians are reported with their spread."""
 
-from __future__ import annotations
-
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 
-__all__ = ["Times", "seconds_of_exp", "take_turns", "time_parts"]
+CPU = torch.device("cpu")
 
 
 class Times(NamedTuple):
@@ -22,14 +20,11 @@ class Times(NamedTuple):
 
 
 def take_turns(
-    cases: Mapping[str, Callable[[], object]], repeats: int = 5, device: torch.device | None = None
+    cases: dict[str, Callable[[], object]], repeats: int = 5, device: torch.device = CPU
 ) -> dict[str, Times]:
     """Run the cases one after the other, again and again, so that a slow minute of the machine slows all of them.
 
-    Args:
-        cases: name to what is timed; each is called once before, to warm up.
-        repeats: rounds, >= 1.
-        device: where they run; a GPU is waited for.
+    Each is run once before, to warm up. `repeats` rounds (>= 1) are timed; on a GPU each call is waited for.
     """
 
     def one_round() -> Iterator[str]:
@@ -40,11 +35,9 @@ def take_turns(
     return time_parts(one_round, repeats, device)
 
 
-def time_parts(
-    run: Callable[[], Iterator[str]], repeats: int = 5, device: torch.device | None = None
-) -> dict[str, Times]:
+def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch.device = CPU) -> dict[str, Times]:
     """Time the parts of something that says the name of each part when it has done it; otherwise as `take_turns`."""
-    wait = torch.cuda.synchronize if device is not None and device.type == "cuda" else lambda: None
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
     found: dict[str, list[tuple[float, float]]] = {}
     for round_ in range(repeats + 1):
         wall, cpu = time.perf_counter(), time.process_time()
