@@ -3,8 +3,6 @@
 Exit codes: 2 for what the user can mend, 1 for a failure, 128 + its number where a signal ended the work.
 """
 
-from __future__ import annotations
-
 import errno
 import inspect
 import os
@@ -23,8 +21,7 @@ from .fit.commands import demo, evaluate, fit, render
 from .fit.config import FAST, FitConfig, Recipe
 from .fit.progress import say
 
-__all__ = ["main"]
-
+_COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
 _BENCHES = {
     "speed": "time and memory of rendering and of training steps",
     "precision": "errors of images, gradients and footprints against time",
@@ -66,9 +63,10 @@ def _exit_code(words: list[str]) -> int:
     except SystemExit as stop:
         message, code = (stop.code, 2) if isinstance(stop.code, str) else ("", stop.code or 0)
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] == "kgs":
+        package = (error.name or "").partition(".")[0]
+        if package == "kgs":
             raise
-        extra = _EXTRAS.get((error.name or "").partition(".")[0], "app")
+        extra = _EXTRAS.get(package, "app")
         message = f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs'
         message += f', or pip install "kgs-splat[{extra}]" where an index has it'
     except DataError as error:
@@ -94,15 +92,14 @@ def _exit_code(words: list[str]) -> int:
 
 def _find(words: list[str]) -> tuple[Callable[..., Any], str, list[str]]:
     """The function that does what the first words ask for, what it is called, and the words that are left."""
-    commands: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
-    summaries = {name: (function.__doc__ or "").partition("\n")[0] for name, function in commands.items()}
-    summaries["bench"] = "Measure this machine, or what the method is worth; kgs bench --help."
     if words[:1] == ["--version"]:
         from .fit.machine import versions
 
         say("\n".join(f"{name} {version}" for name, version in versions().items()))
         raise SystemExit(0)
     prog, (name, *rest) = "kgs", words or ["--help"]
+    summaries = {name: str(function.__doc__).partition("\n")[0] for name, function in _COMMANDS.items()}
+    summaries["bench"] = "Measure this machine, or what the method is worth; kgs bench --help."
     if name == "bench":
         prog, summaries, (name, *rest) = "kgs bench", _BENCHES, rest or ["--help"]
     if name in ("-h", "--help"):
@@ -111,18 +108,16 @@ def _find(words: list[str]) -> tuple[Callable[..., Any], str, list[str]]:
         raise SystemExit(0)
     if name not in summaries:
         raise SystemExit(f"expected a command of {prog}, one of {', '.join(summaries)}, got {name!r}")
-    if prog == "kgs":
-        return commands[name], f"kgs {name}", rest
-    return getattr(import_module(f"kgs.bench.{name}"), name), f"{prog} {name}", rest
+    function = _COMMANDS[name] if prog == "kgs" else getattr(import_module(f"kgs.bench.{name}"), name)
+    return function, f"{prog} {name}", rest
 
 
 def _flags(function: Callable[..., Any]) -> dict[str, str]:
     """What the parameters of a command are called on the command line."""
-    names = {name: name for name in inspect.signature(function).parameters}
+    names = {"train_views": "views", **{name: name for name in inspect.signature(function).parameters}}
     if "config" in names:
         names |= {entry.name: f"recipe.{entry.name}" for entry in fields(Recipe)}
         names |= {entry.name: entry.name for entry in fields(FitConfig)}
-    names["train_views"] = "views"
     return {name: "--" + flag.replace("_", "-") for name, flag in names.items()}
 
 

@@ -12,8 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.starts import _sweep_range, first_points
-from kgs.fit.starts.dense import dense_points
-from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, _warp, sweep_depths
+from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, _warp, dense_points, sweep_depths
 from kgs.fit.starts.triangulate import project_all
 
 

@@ -102,3 +102,25 @@ def test_a_file_whose_vertices_have_another_name_has_no_points(tmp_path: Path) -
     (tmp_path / "cloud.ply").write_bytes(content.replace(b"element vertex", b"element vertey"))
     with pytest.raises(DataError, match=r"vertices: expected finite points, at least one, got 0"):
         first_points(flat(), "file", file=tmp_path / "cloud.ply")
+
+
+def test_a_text_is_bounded_before_it_is_read(tmp_path: Path) -> None:
+    """What reads text takes some 75 times its size; binary files of the same size are read."""
+    header = (
+        "ply\nformat {} 1.0\nelement vertex {}\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
+    )
+    count = 2**26 // 12 + 1
+    starts = {
+        "ascii.ply": header.format("ascii", count),
+        "comment.ply": header.format("ascii", count).replace("element", "comment format binary\nelement"),
+        "cloud.xyz": "0 0 0\n" * 2000,
+        "binary.ply": header.format("binary_little_endian", count),
+    }
+    for name, start in starts.items():
+        with open(tmp_path / name, "wb") as file:
+            file.write(start.encode())
+            file.truncate(len(start) + 12 * count)
+    for name in ("ascii.ply", "comment.ply", "cloud.xyz"):
+        with pytest.raises(DataError, match=rf"{name}: is larger than 64 MiB, the most for a text file"):
+            first_points(flat(), "file", file=tmp_path / name)
+    assert len(first_points(flat(), "file", file=tmp_path / "binary.ply").points) == count

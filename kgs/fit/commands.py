@@ -3,8 +3,6 @@
 Everything that can be known is checked before work begins, and heavy packages are imported after that.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shlex
@@ -18,10 +16,9 @@ from kgs.errors import DataError
 from .config import DEMO, FitConfig
 from .progress import say
 
-__all__ = ["demo", "evaluate", "fit", "render"]
-
 _VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
 _SMALLEST = 12  # pixels a side: the window of SSIM
+_Background = Literal["black", "white"]
 
 
 def demo(
@@ -55,11 +52,11 @@ def demo(
     _prepare(device, "matplotlib")
     runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), out, config)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
-    level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
+    test, train = ({name: run[part]["psnr"] or math.inf for name, run in runs.items()} for part in ("test", "train"))
     for name, run in runs.items():
-        columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
+        columns = f"{test[name]:8.2f}{run['test']['ssim']:8.3f}{train[name]:12.2f}"
         say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
-    gain = level["with"][0] - level["without"][0]
+    gain = test["with"] - test["without"]
     say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
     say(f"pictures: {out / 'demo.png'}, {out / 'curve.png'}")
     _next("kgs fit SCENE -o OUT  # your own photos, with poses", _VIEWER.format(_line(out / "splat.ply")))
@@ -72,7 +69,7 @@ def fit(
     out: Path,
     views: int | None = None,
     downscale: float | None = None,
-    background: Literal["black", "white"] = "black",
+    background: _Background = "black",
     fast: bool = False,
     resume: bool = False,
     lpips_weights: Path | None = None,
@@ -103,13 +100,9 @@ def fit(
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
     lpips = _prepare(config.device, "matplotlib", "safetensors", lpips=lpips_weights)
     check_folder(out, RESULTS, scene, make=False)
-    request = {
-        "scene": os.path.abspath(scene),
-        "train_views": views,
-        "downscale": downscale,
-        "background": background,
-        "points": "model-points" if config.init == "model-points" else "none",
-    }
+    points = "model-points" if config.init == "model-points" else "none"
+    request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale}
+    request |= {"background": background, "points": points}
     loaded = _load(request)
     height, width = loaded.train.images.shape[-2:]
     say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
@@ -138,7 +131,7 @@ def render(
     cameras: Path,
     out: Path,
     downscale: float | None = None,
-    background: Literal["black", "white"] = "black",
+    background: _Background = "black",
     device: str = "cpu",
 ) -> None:
     """Render a splat from every camera of a scene into PNGs.
@@ -192,9 +185,8 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     write_json(path, metrics)
     _print_metrics(metrics)
     say(f"{path} is up to date")
-    _next(
-        f"{_line('kgs', 'fit', saved.request['scene'], '-o', 'OUT', '--drop', '0')}  # to compare: without DropGaussian"
-    )
+    without = _line("kgs", "fit", saved.request["scene"], "-o", "OUT", "--drop", "0")
+    _next(f"{without}  # to compare: without DropGaussian")
 
 
 def _prepare(device: str, *packages: str, lpips: Path | None = None) -> Any:
@@ -235,5 +227,4 @@ def _line(*words: object) -> str:
 
 
 def _next(*steps: str) -> None:
-    """What a user may want to do now."""
     say("\n  ".join(["next:", *steps]))

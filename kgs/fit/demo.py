@@ -1,7 +1,5 @@
 """The demonstration: three views of a synthetic scene, with and without DropGaussian, from equal starts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,30 +10,21 @@ from kgs.datasets.scene import Scene
 from kgs.ply import save_ply
 
 from .config import DEMO, FitConfig
-from .figures import write_curve, write_sheet
-from .outputs import check_folder, write_json
+from .outputs import check_folder, write_curve, write_json, write_sheet
 from .progress import each, say
 from .run import choose_points, measure, train
 from .trainer import Trainer
-
-__all__ = ["run_demo"]
 
 
 def run_demo(scene: Scene, out: Path, config: FitConfig = DEMO, *, say: Callable[[str], None] = say) -> dict[str, Any]:
     """Fit the same scene twice and compare on views that neither fit has seen.
 
-    Args:
-        scene: what to fit, with test views.
-        out: folder for demo.png, curve.png, metrics.json and splat.ply (of the fit with DropGaussian).
-        config: the fit with DropGaussian; the other has drop = 0 and is equal otherwise, the first points and the
-            order of views included.
-        say: where lines for the user go.
+    Writes demo.png, curve.png, metrics.json and splat.ply (of the fit with DropGaussian) to `out`, and returns what
+    metrics.json holds: `{"without": run, "with": run}`. The fit without has drop = 0 and is equal otherwise, the first
+    points and the order of views included.
 
     Raises:
         SystemExit: a signal ended a fit; its code is 128 + the number of the signal.
-
-    Returns:
-        What metrics.json holds: `{"without": run, "with": run}`.
     """
     check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
     points = choose_points(scene, config, each)

@@ -8,8 +8,6 @@ with the linear heads of version 0.1:
 where u_l are the features after the last ReLU of block l, scaled to unit length along the channels.
 """
 
-from __future__ import annotations
-
 import math
 import zipfile
 from io import BytesIO
@@ -23,38 +21,30 @@ from torch import Tensor, nn
 
 from kgs.errors import DataError
 
-__all__ = ["Lpips"]
-
 # The mean and deviation of ImageNet, as the authors give them for images in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 NORM_EPS = 1e-10
 
-# Convolutions (width, size, stride, padding), each with a ReLU, and poolings (size, stride).
-PLANS = {
+# Convolutions (width, size, stride, padding), each with a ReLU, and poolings (size, stride), in torchvision's order.
+LAYERS = {
     "alexnet": ((64, 11, 4, 2), (3, 2), (192, 5, 1, 2), (3, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
     "vgg16": (
         *(*[(64, 3, 1, 1)] * 2, (2, 2), *[(128, 3, 1, 1)] * 2, (2, 2), *[(256, 3, 1, 1)] * 3, (2, 2)),
         *(*[(512, 3, 1, 1)] * 3, (2, 2), *[(512, 3, 1, 1)] * 3),
     ),
 }
-# Positions, in torchvision's `features`, of the ReLUs whose outputs are compared; and the smallest image they take.
+# Positions among the layers of the ReLUs whose outputs are compared; and the smallest image they take.
 TAPS = {"alexnet": (1, 4, 7, 9, 11), "vgg16": (3, 8, 15, 22, 29)}
 MIN_SIZE = {"alexnet": 31, "vgg16": 16}
 MOST_HEADER = 10_000  # bytes of an array's
 
 
 class Lpips(nn.Module):
-    """Perceptual distance of two images.
+    """Perceptual distance of two images; `net` is "vgg16" or "alexnet".
 
     The state dict has the names of the weight files: torchvision's `features.0.weight`, ... and `lin0` to `lin4`. A
     module made without `load` has random features and heads of ones; it is a distance, but not LPIPS.
-
-    Args:
-        net: "vgg16" or "alexnet".
-
-    Raises:
-        ValueError: `net` is neither of the two.
     """
 
     def __init__(self, net: str = "vgg16") -> None:
@@ -62,26 +52,24 @@ class Lpips(nn.Module):
         if net not in TAPS:
             raise ValueError(f"net: expected one of {sorted(TAPS)}, got {net!r}")
         self.net = net
-        self.features = _features(net)
-        channels = 0
-        for index, layer in enumerate(self.features):
-            if isinstance(layer, nn.Conv2d):
-                channels = layer.out_channels
-            if index in TAPS[net]:
-                self.register_buffer(f"lin{TAPS[net].index(index)}", torch.ones(channels))
+        layers, channels = list[nn.Module](), 3
+        for width, *shape in LAYERS[net]:
+            if len(shape) == 1:
+                layers.append(nn.MaxPool2d(width, *shape))
+                continue
+            layers += [nn.Conv2d(channels, width, *shape), nn.ReLU()]
+            channels = width
+            if len(layers) - 1 in TAPS[net]:
+                self.register_buffer(f"lin{TAPS[net].index(len(layers) - 1)}", torch.ones(channels))
+        self.features = nn.Sequential(*layers)
         self.requires_grad_(False)
 
     @classmethod
     def load(cls, folder: str | PathLike[str], net: str = "vgg16") -> Self:
-        """Read the weights from `<net>_features.npz` and `lpips_lin_<net>.npz`.
+        """Read the weights, floating point of any width; the module is frozen, on the CPU, in float32.
 
-        Args:
-            folder: holds the two files: convolutions under torchvision's names (`features.0.weight`, OIHW), heads
-                `lin0` to `lin4`, floating point of any width.
-            net: "vgg16" (the one of published tables) or "alexnet".
-
-        Returns:
-            The module, frozen, on the CPU, in float32.
+        The folder holds `<net>_features.npz` with the convolutions under torchvision's names (`features.0.weight`,
+        OIHW) and `lpips_lin_<net>.npz` with the heads `lin0` to `lin4`. Published tables have `net` "vgg16".
 
         Raises:
             DataError: the folder, a file or an array is missing or not what it should be.
@@ -89,39 +77,33 @@ class Lpips(nn.Module):
         """
         with torch.device("meta"):
             module = cls(net)
-        folder = Path(folder)
+        folder, files = Path(folder), (f"{net}_features.npz", f"lpips_lin_{net}.npz")
         if not folder.is_dir():
-            raise DataError(folder, "", f"expected a folder with {net}_features.npz and lpips_lin_{net}.npz, got none")
-        shapes = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-        convolutions = {name: shape for name, shape in shapes.items() if name.startswith("features.")}
-        heads = {name: shape for name, shape in shapes.items() if name not in convolutions}
-        weights = _read(folder / f"{net}_features.npz", convolutions) | _read(folder / f"lpips_lin_{net}.npz", heads)
-        module.load_state_dict(weights, assign=True)
+            raise DataError(folder, "", f"expected a folder with {files[0]} and {files[1]}, got none")
+        shapes: tuple[dict[str, tuple[int, ...]], ...] = ({}, {})
+        for name, value in module.state_dict().items():
+            shapes[name.startswith("lin")][name] = tuple(value.shape)
+        module.load_state_dict(_read(folder / files[0], shapes[0]) | _read(folder / files[1], shapes[1]), assign=True)
         return module.requires_grad_(False).eval()
 
     def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:
-        """Distance of each image to its target; differentiable in both.
+        """Distances >= 0, `(B,)`, of images to their targets, both `(B, 3, H, W)` in [0, 1]; differentiable in both.
 
-        Args:
-            image: `(B, 3, H, W)` in [0, 1], H, W >= 16 for "vgg16" and >= 31 for "alexnet".
-            target: like `image`.
-            rescale: True brings the images to [-1, 1], which the network is meant for. False feeds them in [0, 1], as
-                the published tables of Gaussian splatting do; the two values cannot be compared.
-
-        Returns:
-            Distances >= 0, `(B,)`.
+        H and W are at least 16 for "vgg16" and 31 for "alexnet". `rescale` brings the images to [-1, 1], which the
+        network is meant for. False feeds them in [0, 1], as the published tables of Gaussian splatting do; the two
+        values cannot be compared.
 
         Raises:
             ValueError: shapes do not fit.
         """
-        smallest = MIN_SIZE[self.net]
+        smallest, taps = MIN_SIZE[self.net], TAPS[self.net]
         if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < smallest:
             raise ValueError(f"image: expected shape (B, 3, H, W) with H, W >= {smallest}, got {tuple(image.shape)}")
         if target.shape != image.shape:
             raise ValueError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
-        x, y = self._normalize(image, rescale), self._normalize(target, rescale)
+        shift, scale = (image.new_tensor(values).view(3, 1, 1) for values in (SHIFT, SCALE))
+        x, y = (((2.0 * value - 1.0 if rescale else value) - shift) / scale for value in (image, target))
         distance = image.new_zeros(len(image))
-        taps = TAPS[self.net]
         for index, layer in enumerate(self.features):
             x, y = layer(x), layer(y)
             if index in taps:
@@ -129,36 +111,17 @@ class Lpips(nn.Module):
                 distance = distance + ((_unit(x) - _unit(y)).square() * head).sum(dim=1).mean(dim=(1, 2))
         return distance
 
-    def _normalize(self, image: Tensor, rescale: bool) -> Tensor:
-        image = 2.0 * image - 1.0 if rescale else image
-        return (image - image.new_tensor(SHIFT).view(3, 1, 1)) / image.new_tensor(SCALE).view(3, 1, 1)
-
 
 def _unit(features: Tensor) -> Tensor:
     norm: Tensor = torch.linalg.vector_norm(features, dim=1, keepdim=True)
     return features / (norm + NORM_EPS)
 
 
-def _features(net: str) -> nn.Sequential:
-    """The convolutions of a network, in torchvision's order."""
-    layers: list[nn.Module] = []
-    channels = 3
-    for part in PLANS[net]:
-        if len(part) == 4:
-            width, size, stride, padding = part
-            layers += [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU()]
-            channels = width
-        else:
-            layers.append(nn.MaxPool2d(part[0], part[1]))
-    return nn.Sequential(*layers)
-
-
 def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
     """The named arrays of an npz file as float32 tensors, each measured before its numbers are unpacked."""
-    if not path.is_file():
-        raise DataError(path, "", "expected an npz file of LPIPS weights, got none")
     if not zipfile.is_zipfile(path):
-        raise DataError(path, "", "expected an npz file, got another format or a part of one")
+        got = "another format or a part of one" if path.is_file() else "none"
+        raise DataError(path, "", f"expected an npz file of LPIPS weights, got {got}")
     field, weights = "", dict[str, Tensor]()
     try:
         with zipfile.ZipFile(path) as archive:

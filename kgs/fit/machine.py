@@ -1,7 +1,5 @@
 """What a fit runs on: versions, memory, and whether the device that is asked for is there."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform
@@ -15,15 +13,9 @@ import torch
 
 from kgs import __version__
 
-__all__ = ["check_device", "peak_rss_mb", "versions"]
-
 
 def check_device(name: str) -> torch.device:
-    """The device of that name, once it has held a number.
-
-    Raises:
-        ValueError: torch knows no such device, or this machine has none.
-    """
+    """The device of that name; ValueError where torch knows none, or it cannot hold a number."""
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # the meta device has no numbers

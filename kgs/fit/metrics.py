@@ -7,8 +7,6 @@ Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussi
 Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -25,11 +23,8 @@ from kgs.errors import DataError
 
 from .lpips import Lpips
 
-__all__ = ["MEASURES", "evaluate", "measure_again"]
-
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
-WINDOW = 11
-RADIUS = WINDOW // 2
+_WINDOW = 11
 
 
 @torch.no_grad()
@@ -44,9 +39,8 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
     Returns:
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
         published tables), "lpips_vgg" (images in [-1, 1], as the network is meant) and "lpips_vgg_unscaled" (in [0, 1],
-        as in the published tables); under "views" a list with "name" and the same keys for each view. All can go to
-        JSON: None stands for what was not measured, and for the PSNR of an image that equals its photo in every value.
-        That is infinite, as is then the mean, and no finite number is put in its place.
+        as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
+        what was not measured, and for an infinite PSNR: of an image that equals its photo in every value, or a mean.
 
     Raises:
         ValueError: a render has another shape than its photo or holds NaN or infinity, or `lpips` is no "vgg16".
@@ -68,12 +62,9 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
-    """What the metrics.json at `path` holds, with the measures of renders taken again; without `lpips` its LPIPS stays.
+    """What the metrics.json at `path` holds, with the renders measured again; without `lpips` its LPIPS stays.
 
-    `scene` is that of the fit; `render` and `lpips` are what `evaluate` takes.
-
-    Raises:
-        DataError: the views of the scene are not those that the metrics are about.
+    `scene` is that of the fit, of the same views, else DataError; `render` and `lpips` are what `evaluate` takes.
     """
     fresh: dict[str, Any] = {}
     for part, views in (("test", scene.test), ("train", scene.train)):
@@ -94,14 +85,14 @@ def measure_again(
 def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
     level = psnr(image, target, 1.0).item()
     # Kornia's "valid" map of images inside a border of zeros is the whole map with zero padding.
-    padded, padded_target = F.pad(image, [RADIUS] * 4), F.pad(target, [RADIUS] * 4)
-    return {
-        "psnr": level if math.isfinite(level) else None,
-        "ssim": ssim(image, target, WINDOW).mean().item(),
-        "ssim_zero_padded": ssim(padded, padded_target, WINDOW, eps=0.0, padding="valid").mean().item(),
-        "lpips_vgg": None if lpips is None else lpips(image, target).item(),
-        "lpips_vgg_unscaled": None if lpips is None else lpips(image, target, rescale=False).item(),
-    }
+    padded = [F.pad(each, [_WINDOW // 2] * 4) for each in (image, target)]
+    values = (
+        level if math.isfinite(level) else None,
+        ssim(image, target, _WINDOW).mean().item(),
+        ssim(*padded, _WINDOW, eps=0.0, padding="valid").mean().item(),
+        *(None if lpips is None else lpips(image, target, rescale).item() for rescale in (True, False)),
+    )
+    return dict(zip(MEASURES, values, strict=True))
 
 
 def _mean(values: list[float | None]) -> float | None:

@@ -1,13 +1,9 @@
 """What a fit says while it works: lines, and how far each stage is. Nobody who stops listening can end the work."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
-
-__all__ = ["Stage", "each", "progress", "say", "silent"]
 
 Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
@@ -27,23 +23,17 @@ def say(line: str, file: TextIO | None = None) -> None:
 
 @contextmanager
 def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """Show on stderr how far a stage is: a bar on a terminal, else a line for every tenth.
+    """Show on stderr how far a stage of `total` units is: a bar on a terminal, else a line for every tenth.
 
-    Args:
-        total: how many units the stage has; with 0 nothing is shown.
-        title: the name of the stage.
-        done: how many units were done before.
-        unit: what is counted.
-
-    Yields:
-        `advance(note="")`: one more unit is done; the note stands behind the figures.
-
-    Examples:
-        >>> with progress(3, "depth maps", unit="view") as advance:
-        ...     for _ in range(3):
-        ...         advance()
+    Yields `advance(note="")`, for one more unit that is done; the note stands behind the figures. `done` units were
+    done before. With a total of 0 nothing is shown.
     """
-    bar = _bar(total, title, done, unit)
+    bar: Any = None
+    with suppress(OSError, ValueError, AttributeError, ImportError):  # no tqdm, or a stderr that is closed
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            bar = tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=0.5, file=sys.stderr)
 
     def advance(note: str = "") -> None:
         nonlocal done
@@ -64,7 +54,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
 
 
 def each(items: Sequence[Any], title: str, unit: str) -> Iterator[Any]:
-    """The items, with :func:`progress` behind each that is done."""
+    """The items; each that is done moves the stage on."""
     with progress(len(items), title, unit=unit) as advance:
         for item in items:
             yield item
@@ -72,15 +62,5 @@ def each(items: Sequence[Any], title: str, unit: str) -> Iterator[Any]:
 
 
 def silent(items: Sequence[Any], title: str, unit: str) -> Iterable[Any]:
-    """Like :func:`each`, and shows nothing."""
+    """The items; nothing is shown."""
     return items
-
-
-def _bar(total: int, title: str, done: int, unit: str) -> Any:
-    """A bar where stderr is a terminal and tqdm is there, else None."""
-    with suppress(OSError, ValueError, AttributeError, ImportError):
-        if sys.stderr.isatty():
-            from tqdm import tqdm
-
-            return tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=0.5, file=sys.stderr)
-    return None

@@ -1,7 +1,5 @@
 """First points of a fit, from the training views alone: nothing here ever sees a test view."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from os import PathLike
@@ -16,8 +14,8 @@ from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 from kgs.neighbours import log_spacing
 
-from .dense import dense_points
 from .files import read_points
+from .plane_sweep import dense_points
 from .tracks import find_tracks
 from .triangulate import camera_centers, project_all, triangulate_certain, unproject
 
@@ -74,7 +72,7 @@ def first_points(
 
     Raises:
         ValueError: another kind, `count` below 1, or no file for "file".
-        DataError: the file is missing, broken, compressed, or has no points.
+        DataError: the file is missing, broken, compressed, too large, or has no points.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
@@ -83,7 +81,7 @@ def first_points(
     if kind == "file":
         if file is None:
             raise ValueError("file: expected a path for the kind 'file', got None")
-        return FirstPoints(*read_points(Path(file), origin), kind="file")
+        return FirstPoints(*read_points(Path(file), origin), kind)
     points, tracks = triangulate_certain(find_tracks(views, stage), views.cameras)
     good = _within_typical_depths(points, tracks.seen, views.cameras)
     points, tracks = points[good], tracks.select(good)
@@ -96,18 +94,18 @@ def first_points(
         near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
         dense, colors = dense_points(views, near, far, count, generator, stage)
         if len(dense) >= min(FEWEST_DENSE, count):
-            return FirstPoints(dense, colors, kind="dense")
+            return FirstPoints(dense, colors, kind)
         message = f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead"
         warnings.warn(message, stacklevel=2)
     if kind in ("dense", "sift"):
         if len(points) >= FEWEST_POINTS:
-            return FirstPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), kind="sift")
+            return FirstPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), "sift")
         message = f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
     pixels, depths = project_all(points, views.cameras)
     colors = _mean_colors(views, pixels, _inside(pixels, depths, views, near, far))
-    return FirstPoints(points.float(), colors, kind="random")
+    return FirstPoints(points.float(), colors, "random")
 
 
 def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
@@ -134,7 +132,7 @@ def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
     """Whether points lie between half the 1st and twice the 99th percentile of all depths in all views that see them.
 
-    The few false matches that satisfy the geometry by chance mostly lie right before a camera or far behind the scene.
+    Most false matches that satisfy the geometry by chance lie right before a camera or far behind the scene.
     """
     _, depths = project_all(points, cameras)
     if not seen.any():
@@ -186,17 +184,16 @@ def _random_points(views: Views, count: int, near: float, far: float, generator:
     """Points of even density where at least two views see; where there is no such place, where one sees."""
     size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
     found: list[Tensor] = []
-    for fewest in (min(2, len(views)), 1):
-        for _ in range(50):
-            draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
-            view = (torch.rand(4 * count, generator=generator) * len(views)).long()
-            depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
-            points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
-            # A place that k views see is drawn k times as often as one that a single view sees.
-            seeing = _inside(*project_all(points, views.cameras), views, near, far).sum(1)
-            found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])
-            if sum(map(len, found)) >= count:
-                return torch.cat(found)[:count]
+    for fewest in [min(2, len(views))] * 50 + [1] * 50:
+        draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
+        view = (torch.rand(4 * count, generator=generator) * len(views)).long()
+        depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
+        points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
+        # A place that k views see is drawn k times as often as one that a single view sees.
+        seeing = _inside(*project_all(points, views.cameras), views, near, far).sum(1)
+        found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])
+        if sum(map(len, found)) >= count:
+            break
     return torch.cat(found)[:count]
 
 

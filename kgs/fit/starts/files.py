@@ -1,7 +1,6 @@
 """First points from a file: a splat of 3D Gaussian Splatting, or any point cloud or mesh that trimesh reads."""
 
-from __future__ import annotations
-
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,36 +12,33 @@ from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.ply import load_ply
 
-__all__ = ["read_points"]
-
-_MOST_BYTES = 2**30
+_MOST_BYTES, _MOST_TEXT = 2**30, 2**26  # trimesh takes some 75 times the size of a text
 _PACKED = {b"PK\3\4": "zip", b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zX": "xz", b"7z\xbc\xaf": "7z"}
 
 
 def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Positions and colours of the points or vertices in a file.
+    """Positions `(P, 3)`, less `origin` `(3,)`, and RGB in [0, 1], `(P, 3)`, of a file's points or vertices; float32.
 
-    Args:
-        path: the file. Compressed ones are refused: a small one can hold more than the memory.
-        origin: subtracted in the file's precision, `(3,)`; None for zeros.
-
-    Returns:
-        `(P, 3)` and RGB in [0, 1], `(P, 3)`, float32; a splat has the colours of its harmonics of degree 0, and what
-        has no colours is grey.
+    A splat has the colours of its harmonics of degree 0, and what has no colours is grey. Compressed files are refused:
+    a small one can hold more than the memory.
 
     Raises:
-        DataError: the file is missing, broken, compressed, larger than 1 GiB, or has no points or infinite ones.
+        DataError: the file is missing, broken, compressed, larger than 1 GiB (64 MiB where it is text and no splat),
+            or has no points or infinite ones.
     """
     if not path.is_file():
         raise DataError(path, "", "expected a point cloud or mesh, found no such file")
-    if path.stat().st_size > _MOST_BYTES:
-        raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
     with open(path, "rb") as file:
         head = file.read(2**13)
+    is_ply = head.startswith(b"ply")
+    is_splat = is_ply and b" f_dc_0" in head
+    is_text = not re.search(rb"^format binary" if is_ply else rb"\0", head, re.MULTILINE)
+    most = _MOST_TEXT if is_text and not is_splat else _MOST_BYTES
+    if path.stat().st_size > most:
+        raise DataError(path, "", f"is larger than {most // 2**20} MiB{', the most for a text file' * is_text}")
     for magic, name in _PACKED.items():
         if head.startswith(magic):
             raise DataError(path, "", f"expected a point cloud or mesh, got a {name} archive: unpack it first")
-    is_splat = head.startswith(b"ply") and b" f_dc_0" in head
     points, colors = _splat(path, origin) if is_splat else _cloud(path, origin)
     if not len(points) or not bool(points.isfinite().all()):
         raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
@@ -59,11 +55,10 @@ def _cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         geometry: Any = trimesh.load(path, process=False, skip_materials=True)
         geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
         points = torch.tensor(geometry.vertices, dtype=torch.float64).reshape(-1, 3)
-        values = geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else []
+        colors = torch.tensor(geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else [])
     except Exception as error:  # each of trimesh's readers raises what its parser meets
         raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
     points = (points if origin is None else points - origin).float()
-    colors = torch.tensor(values)
     if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # none, or not those of points
         return points, torch.full((len(points), 3), 0.5)
     return points, colors[:, :3].float() / 255.0

@@ -1,10 +1,10 @@
-"""Depth maps of posed views by a plane sweep: planes parallel to a view's image, warped, compared, smoothed, refined.
+"""A dense first cloud, where depth maps of the training views agree, each from a plane sweep.
+
+Planes parallel to a view's image are warped, compared, smoothed and refined.
 
 Sources: Collins, "A Space-Sweep Approach to True Multi-Image Matching" (CVPR 1996) for the sweep; Hirschmüller, "Stereo
 Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equations 11 to 14, for the smoothing.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator
@@ -19,9 +19,7 @@ from torch import Tensor
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
-from .triangulate import camera_centers
-
-__all__ = ["DepthMap", "sweep_depths"]
+from .triangulate import camera_centers, matrices, project_all, unproject
 
 PLANES = 128
 WINDOW = 7  # pixels, the side of the patches that are compared
@@ -29,20 +27,20 @@ NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
 # Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
 STEP, JUMP, EDGE = 0.06, 0.5, 0.04
+SCORE = 0.6  # a patch of a point has to match at least so well
+MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000
+AGREEMENT = 0.01  # relative difference of the depths that two views have of a point
 _VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of every pixel of one view.
+    """Depth of every pixel of one view, `(H, W)`, and how well the patch matches there, from -1 to 1.
+
+    `is_inner` says where the depth is not on the nearest or farthest plane.
 
     Convention:
         Depth is z in the camera's frame (OpenCV axes), in world units; pixels have integer centres.
-
-    Args:
-        depths: `(H, W)`.
-        scores: how well the patch matches there, normalised cross-correlation in [-1, 1], `(H, W)`.
-        is_inner: whether the depth is not on the nearest or farthest plane, `(H, W)`.
     """
 
     depths: Tensor
@@ -50,35 +48,68 @@ class DepthMap:
     is_inner: Tensor
 
 
-def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES, stage: Stage = silent) -> list[DepthMap]:
-    """The depth map of each view.
+def dense_points(
+    views: Views, near: float, far: float, count: int, generator: torch.Generator, stage: Stage = silent
+) -> tuple[Tensor, Tensor]:
+    """At most `count` points of the surfaces that at least two views agree on, drawn at random, and their colours.
 
-    Args:
-        views: posed; one from whose place no other differs has no depths, and scores of -1.
-        near: depth of the nearest plane, > 0.
-        far: of the farthest, > near.
-        planes: how many, evenly spread over inverse depth; at least 3.
-        stage: shows how far the work is.
+    `near` and `far` bound the depths that are searched. Where the views have masks, points lie where both are above
+    0.5. Large pictures, and many of them, are swept at half the width and height, or a quarter: they give enough
+    points, in bounded time and memory. Returns points `(P, 3)` float32 in the views' frame and RGB in [0, 1], `(P, 3)`.
+    """
+    while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
+        views = views.halved()
+    maps = sweep_depths(views, near, far, stage=stage)
+    certain = [there.is_inner & (there.scores > SCORE) for there in maps]
+    if views.masks is not None:
+        certain = [pixels & (mask[0] > 0.5).cpu() for pixels, mask in zip(certain, views.masks, strict=True)]
+    found = [_agreed(views, maps, certain, view) for view in range(len(views))]
+    points, colors = (torch.cat(parts) for parts in zip(*found, strict=True))
+    chosen = torch.randperm(len(points), generator=generator)[:count]
+    return points[chosen].float(), colors[chosen]
+
+
+def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor]:
+    """The points of one view's certain pixels that another view's have too, and their colours in that view."""
+    here = maps[view].depths
+    rows, columns = certain[view].nonzero().unbind(1)
+    pixels = torch.stack([columns, rows], 1)
+    points = unproject(pixels, here[rows, columns].double(), torch.full_like(rows, view), views.cameras)
+    pixels, depths = project_all(points, views.cameras)
+    limits = torch.tensor(here.mT.shape)
+    agreed = torch.zeros(len(points), dtype=torch.bool)
+    for other in set(range(len(views))) - {view}:
+        places, depth = pixels[:, other].round(), depths[:, other]
+        inside = ((places >= 0) & (places < limits)).all(1) & (depth > 0)
+        x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
+        close = (maps[other].depths[y, x] / depth - 1).abs() < AGREEMENT
+        agreed |= inside & close & certain[other][y, x]
+    return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]
+
+
+def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES, stage: Stage = silent) -> list[DepthMap]:
+    """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
+
+    A view from whose place no other differs has no depths, and scores of -1.
 
     Raises:
-        ValueError: the range is empty or not in front of the cameras, or there are too few planes.
+        ValueError: the range is empty or not in front of the cameras, or there are fewer than 3 planes.
     """
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
     if planes < 3:
         raise ValueError(f"planes: expected at least 3, got {planes}")
-    grey = rgb_to_grayscale(views.images.cpu().float())
+    grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
     depth = 1 / float(inverse.mean())
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
-        image, others = grey[view, 0], _neighbours(views, view, depth)
-        if others:
+        if others := _neighbours(views, view, depth):
             scores = _combine(_scores(grey, views.cameras, view, other, inverse) for other in others)
-            maps.append(_refine(_semi_global(1.0 - scores, image), scores, inverse))
+            maps.append(_refine(_semi_global(1.0 - scores, grey[view]), scores, inverse))
         else:
-            unknown = torch.full_like(image, -1.0)
-            maps.append(DepthMap(torch.full_like(image, far), unknown, unknown > 0))
+            unknown = torch.full_like(grey[view], -1.0)
+            maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
     return maps
 
 
@@ -95,14 +126,13 @@ def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse
 
     A plane at depth d of the view has the homography K' (R + t n^T / d) K^-1 to the other view.
     """
-    intrinsics, extrinsics = cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu()
-    height, width = grey.shape[-2:]
+    intrinsics, extrinsics = matrices(cameras)
     rotation = extrinsics[other, :3, :3] @ extrinsics[view, :3, :3].mT
     shift = extrinsics[other, :3, 3] - rotation @ extrinsics[view, :3, 3]
     back = torch.linalg.inv(intrinsics[view])
-    image, target = grey[view, 0], grey[other, 0]
+    image, target = grey[view], grey[other]
     mean, variance = _moments(image)
-    found, turn = torch.empty(len(inverse), height, width), rotation.clone()
+    found, turn = torch.empty(len(inverse), *image.shape), rotation.clone()
     for plane, value in enumerate(inverse.tolist()):
         turn[:, 2] = rotation[:, 2] + value * shift
         homography = intrinsics[other] @ turn @ back
@@ -117,10 +147,8 @@ def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse
 def _warp(image: Tensor, homography: Tensor) -> Tensor:
     """The image at the places that pixels are mapped to, `(H, W)`; 0 outside and behind the camera."""
     height, width = image.shape
-    size = (width, height)
-    warped = torch.from_numpy(
-        cv2.warpPerspective(image.numpy(), homography.numpy(), size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    )
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = torch.from_numpy(cv2.warpPerspective(image.numpy(), homography.numpy(), (width, height), flags=flags))
     corners = torch.tensor([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)], dtype=torch.float64)
     if bool((corners @ homography[2] > 0).all()):
         return warped
@@ -159,10 +187,10 @@ def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
 
 def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
     """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right per row."""
-    rows = range(cost.shape[1] - 1, -1, -1) if flip else range(cost.shape[1])
+    rows = range(cost.shape[1])
     before: Tensor | None = None
     last = 0
-    for row in rows:
+    for row in reversed(rows) if flip else rows:
         path = cost[:, row].clone()
         if before is not None:
             came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
@@ -181,13 +209,10 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
 
 def _refine(cost: Tensor, scores: Tensor, inverse: Tensor) -> DepthMap:
     """The cheapest plane of each pixel, and between planes the lowest point of a parabola."""
-    planes = len(cost)
     best = cost.argmin(0)
-    inner = best.clamp(1, planes - 2)
+    inner = best.clamp(1, len(cost) - 2)
     left, middle, right = (cost.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
-    step = float(inverse[1] - inverse[0])
-    depths = 1.0 / (float(inverse[0]) + (inner + offset) * step)
-    is_inner = (best > 0) & (best < planes - 1)
-    return DepthMap(depths, scores.gather(0, best[None])[0], is_inner)
+    depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0]))
+    return DepthMap(depths, scores.gather(0, best[None])[0], (best > 0) & (best < len(cost) - 1))

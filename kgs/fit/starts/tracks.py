@@ -4,10 +4,9 @@ Sources: D. Lowe, Distinctive image features from scale-invariant keypoints, IJC
 R. Arandjelovic and A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012 (RootSIFT).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Self
 
 import cv2
 import numpy as np
@@ -19,8 +18,6 @@ from torch import Tensor
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
-__all__ = ["Tracks", "find_tracks"]
-
 SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
 MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
 CHUNK = 256  # keypoints matched at once: bounds the memory
@@ -30,34 +27,26 @@ MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival m
 
 @dataclass(frozen=True)
 class Tracks:
-    """T scene points as V views see them, on the CPU.
+    """T scene points as V views see them: at `pixels` `(T, V, 2)`, float64, where `seen` `(T, V)`; on the CPU.
 
     Convention:
         Integer pixel centres: the first pixel's centre is (0, 0).
-
-    Args:
-        pixels: where each view sees each point, `(T, V, 2)` float64; anything where `seen` is False.
-        seen: `(T, V)` bool.
     """
 
     pixels: Tensor
     seen: Tensor
 
-    def select(self, rows: Tensor) -> Tracks:
+    def select(self, rows: Tensor) -> Self:
         """Some of the points, by a mask or by numbers."""
-        return Tracks(self.pixels[rows], self.seen[rows])
+        return type(self)(self.pixels[rows], self.seen[rows])
 
 
 def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
-    """Find points that at least two of the views see.
+    """Find points that at least two of the views see, where the views' masks, if any, are above 0.5.
 
     Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
     poses), clearly nearer than the second nearest, and alike in itself. The best matches are joined first; one that
     would give a track two places in one view is left out. Nothing is random: the same images give the same bits.
-
-    Args:
-        views: posed images; where they have masks, keypoints lie where the mask is above 0.5.
-        stage: shows how far the work is.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
     limit = min(max(48_000 // len(views), 1500), 12_000)
@@ -67,9 +56,8 @@ def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
     nodes, pixels, owners = _places([places for places, _ in features])
     links: list[tuple[float, int, int]] = []
     for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
-        distances, pairs = _match(features[i], features[j], projections[i], projections[j])
-        ends = nodes[i][pairs[:, 0]], nodes[j][pairs[:, 1]]
-        links += zip(distances.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
+        distances, rows, columns = _match(features[i], features[j], projections[i], projections[j])
+        links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
     tracks = _join(links, owners)
     table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
     seen = torch.zeros(len(tracks), len(views), dtype=torch.bool)
@@ -103,39 +91,36 @@ def _detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
 
 def _match(
     first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], projection1: Tensor, projection2: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Descriptor distances `(M,)` and index pairs `(M, 2)` of the matches between two views."""
+) -> tuple[Tensor, ...]:
+    """Descriptor distances and the keypoints' numbers in both views, each `(M,)`, of the matches between two views."""
     (places1, descriptors1), (places2, descriptors2) = first, second
     fundamental = fundamental_from_projections(projection1[None], projection2[None])[0]
     lines = convert_points_to_homogeneous(places1) @ fundamental.T
     lines = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
     targets = convert_points_to_homogeneous(places2).float().T
-    candidates: list[tuple[Tensor, Tensor, Tensor]] = []
+    candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
     for start in range(0, len(lines), CHUNK):
         near_line = (lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE
         rows, columns = near_line.nonzero().unbind(1)
         # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
         differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
         candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
-    if not candidates:
-        return torch.zeros(0), torch.zeros(0, 2, dtype=torch.int64)
     rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
     nearest1, rival1 = _nearest(distances, rows, len(places1))
     nearest2, rival2 = _nearest(distances, columns, len(places2))
     distinct = distances < MAX_RATIO * torch.minimum(rival1, rival2)
     good = nearest1 & nearest2 & distinct & (distances < MAX_DISTANCE)
-    return distances[good], torch.stack([rows[good], columns[good]], dim=1)
+    return distances[good], rows[good], columns[good]
 
 
 def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """For each candidate: is it the nearest of its owner, and the distance of its owner's second nearest."""
     order = torch.arange(len(distances))
-    least = distances.new_full((count,), torch.inf).scatter_reduce(0, owners, distances, "amin")
-    ties = distances == least[owners]
+    infinite = distances.new_full((count,), torch.inf)
+    ties = distances == infinite.scatter_reduce(0, owners, distances, "amin")[owners]
     first = order.new_full((count,), len(order)).scatter_reduce(0, owners[ties], order[ties], "amin")
     nearest = first[owners] == order
-    rival = distances.new_full((count,), torch.inf)
-    rival = rival.scatter_reduce(0, owners[~nearest], distances[~nearest], "amin")
+    rival = infinite.scatter_reduce(0, owners[~nearest], distances[~nearest], "amin")
     return nearest, rival[owners]
 
 
