@@ -53,11 +53,12 @@ class Lpips(nn.Module):
             raise ValueError(f"net: expected one of {sorted(TAPS)}, got {net!r}")
         self.net = net
         layers, channels = list[nn.Module](), 3
-        for width, *shape in LAYERS[net]:
-            if len(shape) == 1:
-                layers.append(nn.MaxPool2d(width, *shape))
+        for layer in LAYERS[net]:
+            if len(layer) == 2:
+                layers.append(nn.MaxPool2d(*layer))
                 continue
-            layers += [nn.Conv2d(channels, width, *shape), nn.ReLU()]
+            width, size, stride, padding = layer
+            layers += [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU()]
             channels = width
             if len(layers) - 1 in TAPS[net]:
                 self.register_buffer(f"lin{TAPS[net].index(len(layers) - 1)}", torch.ones(channels))

@@ -85,11 +85,11 @@ def measure_again(
 def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
     level = psnr(image, target, 1.0).item()
     # Kornia's "valid" map of images inside a border of zeros is the whole map with zero padding.
-    padded = [F.pad(each, [_WINDOW // 2] * 4) for each in (image, target)]
+    padded, padded_target = (F.pad(each, [_WINDOW // 2] * 4) for each in (image, target))
     values = (
         level if math.isfinite(level) else None,
         ssim(image, target, _WINDOW).mean().item(),
-        ssim(*padded, _WINDOW, eps=0.0, padding="valid").mean().item(),
+        ssim(padded, padded_target, _WINDOW, eps=0.0, padding="valid").mean().item(),
         *(None if lpips is None else lpips(image, target, rescale).item() for rescale in (True, False)),
     )
     return dict(zip(MEASURES, values, strict=True))
