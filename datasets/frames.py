@@ -71,12 +71,9 @@ class FrameSet:
 
 
 def path_inside(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:
-    """The path of a file that `source` names, relative to `folder` or `root`; a DataError where it leads out of `root`.
-
-    Backslashes separate folders where no file has them in its name.
-    """
+    """The path of a file that `source` names, relative to `folder` or `root`; a DataError where it leads out."""
     wrong = partial(DataError, source, repr(name[:200]))
-    given = PureWindowsPath(name)  # knows both separators and drives
+    given = PureWindowsPath(name)  # knows both separators and drives; a file may have backslashes in its name, too
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
         raise wrong("expected the name of a file inside the scene's folder")
     folder = folder or root

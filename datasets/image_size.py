@@ -34,8 +34,7 @@ def image_size(path: Path, data: Buffer) -> tuple[int, int]:
     most = min(2**28, max(2**21, min(2**24, 2048 * len(data)), 32 * len(data)))
     for wide, high in ((width, height), tile or (1, 1)):
         if wide * high > most:
-            claim = f"claims {wide}x{high} pixels in {len(data)} bytes"
-            raise DataError(path, "header", f"{claim}: a decompression bomb, not decoded")
+            raise DataError(path, "header", f"claims {wide}x{high} pixels in {len(data)} bytes: a decompression bomb")
     return width, height
 
 
@@ -62,8 +61,7 @@ def plain_tiff(data: bytes) -> tuple[bytes, bool]:
     Decoders turn an image as its orientation tag says, and multiply 8 bit colours by an alpha that is not multiplied
     in. Both tags are overwritten. A grey TIFF with an alpha channel, which decoders leave out, is a ValueError.
     """
-    tags, order = _tags(data), "<" if data[:1] == b"I" else ">"
-    parts = bytearray(data)
+    tags, order, parts = _tags(data), "<" if data[:1] == b"I" else ">", bytearray(data)
     if _ORIENTATION in tags:
         struct.pack_into(order + "H", parts, tags[_ORIENTATION][1], 1)
     if _EXTRA_SAMPLES not in tags:

@@ -129,10 +129,7 @@ def _decode(data: bytes) -> NDArray[np.uint8 | np.uint16]:
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:
-    """Reduce an image `(H, W)` or `(H, W, K)` and its intrinsics to a size that is not above its own.
-
-    Each new pixel is the mean over the area it covers; the intrinsics are scaled by the exact ratio of each axis.
-    """
+    """Reduce an image `(H, W)` or `(H, W, K)` to means over areas, its intrinsics by the exact ratio of each axis."""
     if (width, height) == (intrinsics.width, intrinsics.height):
         return image, intrinsics
     reduced = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

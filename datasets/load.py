@@ -42,8 +42,7 @@ def load_scene(
 
     Convention:
         Kornia's in the result, see `Views`: world-to-camera extrinsics with OpenCV axes, integer pixel centres. The
-        world is the files', moved by `Scene.offset` (the mean of the training cameras' centres), never scaled or
-        turned.
+        world is the files', moved by `Scene.offset` (the mean of the training cameras' centres), not scaled or turned.
 
     Args:
         path: the scene's folder.
@@ -84,7 +83,10 @@ def load_scene(
             cloud = found.model_points(train)
         if not bool((cloud.points.abs() <= LARGEST).all()):
             raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
-        _check_present(root, [frame.path for frame in (*train, *test)])
+        if missing := [frame.path for frame in (*train, *test) if not frame.path.is_file()]:
+            listed = ", ".join(str(path.relative_to(root)) for path in missing[:_LISTED])
+            listed += f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else ""
+            raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {listed}")
         color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
         offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; no test view enters it
         height, width = size = _common_size([*train, *test], downscale)
@@ -92,8 +94,9 @@ def load_scene(
         is_finer = photos and downscale is not None and fine_downscale < downscale
         views = partial(_views, offset=offset, background=color, photos=photos)
         finer = views(train, _common_size(train, fine_downscale)) if is_finer else None
-        pictures, positions, colors = (views(train, size), views(test, size)), cloud.points - offset, cloud.colors
-        return Scene(*pictures, positions.float(), colors.float(), cloud.kind, offset, color, root, finer, found.notes)
+        both = views(train, size), views(test, size)
+        moved, colors = (cloud.points - offset).float(), cloud.colors.float()
+        return Scene(*both, moved, colors, cloud.kind, offset, color, root, finer, found.notes)
 
 
 def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:
@@ -114,14 +117,6 @@ def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[F
     if train_views == len(found.published) and len(frames) > max(found.published):
         chosen = found.published
     return [frames[i] for i in chosen], test_frames
-
-
-def _check_present(root: Path, paths: Sequence[Path]) -> None:
-    """Raise one DataError that names every photo that is not there."""
-    missing = [str(path.relative_to(root)) for path in paths if not path.is_file()]
-    if missing:
-        listed = ", ".join(missing[:_LISTED]) + (f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else "")
-        raise DataError(root, "", f"{len(missing)} of {len(paths)} images are missing: {listed}")
 
 
 def _common_size(frames: Sequence[Frame], downscale: float | None) -> tuple[int, int]:

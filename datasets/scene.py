@@ -130,8 +130,7 @@ class Scene:
         offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
         background: `(3,)`, the colour behind the scene, in [0, 1].
         root: the folder the scene was read from.
-        finer: the training views in more pixels than `train` has, where the files have more; first points are found
-            in these. None where `train` is as fine as that.
+        finer: the training views in more pixels, to find first points in; None where `train` is as fine as that.
         notes: what the files say that is not used, one sentence each, to be shown to the user.
     """
 

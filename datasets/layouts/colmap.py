@@ -19,9 +19,7 @@ def load_colmap(root: Path) -> FrameSet:
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes already; its first pixel's centre is at (0.5, 0.5).
     """
-    folder = find_model(root)
-    if folder is None:
-        raise DataError(root, "", "expected a COLMAP model in sparse/0 or sparse, found none")
+    folder = find_model(root) or root / "sparse"
     cameras_file, images_file = model_file(folder, "cameras"), model_file(folder, "images")
     cameras, images = read_cameras(cameras_file), read_images(images_file)
     photos, frames, ids = image_folder(root), [], {}

@@ -6,10 +6,9 @@ not read. Every count is held against the file's length before memory of that si
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +18,14 @@ from kgs.errors import DataError
 
 T = TypeVar("T")
 _LONGEST_NAME = 4096
-# In the order of COLMAP's model ids; the numbers of parameters of those that are read.
-_MODELS = (
-    "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV SIMPLE_RADIAL_FISHEYE "
-    "RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"
+# In the order of COLMAP's model ids: how many parameters each has, 0 for those that are not read.
+_MODELS = dict(
+    SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12, FOV=0
 )
-_PARAMETERS = dict(SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5)
-_PARAMETERS |= dict(OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12)
+_MODELS |= dict(SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5, THIN_PRISM_FISHEYE=0, RAD_TAN_THIN_PRISM_FISHEYE=0)
 
 
-@dataclass(frozen=True)
-class ColmapCamera:
+class ColmapCamera(NamedTuple):
     """A lens: the model's name, the image size, the parameters in COLMAP's order."""
 
     model: str
@@ -38,8 +34,7 @@ class ColmapCamera:
     params: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class ColmapImage:
+class ColmapImage(NamedTuple):
     """A registered photo: world-to-camera rotation as a quaternion (w, x, y, z), translation, camera id, name."""
 
     quat: tuple[float, ...]
@@ -69,14 +64,13 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         data = _Binary(path)
         for _ in data.items("number of cameras", 24):
             camera_id, model_id, width, height = data.take("<IiQQ", "camera")
-            model = dict(enumerate(_MODELS.split())).get(model_id, f"number {model_id}")
+            model = dict(enumerate(_MODELS)).get(model_id, f"number {model_id}")
             params = data.take(f"<{_parameter_count(path, camera_id, model)}d", f"camera {camera_id}")
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
     else:
+        kinds = (int, str, int, int, partial(_numbers, float))
         for line in filter(None, _lines(path)):
-            camera_id, model, width, height, params = _fields(
-                path, line, (int, str, int, int, partial(_numbers, float))
-            )
+            camera_id, model, width, height, params = _fields(path, line, kinds)
             if len(params) != _parameter_count(path, camera_id, model):
                 raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
@@ -204,9 +198,9 @@ def _is_observations(line: str) -> bool:
 
 
 def _parameter_count(path: Path, camera_id: int, model: str) -> int:
-    if model in _PARAMETERS:
-        return _PARAMETERS[model]
-    known = ", ".join(_PARAMETERS)
+    if count := _MODELS.get(model):
+        return count
+    known = ", ".join(name for name, count in _MODELS.items() if count)
     raise DataError(path, f"camera {camera_id}", f"camera model {model} cannot be read, only {known}")
 
 

@@ -1,6 +1,7 @@
 """LLFF scenes: `poses_bounds.npy` beside `images/` or `images_k/` (https://github.com/Fyusion/LLFF)."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ def load_llff(root: Path) -> FrameSet:
     if len(paths) != len(rows):
         raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")
     frames = [_frame(source, path, row) for path, row in zip(paths, rows, strict=True)]
-    return FrameSet(frames, model_points=lambda train: _model_points(root, frames, train))
+    model = find_model(root)
+    return FrameSet(frames, model_points=None if model is None else partial(_model_points, model, frames))
 
 
 def _read_rows(path: Path) -> NDArray[np.float64]:
@@ -55,17 +57,13 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
 
 def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
     down, right, backward, center, (height, width, focal) = row[:15].reshape(3, 5).T
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, down, -backward, center], axis=1)
+    pose = np.vstack([np.stack([right, down, -backward, center], axis=1), [0.0, 0.0, 0.0, 1.0]])
     lens = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
     return Frame(source, path.name, path, lens, torch.from_numpy(pose))
 
 
-def _model_points(root: Path, frames: Sequence[Frame], train: Sequence[Frame]) -> PointCloud:
+def _model_points(folder: Path, frames: Sequence[Frame], train: Sequence[Frame]) -> PointCloud:
     """The points of the COLMAP model that the poses were made from; its images pair with ours in order of name."""
-    folder = find_model(root)
-    if folder is None:
-        raise DataError(root, "points", "model-points need a COLMAP model in sparse/0 beside poses_bounds.npy")
     images = sorted(read_images(model_file(folder, "images")).items(), key=lambda item: item[1].name)
     if len(images) == len(frames):
         given = torch.stack([frame.pose for frame in frames])

@@ -24,7 +24,6 @@ from kgs.json_files import read_json
 
 Object = dict[str, Any]
 Said = ChainMap[str, Any]  # what holds for a frame: its own object, then the whole file's
-
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 _BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")  # in OpenCV's order
@@ -37,11 +36,10 @@ _KNOWN = """
     applied_transform applied_scale orientation_override auto_scale_poses_override
 """
 _GEOMETRY = re.compile(
-    r"angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
+    r"(?i)angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
     r"camera|fisheye|ftheta|latlong|equirect|panoram|spheric|ortho|omni|projection|skew|shear|aspect|rolling|shutter|"
     r"mask|crop|width|height|resolution|pose|matrix|extrins|intrins|transl|rotat|quat|orient|flip|^from_|axis|axes|"
-    r"handed|convention|c2w|w2c",
-    re.IGNORECASE,
+    r"handed|convention|c2w|w2c"
 )
 
 
@@ -86,8 +84,7 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
 
     A file that cannot be read, lacks a field, or says of lenses or poses what cannot be used is a DataError.
     """
-    source = root / name
-    data = read_json(source)
+    data = read_json(source := root / name)
     entries = data.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(source, "frames", "expected a list of objects, not empty")

@@ -79,8 +79,7 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
-    size = sizes.pop()
-    triangles = make_world(kind, seed).triangles
+    size, triangles = sizes.pop(), make_world(kind, seed).triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
     return torch.from_numpy(np.stack(depths)[:, None])
@@ -113,8 +112,7 @@ def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int,
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
     colors[v, u] = shade(world, points, faces[v, u])
-    image: NDArray[np.float32] = colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
-    return image
+    return np.asarray(colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1))
 
 
 def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:

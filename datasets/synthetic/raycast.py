@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 MARGIN = 1e-6  # px by which bounding boxes are widened, so that rounding never loses a pixel on an edge
 
 
-def raycast(
-    triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[int, int]
-) -> tuple[Array, NDArray[np.int64]]:
+def raycast(triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> tuple[Array, Index]:
     """The nearest triangle `(F, 3, 3)` that the ray through each pixel centre hits, seen from both sides.
 
     Returns the hit's z in the camera frame, `(H, W)`, 0 where there is none, and the triangle, int64, -1 for none.
@@ -51,9 +50,7 @@ def raycast(
     return depths.reshape(size), faces.reshape(size)
 
 
-def _candidates(
-    projected: Array, valid: NDArray[np.bool_], size: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _candidates(projected: Array, valid: NDArray[np.bool_], size: tuple[int, int]) -> tuple[Index, Index, Index]:
     """All pairs (face, u, v) where the pixel lies in the face's bounding box: the whole image if it crosses z = 0."""
     limits = np.array([size[1] - 1.0, size[0] - 1.0])
     z = projected[..., 2:]

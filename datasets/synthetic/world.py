@@ -3,14 +3,13 @@
 Surfaces are matt: a point has one colour from wherever it is seen.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from trimesh.transformations import euler_matrix
 
-from .raycast import Array
+from .raycast import Array, Index
 from .textures import Texture, random_texture
 
 KINDS = ("forward", "orbit")
@@ -19,13 +18,12 @@ CENTER = np.array([0.0, 0.5, 4.4])  # the middle of the objects
 LIGHT = np.array([-0.48, -0.6, -0.64])  # unit vector towards the light: to the left, above and before the objects
 
 
-@dataclass(frozen=True)
-class World:
+class World(NamedTuple):
     """F triangles that belong to some parts, each of which has a frame and a texture of its own."""
 
     triangles: Array  # (F, 3, 3)
     normals: Array  # (F, 3), unit
-    owners: NDArray[np.int64]  # (F,), the part a triangle belongs to
+    owners: Index  # (F,), the part a triangle belongs to
     frames: tuple[Array, ...]  # a (4, 4) rigid matrix for each part, from its own frame to the world
     textures: tuple[Texture, ...]
     balls: Array  # (B, 4), centre and radius of a ball as large as each of the first B parts: they shade what is near
@@ -55,7 +53,7 @@ def make_world(kind: str, seed: int) -> World:
     return World(triangles, normals, owners, frames, textures, np.array(balls))
 
 
-def shade(world: World, points: Array, faces: NDArray[np.int64]) -> Array:
+def shade(world: World, points: Array, faces: Index) -> Array:
     """Colours `(n, 3)` of points `(n, 3)` on triangles `(n,)`, lit by the sky and one distant light (Lambert)."""
     owners, normals = world.owners[faces], world.normals[faces]
     albedo = np.empty((len(points), 3))
@@ -133,7 +131,7 @@ def _sheet(x: Array, y: Array, z: Array) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, process=False)
 
 
-def _openness(balls: Array, points: Array, normals: Array, owners: NDArray[np.int64]) -> Array:
+def _openness(balls: Array, points: Array, normals: Array, owners: Index) -> Array:
     """How much of the sky the other objects leave free, `(n,)`: a ball at distance d hides cos(angle) (r / d)^2."""
     centers, radii = balls[:, :3], balls[:, 3]
     towards = normals @ centers.T - (normals * points).sum(axis=1, keepdims=True)
