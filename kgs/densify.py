@@ -141,7 +141,12 @@ class Densifier:
         model, before = self.model, len(self.model)
         average = self._statistics["gradient_sums"] / self._statistics["counts"].clamp(min=1)
         opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # NaN stays, for the trainer to find
-        hot, capped = self._choose((average >= self.grad_threshold) & opaque, average, int(opaque.sum()))
+        hot = (average >= self.grad_threshold) & opaque
+        wanted = int(hot.sum())
+        room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - int(opaque.sum()))
+        if wanted > room:  # each adds one; those of the largest gradients
+            order = torch.where(hot, average, -1.0).argsort(descending=True, stable=True)
+            hot = torch.zeros_like(hot).index_fill(0, order[:room], True)
         large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
         masks = (hot & ~large, hot & large, opaque & ~(hot & large))
         cloned, split, kept = (mask.nonzero().squeeze(1) for mask in masks)
@@ -153,7 +158,8 @@ class Densifier:
         for name, parameter in list(model.named_parameters()):
             self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
         self._observe_anew(self.mean_gradients[torch.cat([kept, born])])
-        return DensifyReport(len(cloned), len(split), before - len(kept) - len(split), len(model), capped)
+        pruned, capped = before - len(kept) - len(split), max(0, wanted - room)
+        return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
 
     @torch.no_grad()
     def reset_opacity(self, ceiling: float = 0.01) -> None:
@@ -196,15 +202,6 @@ class Densifier:
                 if isinstance(entry, Tensor) and entry.numel() != 1 and entry.shape != shape:
                     got = tuple(entry.shape)
                     raise ValueError(f"optimizer: expected the state {key} of {name} to have shape {shape}, got {got}")
-
-    def _choose(self, hot: Tensor, average: Tensor, remaining: int) -> tuple[Tensor, int]:
-        """Of `hot` no more than may be added (each adds 1), the largest first, and how many were left out."""
-        wanted = int(hot.sum())
-        room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - remaining)
-        if wanted <= room:
-            return hot, 0
-        order = torch.where(hot, average, -1.0).argsort(descending=True, stable=True)
-        return torch.zeros_like(hot).index_fill(0, order[:room], True), wanted - room
 
     def _sample_offsets(self, ids: Tensor) -> Tensor:
         """Draw, for each id, a place relative to the centre from that Gaussian's own distribution."""

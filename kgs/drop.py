@@ -16,6 +16,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+SCHEDULES = ("constant", "linear")
+
 
 def drop_gaussian(
     opacities: Tensor, p: float = 0.2, training: bool = True, generator: torch.Generator | None = None
@@ -54,19 +56,6 @@ def drop_gaussian(
     return opacities * mask.to(opacities.device)
 
 
-def linear(progress: float) -> float:
-    """The paper's schedule: the rate grows in proportion to the progress."""
-    return progress
-
-
-def constant(progress: float) -> float:
-    """The same rate throughout."""
-    return 1.0
-
-
-SCHEDULES: dict[str, Callable[[float], float]] = {"linear": linear, "constant": constant}
-
-
 class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
@@ -98,12 +87,12 @@ class DropGaussian(nn.Module):
     ) -> None:
         super().__init__()
         if not (schedule in SCHEDULES if isinstance(schedule, str) else callable(schedule)):
-            raise ValueError(f"schedule: expected one of {sorted(SCHEDULES)} or a callable, got {schedule!r}")
+            raise ValueError(f"schedule: expected one of {list(SCHEDULES)} or a callable, got {schedule!r}")
         is_integer = isinstance(seed, (int, Integral)) and not isinstance(seed, bool)
         if seed is not None and not (is_integer and -(2**63) <= seed < 2**64):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
-        self.schedule = SCHEDULES[schedule] if isinstance(schedule, str) else schedule
+        self.schedule = schedule
         self.seed = seed
         self._progress: float | None = None
         # objects, not values: shallow copies such as the replicas of nn.DataParallel share and advance them
@@ -122,13 +111,15 @@ class DropGaussian(nn.Module):
     @property
     def rate(self) -> float:
         """The drop rate of the next call in `train()`."""
-        return _fraction("p * schedule(progress)", self.p * self.schedule(self.progress))
+        factors = {"linear": self.progress, "constant": 1.0}
+        factor = factors[self.schedule] if isinstance(self.schedule, str) else self.schedule(self.progress)
+        return _fraction("p * schedule(progress)", self.p * factor)
 
     def forward(self, opacities: Tensor) -> Tensor:
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
         if not self.training:
             return opacities
-        if self._progress is None and self.schedule is not constant:
+        if self._progress is None and self.schedule != "constant":
             wanted = "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
             self._warn_once("progress", f"progress was never set, so the rate is {self.rate:g} throughout; {wanted}")
         dropped = drop_gaussian(opacities, self.rate, True, self._stream)
@@ -150,7 +141,7 @@ class DropGaussian(nn.Module):
 
     def extra_repr(self) -> str:
         """What `print` shows."""
-        name = getattr(self.schedule, "__name__", repr(self.schedule))
+        name = getattr(self.schedule, "__name__", self.schedule)
         progress = "1.0 (never set)" if self._progress is None else f"{self._progress:g}"
         seed = "" if self.seed is None else f", seed={self.seed}"
         return f"p={self.p:g}, schedule={name}, progress={progress}{seed}"

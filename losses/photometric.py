@@ -105,8 +105,7 @@ def photometric_loss(
     if not fast or target.requires_grad or image.dtype != torch.float32 or min(shape[-2:]) < WINDOW:
         return loss + 2.0 * dssim_weight * _mean(ssim_loss(image, target, WINDOW, reduction="none"), outside)
     moments = target_moments(target) if moments is None else moments
-    if outside is not None:
-        outside = outside.expand_as(image).reshape(shape)
+    outside = None if outside is None else outside.expand_as(image).reshape(shape)
     arguments = (image.reshape(shape), moments.padded, moments.mean, moments.variance, outside)
     mean_ssim: Tensor = choose("loss", "auto", *arguments)(*arguments)
     return loss + dssim_weight * (1.0 - mean_ssim)
@@ -168,8 +167,7 @@ class _MeanSsim(torch.autograd.Function):
             # once_differentiable would stay silent: the incoming gradient of a loss is a constant
             raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
         padded, target, by_mean, by_square, by_product = ctx.saved_tensors
-        by_pixel = _blur_adjoint(by_mean)
-        by_pixel.addcmul_(padded, _blur_adjoint(by_square), value=2.0)
+        by_pixel = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
         by_pixel.addcmul_(target, _blur_adjoint(by_product))
         return _fold(by_pixel).mul_(grad / ctx.count), None, None, None, None
 
