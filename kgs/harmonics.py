@@ -4,11 +4,12 @@ Source: P.-P. Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2(2), 2013;
 files of Kerbl et al. 2023.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
 from .full_precision import in_full_precision
-from .types import sh_degree
 
 SH_C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -18,18 +19,7 @@ _C3 += (-0.4570457994644658, 1.445305721320277, -0.5900435899266435)
 
 
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
-    """The (degree + 1)^2 basis functions at unit vectors.
-
-    Convention:
-        `directions` point from the camera to the Gaussian, in world axes.
-
-    Args:
-        directions: unit vectors, `(M, 3)`.
-        degree: 0 to 3.
-
-    Returns:
-        `(M, (degree + 1)^2)`.
-    """
+    """The basis functions of degree 0 to 3 at unit vectors `(M, 3)` from the camera: `(M, (degree + 1)^2)`."""
     x, y, z = directions.unbind(1)
     basis = [torch.full_like(x, SH_C0)]
     if degree >= 1:
@@ -38,15 +28,9 @@ def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
         xx, yy, zz = x * x, y * y, z * z
         basis += [_C2[0] * x * y, _C2[1] * y * z, _C2[2] * (2 * zz - xx - yy), _C2[3] * x * z, _C2[4] * (xx - yy)]
     if degree >= 3:
-        basis += [
-            _C3[0] * y * (3 * xx - yy),
-            _C3[1] * x * y * z,
-            _C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            _C3[4] * x * (4 * zz - xx - yy),
-            _C3[5] * z * (xx - yy),
-            _C3[6] * x * (xx - 3 * yy),
-        ]
+        basis += [_C3[0] * y * (3 * xx - yy), _C3[1] * x * y * z, _C3[2] * y * (4 * zz - xx - yy)]
+        basis += [_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), _C3[4] * x * (4 * zz - xx - yy)]
+        basis += [_C3[5] * z * (xx - yy), _C3[6] * x * (xx - 3 * yy)]
     return torch.stack(basis, 1)
 
 
@@ -55,15 +39,11 @@ def evaluate_harmonics(colors: Tensor, directions: Tensor) -> Tensor:
 
     Args:
         colors: coefficients, `(M, K, 3)` with K = 1, 4, 9 or 16; only these bands are evaluated.
-        directions: unit vectors from the camera to the Gaussians, `(M, 3)`; unused at degree 0.
-
-    Returns:
-        RGB, >= 0, `(M, 3)`.
+        directions: unit vectors from the camera to the Gaussians in world axes, `(M, 3)`; unused for K = 1.
     """
-    degree = sh_degree(colors)
-    if degree == 0:
-        value = SH_C0 * colors[:, 0]
+    if colors.shape[1] == 1:
+        value = SH_C0 * colors[:, 0] + 0.5
     else:
-        value = in_full_precision(torch.bmm, harmonics_basis(directions, degree)[:, None], colors)[:, 0]
-    value = value + 0.5
+        basis = harmonics_basis(directions, math.isqrt(colors.shape[1]) - 1)
+        value = in_full_precision(torch.bmm, basis[:, None], colors)[:, 0] + 0.5
     return value.masked_fill(value < 0, 0.0)  # the gradient of clamp_min at 0 is not that of every torch

@@ -182,7 +182,7 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
     """Unit vectors from the camera to the Gaussians, world axes; the pose may be scaled or sheared."""
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     product = rotation.detach() @ rotation.detach().T
-    turned = bool(((product - torch.eye(3).to(product)).abs() <= 1e-3).all())
+    turned = bool(((product - torch.diag_embed(product.new_ones(3))).abs() <= 1e-3).all())
     inverse = rotation.T if turned else torch.linalg.inv(rotation)
     if lens.parallel and turned:
         return inverse[:, 2].expand_as(means)

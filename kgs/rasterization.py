@@ -10,7 +10,7 @@ from .camera import cameras
 from .projection import project
 from .raster import composite
 from .renderer import blend
-from .types import SH_SIZES, Gaussians, RasterOptions
+from .types import SH_SIZES, Gaussians, RasterOptions, check_tensor
 
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 # what gsplat takes and kgs does not: the value with which it does nothing
@@ -58,6 +58,10 @@ def rasterization(  # noqa: D417 - what does nothing is described together
 
     Differentiable in all tensors, `viewmats` and `Ks` included. For other lenses and outputs see `GaussianRenderer`.
 
+    For near_plane, eps2d, tile_size, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
+    Without effect are packed, channel_chunk and segmented; only at the values with which they do nothing are accepted
+    far_plane (1e10 or more), radius_clip, sparse_grad, absgrad, rasterize_mode, distributed, camera_model, and others.
+
     Convention:
         World-to-camera matrices, OpenCV axes; quaternions w, x, y, z; the first pixel's centre at (0.5, 0.5).
 
@@ -71,14 +75,9 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         Ks: intrinsics in pixels, `(C, 3, 3)`.
         width: of the images in pixels.
         height: of the images in pixels.
-        near_plane, eps2d, tile_size, alpha_threshold, transmittance_stop, max_bytes: see :class:`kgs.RasterOptions`.
-        far_plane: nothing is cut, so 1e10 or more.
         sh_degree: degree 0 to 3 of the harmonics to use; K is at least (sh_degree + 1)^2. None: `colors` as they are.
         backgrounds: `(C, D)`, or None for 0.
         render_mode: "RGB" (the colours), "D" (sum of w z), "ED" (that over alpha), "RGB+D" or "RGB+ED".
-        packed, channel_chunk, segmented: accepted, without effect.
-        radius_clip, sparse_grad, absgrad, rasterize_mode, distributed, camera_model, others: gsplat's, at the values
-            with which they do nothing.
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
         backend: "auto", or the name of one, see `kgs.backends`.
 
@@ -102,8 +101,14 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         >>> renders.shape, alphas.shape, meta["means2d"].tolist()
         (torch.Size([1, 24, 32, 6]), torch.Size([1, 24, 32, 1]), [[16.0, 12.0]])
     """
-    given = {"radius_clip": radius_clip, "sparse_grad": sparse_grad, "absgrad": absgrad, "distributed": distributed}
-    _refuse(given | {"rasterize_mode": rasterize_mode, "camera_model": camera_model} | others)
+    others |= {"radius_clip": radius_clip, "rasterize_mode": rasterize_mode, "camera_model": camera_model}
+    others |= {"sparse_grad": sparse_grad, "absgrad": absgrad, "distributed": distributed}
+    for name, value in others.items():
+        if name not in _HARMLESS:
+            raise TypeError(f"rasterization: got an unexpected argument {name!r}")
+        if isinstance(value, Tensor) or value != _HARMLESS[name]:
+            shown = f"a tensor {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
+            raise ValueError(f"{name}: expected {_HARMLESS[name]!r}, all that kgs supports, got {shown}")
     if not far_plane >= 1e10:
         raise ValueError(f"far_plane: expected 1e10 or more, kgs cuts nothing far away, got {far_plane}")
     if render_mode not in _MODES:
@@ -143,20 +148,9 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     return torch.cat([renders, depths], 1).permute(0, 2, 3, 1), alphas.permute(0, 2, 3, 1), meta
 
 
-def _refuse(given: dict[str, Any]) -> None:
-    """Raise an error that names the argument of gsplat's that asks for what kgs does not do."""
-    for name, value in given.items():
-        if name not in _HARMLESS:
-            raise TypeError(f"rasterization: got an unexpected argument {name!r}")
-        if isinstance(value, Tensor) or value != _HARMLESS[name]:
-            shown = f"a tensor {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
-            raise ValueError(f"{name}: expected {_HARMLESS[name]!r}, all that kgs supports, got {shown}")
-
-
 def _check_colors(colors: Tensor, sh_degree: int | None, count: int, n: int) -> Tensor:
     """The colours, of harmonics those that are used."""
-    if not isinstance(colors, Tensor):
-        raise TypeError(f"colors: expected a torch.Tensor, got {type(colors).__name__}")
+    check_tensor("colors", colors)
     shape = tuple(colors.shape)
     if sh_degree is None:
         if shape[:-1] not in ((n,), (count, n)):

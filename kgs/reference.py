@@ -8,7 +8,7 @@ Forming a covariance squares its condition: footprints up to 1e4 px keep 7 digit
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -19,7 +19,8 @@ from .types import Gaussians
 __all__ = ["Layers", "layers", "render"]
 
 
-class Layers(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Layers:
     """The L Gaussians in front of the camera from front to back, float64.
 
     Args:

@@ -20,6 +20,8 @@ _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 class GaussianRenderer(nn.Module):
     """Render 3D Gaussians with Kornia cameras, differentiable in everything: Gaussians, poses, intrinsics, background.
 
+    For tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
+
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres (a centred image has cx = (W - 1) / 2).
 
@@ -30,7 +32,6 @@ class GaussianRenderer(nn.Module):
 
     Args:
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
-        tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes: see :class:`kgs.RasterOptions`.
         backend: "auto" (the fastest that covers the call) or "torch", see `kgs.backends`.
 
     Raises:
@@ -48,13 +49,11 @@ class GaussianRenderer(nn.Module):
 
         A pose that is optimised: the camera is made in the loop, because a `PinholeCamera` clones what it is given.
 
-        >>> from kornia.geometry.conversions import axis_angle_to_rotation_matrix
         >>> target = kgs.GaussianRenderer()(gaussians, camera).image
-        >>> turn, shift = torch.zeros(1, 3, requires_grad=True), torch.full((1, 3, 1), 0.1, requires_grad=True)
-        >>> optimizer = torch.optim.Adam([turn, shift], lr=0.01)
+        >>> shift = torch.full((3, 1), 0.1, requires_grad=True)
+        >>> optimizer = torch.optim.Adam([shift], lr=0.01)
         >>> for step in range(20):
-        ...     top = torch.cat([axis_angle_to_rotation_matrix(turn), shift], 2)
-        ...     pose = torch.cat([top, torch.tensor([[[0.0, 0.0, 0.0, 1.0]]])], 1)
+        ...     pose = torch.eye(4) + torch.nn.functional.pad(shift, (3, 0, 0, 1))
         ...     image = kgs.GaussianRenderer()(gaussians, kgs.cameras(pose, k, width=32, height=24)).image
         ...     loss = (image - target).square().mean()
         ...     optimizer.zero_grad(); loss.backward(); optimizer.step()
@@ -120,15 +119,10 @@ class GaussianRenderer(nn.Module):
             features["depth"] = projected.depths[:, None]
         if "normal" in outputs:
             features["normal"] = normals(gaussians, cameras, projected)
-        result = composite(
-            projected,
-            torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors,
-            tile_size=self.tile_size,
-            transmittance_stop=self.transmittance_stop,
-            median_depth="median_depth" in outputs,
-            max_bytes=self.max_bytes,
-            **rules,
-        )
+        values = torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors
+        rules |= {"tile_size": self.tile_size, "transmittance_stop": self.transmittance_stop}
+        rules |= {"max_bytes": self.max_bytes, "median_depth": "median_depth" in outputs}
+        result = composite(projected, values, **rules)
         alpha = 1.0 - result.transmittance
         ends = accumulate((x.shape[1] for x in features.values()), initial=0)
         found = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
@@ -146,10 +140,8 @@ class GaussianRenderer(nn.Module):
 
     def extra_repr(self) -> str:
         """What `print` shows."""
-        return (
-            f"tile_size={self.tile_size}, near_plane={self.near_plane:g}, eps2d={self.eps2d:g}, "
-            f"alpha_threshold={self.alpha_threshold:g}, transmittance_stop={self.transmittance_stop:g}"
-        )
+        names = ("tile_size", "near_plane", "eps2d", "alpha_threshold", "transmittance_stop")
+        return ", ".join(f"{name}={getattr(self, name):g}" for name in names)
 
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name: str = "background") -> Tensor:

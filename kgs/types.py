@@ -192,11 +192,6 @@ class Rendering:
     normal: Tensor | None = None
 
 
-def sh_degree(colors: Tensor) -> int:
-    """Degree of harmonics `(N, K, 3)`."""
-    return math.isqrt(colors.shape[1]) - 1
-
-
 def check_tensor(name: str, value: Any, like: Tensor | None = None, whose: str = "") -> None:
     """Raise a TypeError where the argument is no tensor, or not of the dtype and on the device of `like`."""
     if not isinstance(value, Tensor):

@@ -34,7 +34,8 @@ class TargetMoments:
 
     Args:
         padded: the target with its reflected border, `(1, B C, H + 10, W + 10)`.
-        mean, variance: local mean and variance, `(1, B C, H, W)`.
+        mean: local mean, `(1, B C, H, W)`.
+        variance: local variance, `(1, B C, H, W)`.
     """
 
     padded: Tensor

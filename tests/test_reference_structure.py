@@ -258,4 +258,4 @@ def test_nothing_of_the_package_but_its_types_is_used():
     tree = ast.parse(Path(kgs.reference.__file__).read_text(encoding="utf-8"))
     modules = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     modules |= {"." * node.level + str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert modules == {"__future__", "math", "typing", "torch", "kornia.geometry.camera", ".types"}
+    assert modules == {"math", "dataclasses", "torch", "kornia.geometry.camera", ".types"}

@@ -29,14 +29,14 @@ listed nor sorted.
 from torch import Tensor
 
 from kgs.backends import choose, register
-from kgs.types import Composited, ProjectedGaussians, RasterOptions
+from kgs.types import Composited, ProjectedGaussians, RasterOptions, check_tensor
 
 from .torch_passes import composite_torch
 
 register("compositing", "torch", composite_torch)
 
 
-def composite(
+def composite(  # noqa: D417 - options are described in one place
     projected: ProjectedGaussians,
     features: Tensor,
     *,
@@ -51,17 +51,17 @@ def composite(
     """Composite features of projected Gaussians over all pixels of all cameras.
 
     Differentiable once, by `backward`, with respect to `features` and `projected.means2d`, `factors` and `opacities`.
+    For tile_size, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
 
     Args:
         projected: M visible pairs (camera, Gaussian).
         features: what to accumulate, `(M, F)`: colours, depths, anything.
-        tile_size: see `kgs.types.RasterOptions`, as for the next two and `max_bytes`.
-        alpha_threshold: the error is at most the number of layers times it.
-        transmittance_stop: the error is at most it.
         median_depth: also find the depth at which T falls below one half.
-        max_bytes: bound for the working memory.
         chunk_size: entries of a tile per step; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
+
+    Returns:
+        Features `(C, F, H, W)` without background, transmittance and median depth (or None), each `(C, 1, H, W)`.
 
     Raises:
         TypeError: an argument has another type, dtype or device.
@@ -84,19 +84,14 @@ def composite(
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
-    if not isinstance(features, Tensor):
-        raise TypeError(f"features: expected a torch.Tensor, got {type(features).__name__}")
-    count, like = len(projected), projected.means2d
-    if features.ndim != 2 or features.shape[0] != count:
-        raise ValueError(
-            f"features: expected shape ({count}, F), a row per projected Gaussian, got {tuple(features.shape)}"
-        )
+    check_tensor("features", features)
+    shape, like = tuple(features.shape), projected.means2d
+    if len(shape) != 2 or shape[0] != len(like):
+        raise ValueError(f"features: expected shape ({len(like)}, F), a row per projected Gaussian, got {shape}")
     for name, value in (("factors", projected.factors), ("opacities", projected.opacities), ("features", features)):
-        if value.shape[0] != count or (value.dtype, value.device) != (like.dtype, like.device):
-            raise TypeError(
-                f"{name}: expected {count} rows of {like.dtype} on {like.device} as means2d, "
-                f"got {value.shape[0]} of {value.dtype} on {value.device}"
-            )
+        if len(value) != len(like) or (value.dtype, value.device) != (like.dtype, like.device):
+            want, got = (f"{len(x)} rows of {x.dtype} on {x.device}" for x in (like, value))
+            raise TypeError(f"{name}: expected {want} as means2d, got {got}")
     run = choose("compositing", backend, projected, features, options, median_depth, chunk_size)
     result: Composited = run(projected, features, options, median_depth, chunk_size)
     return result
