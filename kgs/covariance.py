@@ -20,37 +20,18 @@ from torch import Tensor
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions of any norm.
+    """Rotation matrices `(N, 3, 3)` of quaternions w, x, y, z of any norm, `(N, 4)`.
 
-    Convention:
-        Order w, x, y, z. The columns are the Gaussian's local axes in the world. The zero quaternion gives the
-        identity with zero gradient.
-
-    Args:
-        quats: shape `(N, 4)`; norms from 1e-30 to 1e30 give the same matrix.
-
-    Returns:
-        Shape `(N, 3, 3)`.
+    The columns are the Gaussian's local axes in the world. The zero quaternion gives the identity with zero gradient.
     """
     peak = quats.detach().abs().amax(-1, keepdim=True)
     return quaternion_to_rotation_matrix(quats / torch.where(peak > 0, peak, 1.0))
 
 
 def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-    """The 2x3 factors M = (J W) R S.
+    """The factors M = (J W) R S `(M, 2, 3)` in pixels; `rows` are J W, from the world point to the pixel, `(M, 2, 3)`.
 
     Differentiable once, in closed form over columns of numbers: products of as many tiny matrices are ten times slower.
-
-    Convention:
-        As in `rotation_matrices`.
-
-    Args:
-        rows: J W, the derivative of the pixel with respect to the world point, `(M, 2, 3)`.
-        quats: `(M, 4)`.
-        scales: `(M, 3)`.
-
-    Returns:
-        `(M, 2, 3)` in pixels.
     """
     factors: Tensor = _FootprintFactors.apply(rows, quats, scales)
     return factors
@@ -93,7 +74,7 @@ class _FootprintFactors(torch.autograd.Function):
 
 
 def columns(rows: Tensor) -> Tensor:
-    """`(M, ...)` as one contiguous column a number, `(numbers, M)`, in memory of its own."""
+    """`(M, ...)` as one contiguous column per number, `(numbers, M)`, in memory of its own."""
     return rows.flatten(1).t().clone(memory_format=torch.contiguous_format)
 
 
@@ -141,14 +122,11 @@ def conics(factors: Tensor, eps2d: float) -> Tensor:
 def whitening(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Two vectors a, b with d^T Sigma'^-1 d = (a . d)^2 + (b . d)^2, as (a_x, a_y, b_x, b_y).
 
-    An LDL^T factorisation with the larger variance as pivot: the form in which the exponent keeps its accuracy
-    for needles.
+    An LDL^T factorisation with the larger variance as pivot: so the exponent keeps its accuracy for needles.
     """
     x_larger = xx >= yy
     pivot = torch.where(x_larger, xx, yy)
-    slope = -xy / pivot
-    along = pivot.rsqrt()
-    across = (pivot / det).sqrt()
+    slope, along, across = -xy / pivot, pivot.rsqrt(), (pivot / det).sqrt()
     zero = torch.zeros_like(along)
     ax, ay = torch.where(x_larger, slope * across, across), torch.where(x_larger, across, slope * across)
     return ax, ay, torch.where(x_larger, along, zero), torch.where(x_larger, zero, along)

@@ -45,13 +45,9 @@ def full_precision(device: torch.device) -> Iterator[None]:
 
 
 def in_full_precision(function: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
-    """`function(*inputs)`, differentiated in full precision as well.
+    """A cheap `function(*inputs)` of tensors to a tensor, differentiated in full precision as well.
 
     Torch's own backward formulas obey what is set when `backward` runs, so the function is called again there.
-
-    Args:
-        function: of tensors alone, to one tensor; cheap.
-        inputs: on one device.
     """
     result: Tensor = _InFullPrecision.apply(function, *inputs)
     return result
@@ -70,10 +66,8 @@ class _InFullPrecision(torch.autograd.Function):
         needed, again = ctx.needs_input_grad[1:], torch.is_grad_enabled()
         with full_precision(grad.device), torch.enable_grad():
             # views of the inputs where second derivatives are wanted: one input may depend on another
-            inputs = [
-                x.view_as(x) if again else x.detach().requires_grad_(n)
-                for x, n in zip(ctx.saved_tensors, needed, strict=True)
-            ]
+            pairs = list(zip(ctx.saved_tensors, needed, strict=True))
+            inputs = [x.view_as(x) if again else x.detach().requires_grad_(n) for x, n in pairs]
             wanted = [x for x, n in zip(inputs, needed, strict=True) if n]
             result = ctx.function(*inputs)
             found = iter([torch.zeros_like(x) for x in wanted])

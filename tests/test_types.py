@@ -12,6 +12,7 @@ from kornia.sensors.camera import CameraModel, CameraModelType
 
 import kgs
 from kgs import Gaussians, PosedCamera
+from kgs.harmonics import evaluate_harmonics
 
 PARAMS = {
     CameraModelType.PINHOLE: 4,

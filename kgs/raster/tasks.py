@@ -16,7 +16,6 @@ from torch import Tensor
 from .tiles import Reach, TileLists
 
 ALPHA_MAX = 0.99
-_STEP_PAIRS = {"cpu": 2**19, "cuda": 2**24}  # Gaussian-pixel pairs of a step: few operator calls, small buffers
 _BUFFERS = 7  # numbers per pair, intermediate values of products included
 _PAIRS_TO_SHARE = 2**22  # from here on a CPU has work for two groups, so for two threads
 
@@ -56,14 +55,10 @@ class Group:
 
 
 class Slice:
-    """The tiles of a row slice with their entries of a depth slice.
+    """The tiles of a row slice with their entries of a depth slice, and the n Gaussians in their lists.
 
-    Args:
-        table: `(10, n + 1)`, see `kgs.covariance.footprint_table`; the last column is a dummy without effect.
-        features: `(n + 1, F)`, the last row 0.
-        depths: `(n + 1,)`, or None where no median depth is wanted.
-        lists: of the tiles.
-        rules: what counts as a layer.
+    `table` is `(10, n + 1)`, see `kgs.covariance.footprint_table`, `features` `(n + 1, F)`, and `depths` `(n + 1,)` or
+    None where no median depth is wanted; the last of each is a dummy without effect.
     """
 
     def __init__(self, table: Tensor, features: Tensor, depths: Tensor | None, lists: TileLists, rules: Rules) -> None:
@@ -105,10 +100,9 @@ class Slice:
         order = order[: int((chunks > 0).sum())]
         counts = chunks[: len(order)].tolist()
         starts, ends = (x.index_select(0, order) for x in (self.lists.offsets[:-1], self.lists.offsets[1:]))
-        device, pairs = self.table.device.type, self.chunk_size * self.pixels
-        step_pairs = self.rules.buffer_bytes // (_BUFFERS * self.table.element_size())
-        most_tiles = max(1, step_pairs // pairs)
-        shared = device == "cpu" and sum(counts) * pairs >= _PAIRS_TO_SHARE
+        pairs = self.chunk_size * self.pixels
+        most_tiles = max(1, self.rules.buffer_bytes // (_BUFFERS * self.table.element_size()) // pairs)
+        shared = self.by_layer and sum(counts) * pairs >= _PAIRS_TO_SHARE
         most_chunks = -(-sum(counts) // 2) if shared else sum(counts)
         groups, begin, work = [], 0, 0
         for i, count in enumerate(counts):
@@ -121,10 +115,12 @@ class Slice:
 
 
 def buffer_bytes(max_bytes: int, like: Tensor) -> int:
-    """What the buffers of one thread may take: all that they want, or a part of the bound where it is tight."""
-    device = like.device.type
-    wanted = _STEP_PAIRS.get(device, 2**24) * _BUFFERS * like.element_size()
-    return min(wanted, max_bytes // (16 if device == "cpu" else 2))
+    """What the buffers of one thread may take: all that they want, or a part of the bound where it is tight.
+
+    A step has as many pairs (Gaussian, pixel) as make few operator calls in small buffers.
+    """
+    step_pairs, share = (2**19, 16) if like.device.type == "cpu" else (2**24, 2)
+    return min(step_pairs * _BUFFERS * like.element_size(), max_bytes // share)
 
 
 def bytes_per_span(dtype: torch.dtype) -> int:

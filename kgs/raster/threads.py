@@ -22,16 +22,12 @@ _pools: dict[int, ThreadPoolExecutor] = {}
 
 
 def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], None]], device: torch.device) -> None:
-    """Call a worker on every item, on as many threads as torch has; items are taken in order; put the longest first.
+    """Call a worker on every item, in order, on as many threads as torch has; one thread where no CPU does the work.
 
-    Args:
-        items: the pieces of work.
-        make_worker: called once per thread; returns the function that does one piece (a place for its buffers).
-        device: where the work runs; on anything but a CPU one thread does it all.
+    `make_worker` is called once per thread and returns the function that does one item (a place for its buffers).
     """
     queue = deque(items)
     threads = torch.get_num_threads() if device.type == "cpu" else 1
-
     inference = torch.is_inference_mode_enabled()
 
     def drain() -> None:

@@ -72,17 +72,10 @@ class Reach:
 
     Memory is proportional to the Gaussians and, at any time, to at most `max_spans` spans.
 
-    Args:
-        projected: what `project` returned.
-        tile_size: side of a tile in pixels.
-        alpha_threshold: alphas below it do not count; with 0 every Gaussian reaches every tile of its camera.
-        max_spans: how many spans there is memory for.
-
     Attributes:
         ids: `(n,)`, rows of `projected` that reach a tile, in depth order; equal depths keep their order.
         total_rows: R, rows of tiles of all cameras.
-        spans_per_row: `(R,)` int64.
-        entries_per_row: `(R,)` int64.
+        spans_per_row, entries_per_row: `(R,)` int64.
         num_spans, num_entries: of all rows.
     """
 
@@ -97,17 +90,15 @@ class Reach:
         xx, xy, yy, det = variances(projected.factors, projected.eps2d)
         reach = (cut.clamp_min(0.0) * yy).sqrt()
         x, y = projected.means2d.unbind(1)
-        top = torch.ceil(y - reach).clamp(0, height)
-        bottom = torch.floor(y + reach).clamp(-1, height - 1)
+        top, bottom = torch.ceil(y - reach).clamp(0, height), torch.floor(y + reach).clamp(-1, height - 1)
         ids = ((cut > 0) & (bottom >= top)).nonzero()[:, 0]
-        ids = ids.index_select(0, torch.sort(projected.depths.index_select(0, ids), stable=True).indices)
-        self.ids = ids
+        self.ids = ids = ids.index_select(0, projected.depths.index_select(0, ids).argsort(stable=True))
         self._camera_row = projected.camera_ids.index_select(0, ids).int().mul_(self.grid[0])
         self._first_row = (top.index_select(0, ids) / tile_size).floor().int()
         self._num_rows = (bottom.index_select(0, ids) / tile_size).floor().int() - self._first_row + 1
         # a column of numbers per Gaussian, gathered once for each row of tiles that it reaches
-        table = torch.stack([x, y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()])
-        table = table.index_select(1, ids)
+        columns = [x, y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()]
+        table = torch.stack(columns).index_select(1, ids)
         self._table = torch.where(table.isfinite(), table, torch.inf)
         self._count(max_spans)
 
@@ -132,18 +123,13 @@ class Reach:
         self._entries_up_to = torch.cat(up_to) if len(up_to) > 1 else up_to[0]
 
     def row_slices(self, max_bytes: int, per_span: int, per_entry: int) -> list[tuple[int, int]]:
-        """Consecutive rows whose spans and entries take at most `max_bytes` together.
-
-        Raises:
-            ValueError: one row of tiles alone takes more.
-        """
+        """Consecutive rows whose spans and entries take at most `max_bytes` together; an error where one takes more."""
         slices, begin, total = [], 0, 0
         for row, need in enumerate((self.spans_per_row * per_span + self.entries_per_row * per_entry).tolist()):
             if need > max_bytes:
-                raise ValueError(
-                    f"max_bytes: one row of tiles needs {need} bytes, expected at least that, got {max_bytes} for it; "
-                    "raise max_bytes, or render fewer or smaller Gaussians"
-                )
+                got = f"expected at least that, got {max_bytes} for it"
+                ways = "raise max_bytes, or render fewer or smaller Gaussians"
+                raise ValueError(f"max_bytes: one row of tiles needs {need} bytes, {got}; {ways}")
             if total + need > max_bytes:
                 slices.append((begin, row))
                 begin, total = row, 0
@@ -192,14 +178,9 @@ class Reach:
     def lists(
         self, spans: Spans, begin: int, end: int, ranks: tuple[int, int] | None = None, live: Tensor | None = None
     ) -> TileLists:
-        """The lists of the tiles in a row slice.
+        """The lists of the tiles in the rows `begin` to `end`, whose spans are given.
 
-        Args:
-            spans: those of the row slice.
-            begin: first row of tiles.
-            end: one past the last row.
-            ranks: the depth slice, a range of `ids`; None: all.
-            live: which of these tiles want a list, `(T,)`; None: all.
+        They hold a depth slice, the range `ranks` of `ids`, or all; those of the tiles that are not `live` are empty.
         """
         low, high = ranks or (0, self.ids.shape[0])
         if (low, high) != (0, self.ids.shape[0]):
@@ -232,7 +213,7 @@ def bin_to_tiles(
     tile_size: int = RasterOptions.tile_size,
     alpha_threshold: float = RasterOptions.alpha_threshold,
 ) -> TileLists:
-    """The lists of all tiles of all cameras at once; see `Reach`. A Gaussian of opacity 0 is in none."""
+    """The lists of all tiles of all cameras at once, see `Reach`."""
     reach = Reach(projected, tile_size, alpha_threshold)
     return reach.lists(reach.spans(0, reach.total_rows), 0, reach.total_rows)
 

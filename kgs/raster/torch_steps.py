@@ -47,9 +47,8 @@ class _Worker:
         part = self.part
         table = part.table.index_select(1, ids)
         ux, uy = self.offsets(table[1:3], tiles)
-        ax, ay, bx, by = table[6], table[7], table[8], table[9]
-        va = torch.mul(ax, ux).addcmul_(ay, uy)
-        vb = torch.mul(bx, ux).addcmul_(by, uy)
+        ax, ay, bx, by = table[6:]
+        va, vb = torch.mul(ax, ux).addcmul_(ay, uy), torch.mul(bx, ux).addcmul_(by, uy)
         table[0].addcmul_(va, va, value=-0.5).addcmul_(vb, vb, value=-0.5)
         torch.mul(ax, va, out=table[1]).addcmul_(bx, vb)
         torch.mul(ay, va, out=table[2]).addcmul_(by, vb)
@@ -86,10 +85,9 @@ class Forward(_Worker):
         """Composite a group."""
         part, size = self.part, self.part.chunk_size
         tiles, starts, ends, chunks = group.tiles, group.starts, group.ends, group.chunks
-        state = tuple(output.index_select(0, tiles) for output in self.outputs)
+        state = [output.index_select(0, tiles) for output in self.outputs]
         rows: Tensor | None = None
-        group.steps = []
-        n, j = len(chunks), 0
+        group.steps, n, j = [], len(chunks), 0
         while chunks[0] > j:
             while chunks[n - 1] <= j:
                 n -= 1
@@ -119,30 +117,24 @@ class Forward(_Worker):
                     break
                 if len(kept) < _LIVE_SHARE * n:
                     self._write(tiles, state)
-                    tiles, starts, ends = (x.index_select(0, kept) for x in (tiles, starts, ends))
-                    state = tuple(x.index_select(0, kept) for x in state)
+                    tiles, starts, ends, *state = (x.index_select(0, kept) for x in (tiles, starts, ends, *state))
                     rows = kept if rows is None else rows.index_select(0, kept)
                     chunks = [chunks[i] for i in kept.tolist()]
                     n = len(chunks)
             j += 1
         self._write(tiles, state)
 
-    def _write(self, tiles: Tensor, state: tuple[Tensor, ...]) -> None:
+    def _write(self, tiles: Tensor, state: list[Tensor]) -> None:
         for output, value in zip(self.outputs, state, strict=True):
             output.index_copy_(0, tiles, value)
 
 
 class Backward(_Worker):
-    """Takes the kept steps of a group from back to front and writes the gradients of their entries.
+    """Takes the kept steps of a group from back to front and writes the gradients of their entries to `rows`.
 
-    Args:
-        part: with the steps of its forward pass.
-        grads: dL/d sums, `(T, F, P)`.
-        behind: V behind the last layer, `(T, 1, P)`; becomes V before the first.
-        rows: one per entry, and a last one that takes what is thrown away; six moments where `moments` and F numbers
-            where `features`.
-        moments: whether geometry or opacities want a gradient.
-        features: whether the features want one.
+    There is one row per entry, and a last one that takes what is thrown away: six moments where `moments`, for geometry
+    and opacities, and F numbers where `features`. `grads` are dL/d sums, `(T, F, P)`; `behind` is V behind the last
+    layer, `(T, 1, P)`, and becomes V before the first.
     """
 
     def __init__(self, part: Slice, grads: Tensor, behind: Tensor, rows: Tensor, moments: bool, features: bool) -> None:
@@ -155,13 +147,13 @@ class Backward(_Worker):
         grads = self.grads.index_select(0, group.tiles)
         behind = self.behind.index_select(0, group.tiles)[:, 0]
         for step in reversed(group.steps):
+            columns = (group.tiles, group.starts, group.ends, grads, behind)
             if step.rows is None:
-                tiles, starts, ends = (x[: step.count] for x in (group.tiles, group.starts, group.ends))
-                self._step(step, tiles, starts, ends, grads[: step.count], behind[: step.count])
+                self._step(step, *(x[: step.count] for x in columns))
             else:
-                rows, columns = step.rows[: step.count], (group.tiles, group.starts, group.ends, grads, behind)
-                tiles, starts, ends, g, later = (x.index_select(0, rows) for x in columns)
-                self._step(step, tiles, starts, ends, g, later)
+                rows = step.rows[: step.count]
+                *before, later = (x.index_select(0, rows) for x in columns)
+                self._step(step, *before, later)
                 behind.index_copy_(0, rows, later)
         self.behind.index_copy_(0, group.tiles, behind[:, None])
 
@@ -169,11 +161,10 @@ class Backward(_Worker):
         """Gradients of one step; `behind` becomes V before the step, see `kgs.raster`."""
         part, n, size = self.part, step.count, self.part.chunk_size
         positions, beyond, ids = self.entries(starts, ends, step.chunk)
+        alpha = self.buffer(1, size, n) if step.alpha is None else step.alpha
         if step.alpha is None:
-            alpha = self.buffer(1, size, n)
             ux, uy = self.evaluate(ids, tiles, alpha)
         else:
-            alpha = step.alpha
             ux, uy = self.offsets(part.table[1:3].index_select(1, ids), tiles)
         light = self.scan(alpha, step.transmittance)
         if step.ended:
@@ -220,8 +211,7 @@ class Backward(_Worker):
 def _about_centre(moments: Tensor, ux: Tensor, uy: Tensor) -> Tensor:
     """Moments 1, x, y, xx, xy, yy about the tile's centre, in place to those about the Gaussian's."""
     m0, mx, my, mxx, mxy, myy = moments
-    sx = torch.addcmul(mx, ux, m0, value=-1)
-    sy = torch.addcmul(my, uy, m0, value=-1)
+    sx, sy = torch.addcmul(mx, ux, m0, value=-1), torch.addcmul(my, uy, m0, value=-1)
     mxx.addcmul_(ux, mx.add_(sx), value=-1)
     mxy.addcmul_(ux, my, value=-1).addcmul_(uy, sx, value=-1)
     myy.addcmul_(uy, my.add_(sy), value=-1)
