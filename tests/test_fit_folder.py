@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,11 +34,27 @@ def scene() -> Any:
     return synthetic_scene(train_views=3, test_views=2, size=(24, 32), seed=0)
 
 
-@pytest.fixture(autouse=True)
-def _few_points(monkeypatch: Any) -> None:
+@pytest.fixture(scope="module", autouse=True)
+def _few_points() -> Any:
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     first = FirstPoints(points, torch.full((150, 3), 0.5), "random")
-    monkeypatch.setattr(run, "choose_points", lambda *_: first)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "choose_points", lambda *_: first)
+        yield
+
+
+@pytest.fixture(scope="module")
+def first_fit(scene: Any, tmp_path_factory: Any) -> Path:
+    out: Path = tmp_path_factory.mktemp("first")
+    fit(scene, CONFIG, out)
+    return out
+
+
+@pytest.fixture
+def done(first_fit: Path, tmp_path: Path) -> Path:
+    """A folder with the finished fit of CONFIG, for this test alone."""
+    shutil.copytree(first_fit, tmp_path, dirs_exist_ok=True)
+    return tmp_path
 
 
 def fit(scene: Any, config: FitConfig, out: Path, **options: Any) -> list[str]:
@@ -80,21 +97,19 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
         pass
 
 
-def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    fit(scene, CONFIG, tmp_path)
-    before = contents(tmp_path)
+def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkeypatch: Any) -> None:
+    before = contents(done)
     monkeypatch.setattr("kgs.fit.trainer.gradient_fault", lambda model: "expected finite gradients")
     with pytest.raises(TrainingDiverged, match="step 1.*no checkpoint yet"):
-        fit(scene, OTHER, tmp_path)
-    assert contents(tmp_path) == before
-    assert "unfinished" not in os.listdir(tmp_path)
+        fit(scene, OTHER, done)
+    assert contents(done) == before
+    assert "unfinished" not in os.listdir(done)
 
 
 @pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json"])
 def test_results_that_cannot_be_written_leave_the_old_ones(
-    scene: Any, tmp_path: Path, monkeypatch: Any, failing: str
+    scene: Any, done: Path, monkeypatch: Any, failing: str
 ) -> None:
-    fit(scene, CONFIG, tmp_path)
     plain = getattr(run, failing)
 
     def full(path: Any, *arguments: Any, **options: Any) -> Any:
@@ -104,17 +119,16 @@ def test_results_that_cannot_be_written_leave_the_old_ones(
 
     monkeypatch.setattr(run, failing, full)
     with pytest.raises(OSError, match="space"):
-        fit(scene, OTHER, tmp_path)
-    assert seed_of(tmp_path) == 0
+        fit(scene, OTHER, done)
+    assert seed_of(done) == 0
     monkeypatch.undo()
-    assert fit(scene, OTHER, tmp_path, resume=True)[0] == "resumed at step 3"  # the training is not lost
-    assert seed_of(tmp_path) == 1
+    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 3"  # the training is not lost
+    assert seed_of(done) == 1
 
 
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
-def test_a_kill_while_files_are_moved(scene: Any, tmp_path: Path, monkeypatch: Any, moves: int) -> None:
-    fit(scene, CONFIG, tmp_path)
-    (tmp_path / "finished").mkdir()  # half removed
+def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, moves: int) -> None:
+    (done / "finished").mkdir()  # half removed
     plain, done = os.replace, []
 
     def killed(source: Any, target: Any) -> None:
@@ -126,22 +140,21 @@ def test_a_kill_while_files_are_moved(scene: Any, tmp_path: Path, monkeypatch: A
 
     monkeypatch.setattr(folder.os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
-        fit(scene, OTHER, tmp_path)
+        fit(scene, OTHER, done)
     monkeypatch.undo()
-    load_fit(tmp_path)  # ends the move
-    assert seed_of(tmp_path) == (0 if moves == 0 else 1)
-    assert not (tmp_path / "finished").exists()
+    load_fit(done)  # ends the move
+    assert seed_of(done) == (0 if moves == 0 else 1)
+    assert not (done / "finished").exists()
 
 
-def test_no_pictures_or_checkpoints_of_the_former_fit_stay(scene: Any, tmp_path: Path) -> None:
-    fit(scene, CONFIG, tmp_path)
-    (tmp_path / "checkpoint.pt").write_bytes(b"kgs-checkpoint 2 ")
-    (tmp_path / "test" / "notes.txt").write_text("mine")
-    fit(replace(scene, test=scene.test.select([1])), OTHER, tmp_path)
-    assert len(list((tmp_path / "test").glob("*.png"))) == 1
-    assert (tmp_path / "test" / "notes.txt").exists()
-    assert not (tmp_path / "checkpoint.pt").exists()
-    assert seed_of(tmp_path) == 1
+def test_no_pictures_or_checkpoints_of_the_former_fit_stay(scene: Any, done: Path) -> None:
+    (done / "checkpoint.pt").write_bytes(b"kgs-checkpoint 2 ")
+    (done / "test" / "notes.txt").write_text("mine")
+    fit(replace(scene, test=scene.test.select([1])), OTHER, done)
+    assert len(list((done / "test").glob("*.png"))) == 1
+    assert (done / "test" / "notes.txt").exists()
+    assert not (done / "checkpoint.pt").exists()
+    assert seed_of(done) == 1
 
 
 def test_an_old_checkpoint_is_refused_in_one_line(scene: Any, tmp_path: Path) -> None:
@@ -150,8 +163,7 @@ def test_an_old_checkpoint_is_refused_in_one_line(scene: Any, tmp_path: Path) ->
         fit(scene, CONFIG, tmp_path, resume=True)
 
 
-def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    fit(scene, CONFIG, tmp_path)
+def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:
     plain = Trainer._descend
 
     def interrupted(self: Trainer) -> float:
@@ -160,25 +172,24 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, tmp_p
         return plain(self)
 
     monkeypatch.setattr(Trainer, "_descend", interrupted)
-    lines = fit(scene, OTHER, tmp_path)
-    assert f"{tmp_path} keeps its finished fit" in lines[-1]
-    assert seed_of(tmp_path) == 0
-    assert seed_of(tmp_path / UNFINISHED) == 1
+    lines = fit(scene, OTHER, done)
+    assert f"{done} keeps its finished fit" in lines[-1]
+    assert seed_of(done) == 0
+    assert seed_of(done / UNFINISHED) == 1
     monkeypatch.undo()
-    assert fit(scene, OTHER, tmp_path, resume=True)[0] == "resumed at step 2"
-    assert seed_of(tmp_path) == 1
-    assert not (tmp_path / UNFINISHED).exists()
+    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 2"
+    assert seed_of(done) == 1
+    assert not (done / UNFINISHED).exists()
 
 
-def test_the_finished_fit_is_resumed_where_another_was_left_unfinished(scene: Any, tmp_path: Path) -> None:
-    fit(scene, CONFIG, tmp_path)
+def test_the_finished_fit_is_resumed_where_another_was_left_unfinished(scene: Any, done: Path) -> None:
     unfinished = Trainer(scene, OTHER, run.choose_points(scene, OTHER))
-    (tmp_path / UNFINISHED).mkdir()
-    unfinished.save(tmp_path / UNFINISHED / CHECKPOINT)
-    lines = fit(scene, replace(CONFIG, steps=5), tmp_path, resume=True)
+    (done / UNFINISHED).mkdir()
+    unfinished.save(done / UNFINISHED / CHECKPOINT)
+    lines = fit(scene, replace(CONFIG, steps=5), done, resume=True)
     assert lines[0] == "resumed at step 3"
     assert "trained on from step 3" in lines[1]
-    assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 5
+    assert json.loads((done / "metrics.json").read_text())["steps"] == 5
 
 
 @pytest.mark.parametrize("place", ["file", "file/out", "/proc/kgs"])
@@ -211,9 +222,8 @@ def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -
     assert not (tmp_path / "out").exists()
 
 
-def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, tmp_path: Path) -> None:
-    fit(scene, CONFIG, tmp_path)
-    saved, trainer = load_fit(tmp_path), Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT)
+def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
+    saved, trainer = load_fit(done), Trainer.resume(scene, CONFIG, done / CHECKPOINT)
     assert (saved.config, saved.step, saved.request["scene"]) == (CONFIG, 3, "/photos")
     camera = scene.test.camera(0)
     assert torch.equal(saved.render(camera, scene.background), trainer.render(camera))

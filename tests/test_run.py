@@ -21,7 +21,7 @@ from kgs.fit.run import CHECKPOINT, fit_scene, train
 from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
 
-CONFIG = FitConfig(steps=24, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
+CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path:
     assert (metrics["steps"], stopped_by) == (10, signal.SIGTERM)
     assert (tmp_path / "cut" / "splat.ply").is_file()
     metrics, stopped_by = fit_scene(scene, CONFIG, tmp_path / "cut", resume=True, say=lambda line: None)
-    assert (metrics["steps"], stopped_by) == (24, 0)
+    assert (metrics["steps"], stopped_by) == (12, 0)
     assert (tmp_path / "cut" / "splat.ply").read_bytes() == (tmp_path / "whole" / "splat.ply").read_bytes()
 
 
@@ -97,19 +97,19 @@ def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
     plain, failed = os.fsync, []
 
     def full(descriptor: int) -> None:
-        if trainer.step in (12, 18):
+        if trainer.step in (6, 9):
             failed.append(trainer.step)
             raise OSError(28, "No space left on device")
         plain(descriptor)
 
     monkeypatch.setattr("os.fsync", full)
     assert train(trainer, tmp_path / CHECKPOINT) == 0
-    assert failed == [12, 18]
+    assert failed == [6, 9]
     notes = [note for note in trainer.notes if "no checkpoint" in note]
     assert len(notes) == 2
-    assert "step 12" in notes[0]
+    assert "step 6" in notes[0]
     assert CHECKPOINT in notes[0]
-    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 24
+    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 12
     assert sorted(p.name for p in tmp_path.iterdir()) == [previous(Path(CHECKPOINT)).name, CHECKPOINT]
 
 
@@ -119,7 +119,7 @@ def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Pa
     plain = trainer.save
     monkeypatch.setattr(trainer, "save", lambda path: (saved.append(trainer.step), plain(path)))
     train(trainer, tmp_path / CHECKPOINT)
-    assert saved == [*range(1, 25), 24]
+    assert saved == [*range(1, 13), 12]
 
 
 def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, tmp_path: Path) -> None:
@@ -138,8 +138,9 @@ def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, t
 
 
 def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) -> None:
-    fit_scene(scene, CONFIG, tmp_path, say=lambda line: None)
-    fit_scene(scene, replace(CONFIG, seed=1), tmp_path, say=lambda line: None)
+    short = replace(CONFIG, steps=2)
+    fit_scene(scene, short, tmp_path, say=lambda line: None)
+    fit_scene(scene, replace(short, seed=1), tmp_path, say=lambda line: None)
     assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
 
 
@@ -156,7 +157,7 @@ def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> 
         assert train(trainer, tmp_path / CHECKPOINT) == 0
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert trainer.step == 24
+    assert trainer.step == 12
 
 
 def test_nobody_has_to_listen(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:

@@ -14,7 +14,7 @@ from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.trainer import Trainer
 
-CONFIG = FitConfig(steps=60, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
+CONFIG = FitConfig(steps=30, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
 
 
 def parameters(trainer):
@@ -39,7 +39,7 @@ def whole(scene, points):
 
 def test_it_learns(whole, scene):
     curve = whole.curve
-    assert [point["step"] for point in curve] == [20, 40, 60]
+    assert [point["step"] for point in curve] == [10, 20, 30]
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"] + 1
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
 
@@ -65,9 +65,9 @@ def test_with_and_without_drop_see_the_same_views(scene, points):
     assert orders[0] == orders[1]
 
 
-@pytest.mark.parametrize("at", [1, 20, 31, 59], ids=["first", "densify", "mid-epoch", "last"])
+@pytest.mark.parametrize("at", [1, 10, 16, 29], ids=["first", "densify", "mid-epoch", "last"])
 def test_resumed_is_bit_identical(whole, scene, points, tmp_path, at):
-    if at == 20:
+    if at == 10:
         assert at in whole.times.densify
     first = Trainer(scene, CONFIG, points)
     first.fit(lambda trainer, _: trainer.step == at)
@@ -122,7 +122,7 @@ def test_the_number_may_grow_evenly(scene, points):
     counts = []
     trainer = Trainer(scene, config, points)
     trainer.fit(lambda trainer, _: counts.append(len(trainer.model)))
-    assert all(count <= 150 + 10 * step for step, count in enumerate(counts, 1))
+    assert all(count <= 150 + 20 * step for step, count in enumerate(counts, 1))
     assert 300 < max(counts) <= 450
     at_once = fitted(scene, points, replace(config, growth=0.0))
     assert len(at_once.model) >= len(trainer.model)
@@ -177,7 +177,7 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
     rates = {
         name: factor * getattr(CONFIG.recipe, name) for name in ("lr_means", "lr_scales", "lr_opacity", "lr_quats")
     }
-    trainer = Trainer(scene, replace(CONFIG, steps=90, recipe=replace(CONFIG.recipe, **rates)), points)
+    trainer = Trainer(scene, replace(CONFIG, steps=45, recipe=replace(CONFIG.recipe, **rates)), points)
     with contextlib.suppress(TrainingDiverged):
         trainer.fit()
     assert all(torch.isfinite(value).all() for value in parameters(trainer).values())
@@ -197,10 +197,10 @@ def test_a_dropped_layer_is_absent_at_rate_zero(scene, points):
 
 
 def test_the_rate_follows_the_papers_schedule(scene, points):
-    trainer = Trainer(scene, CONFIG, points)
+    trainer = Trainer(scene, replace(CONFIG, steps=12), points)
     rates = []
     trainer.fit(lambda trainer, _: rates.append(trainer.drop.rate))
-    assert rates == pytest.approx([0.3 * step / 60 for step in range(1, 61)])
+    assert rates == pytest.approx([0.3 * step / 12 for step in range(1, 13)])
 
 
 def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path):
@@ -208,8 +208,8 @@ def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path)
     trainer = Trainer(scene, config, points)
     sizes = []
     trainer.renderer.register_forward_hook(lambda *args: sizes.append(tuple(args[2].image.shape[-2:])))
-    trainer.fit(lambda trainer, _: trainer.step == 30)
-    assert set(sizes[:19]) == {(16, 20)}  # up to the first evaluation, after 20 steps
+    trainer.fit(lambda trainer, _: trainer.step == 15)
+    assert set(sizes[:9]) == {(16, 20)}  # up to the first evaluation, after 10 steps
     trainer.save(tmp_path / "half.safetensors")
     resumed = Trainer.resume(scene, config, tmp_path / "half.safetensors")
     trainer.fit()

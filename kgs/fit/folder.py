@@ -73,7 +73,7 @@ def publish(out: Path) -> None:
 
 
 def end_move(out: Path) -> None:
-    """Within `locked`, end a move that a kill may have stopped: what is left goes to its place, and what belonged to the result before goes away."""
+    """Within `locked`: what is left of a move goes to its place, what belonged to the former result goes away."""
     done = out / _FINISHED
     if not (done / _LIST).exists():
         return
