@@ -129,12 +129,12 @@ def test_results_that_cannot_be_written_leave_the_old_ones(
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
 def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, moves: int) -> None:
     (done / "finished").mkdir()  # half removed
-    plain, done = os.replace, []
+    plain, calls = os.replace, []
 
     def killed(source: Any, target: Any) -> None:
-        if Path(source).name == UNFINISHED or done:
-            done.append(source)
-        if len(done) > moves:
+        if Path(source).name == UNFINISHED or calls:
+            calls.append(source)
+        if len(calls) > moves:
             raise KeyboardInterrupt
         plain(source, target)
 

@@ -33,13 +33,10 @@ def previous(path: Path) -> Path:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write tensors and plain values; the file that was there becomes the previous one.
+    """Write nested dicts, with text as keys, of tensors and of what JSON knows.
 
-    Whenever the process dies, `newest_checkpoint` finds the old or the new state.
-
-    Args:
-        path: the file.
-        state: nested dicts, with text as keys, of tensors and of what JSON knows.
+    The file that was there becomes the previous one. Whenever the process dies, `newest_checkpoint` finds the old or
+    the new state.
 
     Raises:
         OSError: the file cannot be written; those that were there are untouched.
@@ -48,8 +45,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
-    metadata = {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)}
-    content = safetensors.torch.save(tensors, metadata)
+    content = safetensors.torch.save(tensors, {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)})
     temporary = path.with_name(path.name + ".partial")
     try:
         with open(temporary, "wb") as file:
@@ -67,10 +63,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
-    """The newest state that verifies: that at `path`, else the previous one.
-
-    Returns:
-        The state, and what is wrong with the newer file: "" where nothing is.
+    """The newest state that verifies, that at `path` or the previous one, and what is wrong with the newer file or "".
 
     Raises:
         DataError: neither verifies; it is about the file at `path`.
@@ -137,10 +130,9 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
 
 
 def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
-    """Make sure that a state belongs to the fit of this fingerprint and configuration, and can be used.
+    """Make sure that a state can be used and belongs to the fit of this fingerprint and configuration.
 
-    Returns:
-        Notes for the user: what it means that the fit goes on for more steps than it was begun with, if it does.
+    Returns what the user should know where the fit goes on for more steps than it was begun with.
 
     Raises:
         KeyError, TypeError, ValueError: an entry is missing or wrong, or the scene or the configuration is another.

@@ -153,11 +153,7 @@ class FitConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """The inverse of `to_dict`.
-
-        Raises:
-            ValueError: an entry is unknown or out of range.
-        """
+        """The inverse of `to_dict`; ValueError where an entry is unknown or out of range."""
         try:
             return cls(**{**values, "recipe": Recipe(**values.get("recipe", {}))})
         except (AttributeError, TypeError) as error:
@@ -185,15 +181,12 @@ def timetable(config: FitConfig) -> Timetable:
     scale = steps / recipe.steps
     interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
     spacing = max(1, round(recipe.reset_interval * scale))
+    resets, evaluations = [*range(spacing, steps, spacing), steps], range(1, config.evaluations + 1)
     return Timetable(
         sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, config.sh_degree + 1)),
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
-        reset=tuple(
-            s for s, then in pairwise([*range(spacing, steps, spacing), steps]) if then - s >= recipe.reset_recovery
-        ),
-        evaluate=tuple(
-            sorted({max(1, round(steps * k / config.evaluations)) for k in range(1, config.evaluations + 1)})
-        ),
+        reset=tuple(s for s, then in pairwise(resets) if then - s >= recipe.reset_recovery),
+        evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
         coarse=round(config.coarse * steps),
     )
 
@@ -225,21 +218,11 @@ def _plain(value: Any, hint: Any) -> tuple[Any, str]:
 
 # A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps at twice the
 # rates, nine in ten of them on a quarter of the pixels, and Gaussians that come as they are needed.
-FAST = FitConfig(
-    steps=1000,
-    coarse=0.9,
-    max_gaussians=14_000,
-    growth=0.8,
-    recipe=Recipe(lr_means=3e-4, lr_scales=0.01, lr_sh_dc=0.005, lr_sh_rest=2.5e-4),
-)
+_FAST_RECIPE = Recipe(lr_means=3e-4, lr_scales=0.01, lr_sh_dc=0.005, lr_sh_rest=2.5e-4)
+FAST = FitConfig(steps=1000, coarse=0.9, max_gaussians=14_000, growth=0.8, recipe=_FAST_RECIPE)
 
 # Small pictures, many Gaussians and raised rates: a minute is then enough to overfit, which is what is to be shown.
-DEMO = FitConfig(
-    steps=1200,
-    drop=0.2,
-    init="sift",
-    max_gaussians=3000,
-    recipe=Recipe(
-        lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4
-    ),
+_DEMO_RECIPE = Recipe(
+    lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4
 )
+DEMO = FitConfig(steps=1200, drop=0.2, init="sift", max_gaussians=3000, recipe=_DEMO_RECIPE)

@@ -21,10 +21,7 @@ def parameter_fault(model: GaussianModel) -> str:
 
 
 def gradient_fault(model: GaussianModel) -> str:
-    """The first gradient whose square is not finite; "" where there is none.
-
-    Adam keeps the square of a gradient: one above 1e19 would freeze its parameter for ever.
-    """
+    """The first gradient whose square, which Adam keeps, is not finite (from 1e19 on); "" where there is none."""
     for name, parameter in model.named_parameters():
         if parameter.grad is not None and not math.isfinite(float(parameter.grad.square().sum())):
             row = _first_row(parameter.grad.square())

@@ -35,11 +35,7 @@ _OPTIONAL = (previous(Path(CHECKPOINT)).name, "checkpoint.pt", "checkpoint.previ
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Keep other fits out of a folder until the block or the process ends, however it ends.
-
-    Raises:
-        DataError: another fit is at work in the folder.
-    """
+    """Keep other fits out of a folder until the block or the process ends; DataError where one is at work there."""
     with open(out / ".lock", "ab") as file:
         try:
             if sys.platform == "win32":
@@ -60,11 +56,7 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def publish(out: Path) -> None:
-    """Put the results in `unfinished` in the place of those of a former fit.
-
-    Raises:
-        OSError: a file cannot be moved; what is missing is moved by the next `end_move`.
-    """
+    """Put the results in `unfinished` in the place of a former fit's; what fails to move, the next `end_move` moves."""
     new = out / UNFINISHED
     write_json(new / _LIST, {"files": _results(new)})
     shutil.rmtree(out / _FINISHED, ignore_errors=True)

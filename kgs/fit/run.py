@@ -179,7 +179,6 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
 
     Raises:
         DataError: the scene has no points of its own, or the file has none.
-        ValueError: an unknown kind.
     """
     kind = config.init
     if kind in ("scene", "model-points"):
@@ -194,11 +193,8 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
     """Train to the end with a progress line and checkpoints, each minute and at evaluations.
 
-    On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved. A checkpoint that cannot be written (a full disk) stops
-    nothing: a note says so, and the next one is tried.
-
-    Returns:
-        The number of the signal that stopped it, 0 for none.
+    On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved, and the signal's number returned, else 0. A checkpoint
+    that cannot be written (a full disk) stops nothing: a note says so, and the next one is tried.
     """
     saved = time.monotonic()
 

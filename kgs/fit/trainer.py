@@ -47,9 +47,8 @@ class Trainer:
     Attributes:
         model: the Gaussians.
         renderer: with the drop layer inside; `eval()` mode renders all Gaussians.
-        step: how many steps are done.
-        curve: dicts of step, seconds of training, test_psnr and train_psnr.
-        seconds: time spent in training steps; evaluations are not counted.
+        step, seconds: the steps that are done and the time they took, evaluations not counted.
+        curve: dicts of step, seconds, test_psnr and train_psnr.
         notes: lines that a user should read (a capped count, for instance).
         saved: the last checkpoint that was written or read, in words; "" before the first.
         init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
@@ -99,27 +98,23 @@ class Trainer:
 
     def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
         """What a step needs of each view: its camera, its image and what D-SSIM wants of that."""
-        images = [views.images[i : i + 1].to(self.device, torch.float32) for i in range(len(views))]
-        cameras = (move_camera(views.camera(i), self.device) for i in range(len(views)))
+        images = [image[None].to(self.device, torch.float32) for image in views.images]
+        cameras = [move_camera(views.camera(i), self.device) for i in range(len(views))]
         return [(camera, image, target_moments(image)) for camera, image in zip(cameras, images, strict=True)]
 
     @property
     def most_bytes(self) -> int:
-        """A bound for the memory that the fit takes beyond what there is now, known before it begins.
+        """A bound for the memory in bytes that the fit takes beyond what there is now, known before it begins.
 
         The renderer's budget, and for each Gaussian of the largest number the parameters, gradients, Adam's moments,
         their copies while densifying, and what projection and harmonics keep for their backward passes.
         """
-        images, gaussians = self.scene.train.images, self.max_gaussians * _BYTES_PER_GAUSSIAN
-        loss = images[:1].nbytes * _IMAGES_OF_THE_LOSS
-        return _BYTES_AT_FIRST_USE + self.config.max_bytes + gaussians + loss + 4 * images.nbytes
+        images = self.scene.train.images
+        pictures = images[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * images.nbytes
+        return _BYTES_AT_FIRST_USE + self.config.max_bytes + self.max_gaussians * _BYTES_PER_GAUSSIAN + pictures
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
-        """Train to the end.
-
-        Args:
-            callback: called after each step with the trainer and the loss; training stops, in a valid state, when it
-                returns True.
+        """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
 
         Raises:
             TrainingDiverged: a loss, gradient or parameter is not finite, or a scale explodes; no parameter has been
@@ -169,8 +164,8 @@ class Trainer:
 
     def psnr(self, views: Views) -> float | None:
         """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
-        renders = (self.render(views.camera(i)).clamp(0, 1).cpu() for i in range(len(views)))
-        values = [float(psnr(image, views.images[i : i + 1].float(), 1.0)) for i, image in enumerate(renders)]
+        renders = (self.render(views.camera(i))[0].clamp(0, 1).cpu() for i in range(len(views)))
+        values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
         mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
         return round(mean, 4) if math.isfinite(mean) else None
 
@@ -216,11 +211,7 @@ class Trainer:
             raise ValueError(f"state: {error}") from error
 
     def save(self, path: Path) -> None:
-        """Write :meth:`state_dict` to a file, see :func:`save_checkpoint`.
-
-        Raises:
-            OSError: the file cannot be written; earlier ones are untouched.
-        """
+        """Write :meth:`state_dict` to a file; OSError where it cannot be written, and earlier ones are untouched."""
         save_checkpoint(path, self.state_dict())
         self.saved = f"{path} of step {self.step}"
 
