@@ -84,8 +84,7 @@ class GaussianModel(nn.Module):
 
         Raises:
             TypeError: `points` is not float32 or float64, or `colors` is not floating point.
-            ValueError: shapes do not fit, there are fewer than 4 points, one is not finite, all coincide, or
-                `sh_degree` is out of range.
+            ValueError: shapes do not fit, points are fewer than 4, not finite or all one, or `sh_degree` is no degree.
         """
         if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"points: expected float32 or float64, got {getattr(points, 'dtype', type(points))}")
@@ -95,7 +94,7 @@ class GaussianModel(nn.Module):
             shapes = f"{tuple(points.shape)} and {tuple(colors.shape)}"
             raise ValueError(f"points, colors: expected two of shape (N, 3), got {shapes}")
         for name, value in (("points", points), ("colors", colors)):
-            if not bool(torch.isfinite(value).all()):
+            if not bool(value.isfinite().all()):
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
         _check_degree(sh_degree, len(SH_SIZES) - 1)
         points, n = points.detach(), len(points)

@@ -25,6 +25,7 @@ from kgs.backends import choose, register
 
 WINDOW, SIGMA = 11, 1.5
 RADIUS = WINDOW // 2
+BORDER = [RADIUS] * 4
 C1, C2, EPS = 0.01**2, 0.03**2, 1e-12
 
 
@@ -100,7 +101,8 @@ def photometric_loss(
     if min(shape[-2:]) <= RADIUS:
         raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}")
     if outside is not None:  # from here on, of windows: those that touch a pixel outside
-        outside = F.max_pool2d(F.max_pool2d(_pad(outside.float()), (WINDOW, 1), 1), (1, WINDOW), 1) > 0
+        padded = F.pad(outside.float(), BORDER, mode="reflect")
+        outside = F.max_pool2d(F.max_pool2d(padded, (WINDOW, 1), 1), (1, WINDOW), 1) > 0
         if bool(outside.all()):
             return loss
     if not fast or target.requires_grad or image.dtype != torch.float32 or min(shape[-2:]) < WINDOW:
@@ -123,7 +125,7 @@ def target_moments(target: Tensor) -> TargetMoments:
     _check_images(target, target)
     if min(target.shape[-2:]) <= RADIUS:
         raise ValueError(f"target: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {tuple(target.shape)}")
-    padded = _pad(target.reshape(1, -1, *target.shape[-2:]))
+    padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
     mean = _blur(padded)
     return TargetMoments(padded, mean, _blur(padded * padded).sub_(mean * mean))
 
@@ -138,7 +140,7 @@ class _MeanSsim(torch.autograd.Function):
     def forward(
         ctx: Any, image: Tensor, target: Tensor, mean_y: Tensor, variance_y: Tensor, outside: Tensor | None
     ) -> Tensor:
-        padded = _pad(image)
+        padded = F.pad(image, BORDER, mode="reflect")
         mean = _blur(padded)
         mean_squared, mean_product = mean * mean, mean * mean_y
         b = _blur(padded * target).sub_(mean_product).mul_(2.0).add_(C2)
@@ -196,10 +198,6 @@ def _outside(mask: Tensor, image: Tensor) -> Tensor:
     if bool(outside.all()):
         raise ValueError("mask: expected at least one pixel that counts, got none")
     return outside.expand(images, 1, *size)
-
-
-def _pad(image: Tensor) -> Tensor:
-    return F.pad(image, [RADIUS] * 4, mode="reflect")
 
 
 def _fold(grad: Tensor) -> Tensor:
