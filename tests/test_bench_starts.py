@@ -11,7 +11,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.bench import starts
-from kgs.bench.starts import complete_pixels, depth_errors, seen_twice
+from kgs.bench.starts import complete_pixels, depth_errors
 from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
@@ -74,14 +74,6 @@ def test_a_point_completes_the_pixels_around_it(plane: tuple[Views, torch.Tensor
     assert corner.sum((1, 2)).tolist() == [6, 0]  # the other view has it 4 pixels out of its picture
 
 
-def test_what_two_views_see_of_the_plane(plane: tuple[Views, torch.Tensor]) -> None:
-    seen = seen_twice(*plane)
-    assert seen[0, :, 4:].all()
-    assert seen[1, :, :-4].all()
-    assert seen.double().mean() == 1 - 4 / WIDTH
-    assert not seen_twice(plane[0].select([0]), plane[1][:1]).any()
-
-
 def test_a_hidden_point_is_judged_where_it_is_seen() -> None:
     """A surface at 2 before the nearer camera hides the plane that the other one sees."""
     views = at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -89,7 +81,6 @@ def test_a_hidden_point_is_judged_where_it_is_seen() -> None:
     points = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 4.1], [0.0, 0.0, 2.02], [0.0, 0.0, 7.0]])
     errors = depth_errors(points, views, truth)
     assert errors.tolist() == pytest.approx([0.0, 0.1 / 5, 0.01, 2.5], abs=1e-6)  # the last: hidden from both
-    assert not seen_twice(views, truth).any()
 
 
 def test_points_before_nothing_and_outside(plane: tuple[Views, torch.Tensor]) -> None:
@@ -110,7 +101,6 @@ def test_points_of_the_exact_depths_of_the_synthetic_scene() -> None:
     assert float(errors.median()) < 1e-5
     assert float((errors < 0.01).double().mean()) > 0.97  # the rest lies at edges
     assert complete_pixels(points, views, truth).all()
-    assert 0.8 < float(seen_twice(views, truth).double().mean()) < 0.95
     moved = depth_errors(points_of(views, truth, 1.03), views, truth)
     assert float(moved.median()) == pytest.approx(0.03, abs=0.003)
     assert float((moved.abs() < 0.02).double().mean()) < 0.03
@@ -139,7 +129,6 @@ def test_the_files_of_the_quick_program(tmp_path: Path, monkeypatch: pytest.Monk
     dense, _, random = rows
     assert dense["median_error"] < 0.02 < 0.1 < random["median_error"]
     assert dense["complete"] > 1.5 * random["complete"]
-    assert dense["complete_twice"] >= dense["complete"]
 
 
 def test_a_missing_scene_is_named_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,14 +61,11 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
     plan = [(table, count, SIZE) for count in counts for table in ("main", "stages")]
     plan += [("left out", counts[1], SIZE), *(("scaling", *scene) for scene in dict.fromkeys(scaled))]
-    unit, rows = seconds_of_exp(where), []
+    unit, rows, how = seconds_of_exp(where), [], (repeats, where)
     for table, count, (height, width) in plan:
         print(f"{table}: {count} Gaussians at {width}x{height} ...")
         cases = Cases(count, (height, width), where)
-        if table == "stages":
-            found = time_parts(cases.stages, repeats, where)
-        else:
-            found = take_turns(cases.of(table), repeats, where)
+        found = time_parts(cases.stages, *how) if table == "stages" else take_turns(cases.of(table), *how)
         for name, times in found.items():
             row = {"table": table, "case": name, "gaussians": count, "height": height, "width": width}
             row |= {"pairs_millions": cases.pairs} | {f"{key}_s": value for key, value in times._asdict().items()}
@@ -103,9 +100,8 @@ class Cases:
         """What a table compares."""
         if table == "left out":
             return self.savings()
-        return {"forward + backward": self.both} | (
-            {"forward, no gradient": self.forward, "training step": self.train} if table == "main" else {}
-        )
+        main = {"forward, no gradient": self.forward, "forward + backward": self.both, "training step": self.train}
+        return main if table == "main" else {"forward + backward": self.both}
 
     def forward(self) -> Tensor:
         """Render without gradient."""

@@ -14,7 +14,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit.starts import first_points
-from kgs.fit.starts.triangulate import camera_centers, project_all, unproject
+from kgs.fit.starts.triangulate import camera_centers, project_all
 
 from .output import Row, markdown_table, mean_sd, write_results
 from .scenes import check_scenes
@@ -32,10 +32,8 @@ REACH = 2  # pixels, from a point to those it completes
 EDGE = 1.05  # ratio of depths of neighbouring pixels above which nothing is interpolated between them
 # Columns of the tables: head, decimals, factor.
 _POINTS = {"points": ("points", 0, 1)}
-_SHARES = {"within_1": "within 1 %", "within_2": "within 2 %", "complete": "complete"}
-_SHARES |= {"complete_twice": "of those seen twice", "seen_twice": "pixels that two views see"}
 _MEASURES = {"median_error": ("median error", 2, 100), "bias": ("median signed", 2, 100)}
-_MEASURES |= {name: (head, 1, 100) for name, head in _SHARES.items()}
+_MEASURES |= {"within_1": ("within 1 %", 1, 100), "within_2": ("within 2 %", 1, 100), "complete": ("complete", 1, 100)}
 _SECONDS = {"wall_seconds": ("wall s", 1, 1), "cpu_seconds": ("CPU s", 1, 1)}
 
 
@@ -79,17 +77,12 @@ def _rows(scene: str, views: Views, seed: int = 0, truth: Tensor | None = None) 
     """One per kind of start; `truth`: the exact depths, where they are known."""
     height, width = views.images.shape[-2:]
     about, rows = {"scene": scene, "views": len(views), "width": width, "height": height, "seed": seed}, []
-    twice = None if truth is None else seen_twice(views, truth)
     for asked in ("dense", "sift") if truth is None or (height, width) == LARGE else ("dense", "sift", "random"):
         points, row = _find(views, asked, seed)
         row |= dict.fromkeys(_MEASURES)
-        if truth is not None and twice is not None:
-            errors, complete, surface = (
-                depth_errors(points, views, truth),
-                complete_pixels(points, views, truth),
-                truth > 0,
-            )
-            shares = (errors.abs() <= NEAR, errors.abs() <= CLOSE, complete[surface], complete[twice], twice[surface])
+        if truth is not None:
+            errors, complete = depth_errors(points, views, truth), complete_pixels(points, views, truth)
+            shares = (errors.abs() <= NEAR, errors.abs() <= CLOSE, complete[truth > 0])
             values = (errors.abs().median(), errors.median(), *(share.double().mean() for share in shares))
             row |= dict(zip(_MEASURES, map(float, values), strict=True))
         rows.append(about | row)
@@ -170,18 +163,6 @@ def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
             x, y = places[inside].long().unbind(1)
             close = (depths[inside] / exact[y, x] - 1).abs() <= CLOSE
             found[view, y[close], x[close]] = True
-    return found
-
-
-def seen_twice(views: Views, truth: Tensor) -> Tensor:
-    """Which pixels show a surface that another view shows too, to 1 % of its depth there, `(V, H, W)`."""
-    found = torch.zeros_like(truth, dtype=torch.bool)
-    for view, exact in enumerate(truth):
-        rows, columns = (exact > 0).nonzero().unbind(1)
-        pixels = torch.stack([columns, rows], 1)
-        points = unproject(pixels, exact[rows, columns], torch.full_like(rows, view), views.cameras)
-        for other in set(range(len(views))) - {view}:
-            found[view, rows, columns] |= _view_errors(points, views, truth, other).abs() <= NEAR
     return found
 
 

@@ -24,7 +24,7 @@ from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
 from kgs.fit.folder import CHECKPOINT, UNFINISHED
 
-SHORT, LONG = 45, 450  # steps
+SHORT, LONG = 24, 450  # steps
 
 
 @pytest.fixture(scope="module", params=[SHORT, pytest.param(LONG, marks=pytest.mark.slow)])
@@ -53,7 +53,7 @@ def _bits(same: bool) -> str:
 def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
     """One fit after the other, killed again and again, each time resumed from what it left."""
     steps, expected = alone
-    trials, longest = (30, 0.6) if steps == LONG else (2, 0.1)
+    trials, longest = (30, 0.6) if steps == LONG else (1, 0.1)
     fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
     path, corrupt, fallen_back, different, fits, kills = fit.out / UNFINISHED / CHECKPOINT, 0, 0, 0, 0, 0
     while kills < trials:

@@ -86,12 +86,12 @@ def on_threads(dtype: torch.dtype) -> Iterator[Result]:
     """Enough pairs for two threads; one and two of them, twice each."""
     for count in (1, 2, 1, 2):
         with threads(count):
-            yield render(ordinary(3000, (96, 96)), dtype)
+            yield render(ordinary(800, (64, 64)), dtype)
 
 
 def under_a_budget(dtype: torch.dtype) -> Iterator[Result]:
     """The image alone: gradients of a Gaussian are then summed in another order."""
-    scene = gaussians(300, scales=60.0, opacities=0.02), camera((96, 96))
+    scene = gaussians(300, scales=60.0, opacities=0.02), camera((64, 64))
     for most in (2**30, 2**21):
         yield render(scene, dtype, max_bytes=most)[0], {}
 

@@ -44,7 +44,7 @@ print(status("VmHWM") - before)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-@pytest.mark.parametrize("mebibytes", [24, 64])
+@pytest.mark.parametrize("mebibytes", [24, pytest.param(64, marks=pytest.mark.slow)])
 def test_a_call_stays_within_max_bytes_for_tall_gaussians(mebibytes):
     """15 000 lines in 128 rows of tiles: 2 million spans, which took 170 MiB whatever the bound was."""
     run = [sys.executable, "-c", PROGRAM, str(mebibytes)]
