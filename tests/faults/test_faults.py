@@ -83,6 +83,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
     record("kill -9 at a random moment", trials, corrupt, found, corrupt == different == 0)
 
 
+@pytest.mark.slow  # test_run.py has the signals in one process
 def test_sigterm(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
     fit = Fit(tmp_path, "terminated", alone[0])
     process = fit.start()
@@ -95,6 +96,7 @@ def test_sigterm(alone: tuple[int, bytes], tmp_path: Path, record: Callable[...,
     record("SIGTERM", 1, int(not same), found, running and written and same and code == 128 + signal.SIGTERM)
 
 
+@pytest.mark.slow
 def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
     """From some step on no file may grow beyond 16 KiB: neither checkpoints nor results can be written."""
     fit = Fit(tmp_path, "full", alone[0])
