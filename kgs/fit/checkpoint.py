@@ -9,6 +9,8 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -103,10 +105,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
             *folders, key = name.split("/")
-            holder = state
-            for folder in folders:
-                holder = holder[folder]
-            holder[key] = tensor.clone()
+            reduce(getitem, folders, state)[key] = tensor.clone()
     except KeyError as error:
         raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint of kgs, got none") from error
     except (safetensors.SafetensorError, TypeError, ValueError) as error:

@@ -183,10 +183,9 @@ class Trainer:
         return copy.deepcopy(parts | {name: getattr(self, name) for name in PLAIN})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from where :meth:`state_dict` was taken, bit for bit; on another device if need be.
+        """Go on from where :meth:`state_dict` was taken, bit for bit, with its scene and configuration.
 
-        The scene and the configuration must be those of the state. Only a fit that had done all its steps may go on
-        with a larger `steps`; `notes` then says what that means.
+        The device may be another. Where all steps were done `steps` may be larger; `notes` says what that means.
 
         Raises:
             ValueError: they are others, or an entry is missing or wrong; the message begins with its name. The trainer
