@@ -57,7 +57,7 @@ def test_no_module_of_one_system_alone():
     """Windows has no `resource`: a fit can still be imported, and its memory is not known where nothing tells it."""
     code = (
         "import sys; sys.modules['resource'] = None\n"
-        "import kgs.fit.run, kgs.fit.demo, kgs.fit.machine\n"
+        "import kgs.fit.run, kgs.fit.machine\n"
         "from pathlib import Path\n"
         "exists = Path.exists\n"
         "Path.exists = lambda path: False if str(path).startswith('/proc') else exists(path)\n"

@@ -10,7 +10,7 @@ import torch
 import kgs
 from kgs.datasets import synthetic_scene
 from kgs.errors import DataError
-from kgs.fit.render import render_views
+from kgs.fit.commands import render
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def hashes(folder):
 def test_photos_are_never_overwritten(splat, llff, out):
     before = hashes(llff)
     with pytest.raises(DataError, match="holds files of a scene"):
-        render_views(splat, kgs.datasets.load_scene(llff), llff / out)
+        render(splat, cameras=llff, out=llff / out)
     assert hashes(llff) == before
 
 
@@ -54,16 +54,15 @@ def test_a_copy_of_the_photos_is_not_overwritten_either(splat, llff, tmp_path):
     (tmp_path / "copy").mkdir()
     (tmp_path / "copy" / "3.png").write_bytes(photo)
     with pytest.raises(DataError, match=r"3\.png: was not written by kgs"):
-        render_views(splat, kgs.datasets.load_scene(llff), tmp_path / "copy")
+        render(splat, cameras=llff, out=tmp_path / "copy")
     assert hashes(tmp_path / "copy").keys() == {tmp_path / "copy" / "3.png"}
     assert (tmp_path / "copy" / "3.png").read_bytes() == photo
 
 
 def test_a_second_render_replaces_the_first(splat, llff):
-    scene = kgs.datasets.load_scene(llff)
     out = llff / "renders"  # below the scene, with nothing of it inside
-    assert render_views(splat, scene, out) == 10
+    render(splat, cameras=llff, out=out)
     first = hashes(out)
     assert len(first) == 10
-    assert render_views(splat, scene, out) == 10
+    render(splat, cameras=llff, out=out)
     assert hashes(out) == first

@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from kgs.errors import DataError
 
-from .config import DEMO, FitConfig
-from .progress import say
+from .config import DEMO, FitConfig, Recipe
+from .progress import each, say
 
 _VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
 _SMALLEST = 12  # pixels a side: the window of SSIM
@@ -43,20 +43,40 @@ def demo(
         device: cpu, cuda, ...
     """
     from kgs.datasets import synthetic_scene
+    from kgs.ply import save_ply
 
-    from .demo import run_demo
+    from .outputs import check_folder, write_curve, write_json, write_sheet
+    from .run import choose_points, measure, train
+    from .trainer import Trainer
 
     config = replace(DEMO, seed=seed, steps=steps, device=device)
     if min(size) < _SMALLEST:
         raise ValueError(f"size: expected at least {_SMALLEST} pixels a side, got {size[0]} {size[1]}")
     _prepare(device, "matplotlib")
-    runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), out, config)
+    check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
+    scene = synthetic_scene(train_views=3, size=size, seed=seed)
+    points = choose_points(scene, config, each)
+    say(f"{len(scene.train)} training and {len(scene.test)} test views of {size[1]}x{size[0]}")
+    say(f"first points: {len(points.points)} ({points.kind})")
+    runs, renders, curves = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+    for name, drop in (("without", 0.0), ("with", config.drop)):
+        trainer, title = Trainer(scene, replace(config, drop=drop), points), f"{name} DropGaussian"
+        if signal := train(trainer, None, title=title):
+            raise SystemExit(128 + signal)
+        runs[name], curves[title] = measure(trainer), trainer.curve
+        renders[title] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
+    save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
+    write_json(out / "metrics.json", runs)
+    write_curve(out / "curve.png", curves)
+    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs["without"]["test"]["views"]]
+    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
+    write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
-    test, train = ({name: run[part]["psnr"] or math.inf for name, run in runs.items()} for part in ("test", "train"))
+    level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():
-        columns = f"{test[name]:8.2f}{run['test']['ssim']:8.3f}{train[name]:12.2f}"
+        columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
         say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
-    gain = test["with"] - test["without"]
+    gain = level["with"][0] - level["without"][0]
     say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
     say(f"pictures: {out / 'demo.png'}, {out / 'curve.png'}")
     _next("kgs fit SCENE -o OUT  # your own photos, with poses", _VIEWER.format(_line(out / "splat.ply")))
@@ -100,9 +120,8 @@ def fit(
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
     lpips = _prepare(config.device, "matplotlib", "safetensors", lpips=lpips_weights)
     check_folder(out, RESULTS, scene, make=False)
-    points = "model-points" if config.init == "model-points" else "none"
-    request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale}
-    request |= {"background": background, "points": points}
+    request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
+    request["points"] = config.init if config.init == "model-points" else "none"
     loaded = _load(request)
     height, width = loaded.train.images.shape[-2:]
     say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
@@ -148,15 +167,31 @@ def render(
         background: behind the splat.
         device: cpu, cuda, ...
     """
-    from kgs.datasets import load_scene
+    import torch
 
-    from .outputs import check_folder
-    from .render import render_views
+    from kgs.camera import move_camera
+    from kgs.datasets import load_scene
+    from kgs.ply import load_ply
+    from kgs.renderer import GaussianRenderer
+
+    from .outputs import check_folder, png_names, write_png
+    from .starts import typical_depths
 
     _prepare(device)
     check_folder(out, (), cameras, make=False)
     scene = load_scene(cameras, None, downscale, background=background, photos=False)
-    say(f"{render_views(ply, scene, out, device)} pictures in {out}")
+    model = load_ply(ply, origin=scene.offset)
+    near_plane = Recipe().near_plane * typical_depths(scene.train, model.means)[0]  # from the Gaussians themselves
+    posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
+    names = png_names(name for name, _ in posed)
+    check_folder(out, names.values(), scene.root)
+    renderer = GaussianRenderer(near_plane=near_plane).eval()
+    model, background_color = model.to(device), scene.background.to(device)
+    for name, camera in each(posed, "pictures", "view"):
+        with torch.no_grad():
+            image = renderer(model(), move_camera(camera, torch.device(device)), background_color).image[0]
+        write_png(out / names[name], image)
+    say(f"{len(names)} pictures in {out}")
     _next(_VIEWER.format(_line(ply)))
 
 
@@ -206,8 +241,8 @@ def _prepare(device: str, *packages: str, lpips: Path | None = None) -> Any:
 def _load(request: dict[str, Any]) -> Any:
     from kgs.datasets import load_scene
 
-    path, views, downscale = (request[name] for name in ("scene", "train_views", "downscale"))
-    scene = load_scene(path, views, downscale, background=request["background"], points=request["points"])
+    names = ("train_views", "downscale", "background", "points")
+    scene = load_scene(request["scene"], **{name: request[name] for name in names})
     for note in scene.notes:
         say(note)
     return scene

@@ -30,8 +30,7 @@ def versions() -> dict[str, str]:
     found = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
     with contextlib.suppress(PackageNotFoundError):
         found["numba"] = version("numba")
-    machine = f"{platform.machine()}, {os.cpu_count()} cores"
-    return {**found, "python": platform.python_version(), "machine": machine}
+    return found | {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
 
 
 def peak_rss_mb() -> int:

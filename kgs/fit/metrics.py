@@ -10,6 +10,7 @@ Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a b
 import math
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -47,7 +48,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
     """
     if lpips is not None and lpips.net != "vgg16":
         raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
-    rows: list[dict[str, float | None]] = []
+    rows = list[dict[str, Any]]()
     for index, name in enumerate(views.names):
         image, target = render(views.camera(index)), views.images[index : index + 1]
         if image.shape != target.shape:
@@ -55,7 +56,8 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
         rows.append(_measure(image.clamp(0.0, 1.0), target.to(image), lpips))
-    means = {key: _mean([row[key] for row in rows]) for key in MEASURES}
+    columns = {key: [row[key] for row in rows] for key in MEASURES}
+    means = {key: fmean(values) if values and None not in values else None for key, values in columns.items()}
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
@@ -93,8 +95,3 @@ def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, fl
         *(None if lpips is None else lpips(image, target, rescale).item() for rescale in (True, False)),
     )
     return dict(zip(MEASURES, values, strict=True))
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known and len(known) == len(values) else None

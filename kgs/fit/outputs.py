@@ -30,14 +30,8 @@ _LONGEST = 120  # bytes of a picture's name
 def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, make: bool = True) -> None:
     """Make the folder for results, once it is sure that this command can write there and overwrites no user's file.
 
-    Args:
-        out: the folder.
-        files: what the command is going to write, relative to `out`.
-        scene: the scene's folder; no results go where it keeps its own photos.
-        make: False only looks.
-
-    Raises:
-        DataError: it cannot be written to, holds files of a scene, or has one of `files` that kgs did not write.
+    `files`, relative to `out`, are what it is going to write; `scene` is a folder whose own photos it must not write
+    beside. With `make` False it only looks. A folder that will not do is a DataError.
     """
     advice = "choose another folder with -o"
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
@@ -46,8 +40,8 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
     if not os.access(there, os.W_OK | os.X_OK):
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
-    photos = [path for path in list_images(out) if not is_own(path)] if inside and there == out else []
-    if photos or any((out / name).exists() for name in _SCENES):
+    has_photos = inside and there == out and not all(map(is_own, list_images(out)))
+    if has_photos or any((out / name).exists() for name in _SCENES):
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):
         folder = path.parent
@@ -108,9 +102,8 @@ def write_png(path: Path, image: Tensor) -> None:
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")
     chunk = b"tEXt" + PNG_MARK
-    mark = (len(PNG_MARK)).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
-    data = content.tobytes()
-    header = 33  # the signature and the first chunk
+    mark = len(PNG_MARK).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    data, header = content.tobytes(), 33  # bytes of the signature and the first chunk
     write_whole(path, data[:header] + mark + data[header:])
 
 

@@ -7,8 +7,6 @@ from typing import Any, TextIO
 
 Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
-_LINES = 10  # per stage, where there is no terminal
-
 
 def say(line: str, file: TextIO | None = None) -> None:
     """Print a line, on stdout unless told otherwise, and flush it.
@@ -42,7 +40,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
             with suppress(OSError, ValueError):
                 bar.set_postfix_str(note, refresh=False)
                 bar.update()
-        elif done * _LINES // total > (done - 1) * _LINES // total:
+        elif done * 10 // total > (done - 1) * 10 // total:
             say(f"{title}: {done} of {total} {unit}s{', ' * bool(note)}{note}", sys.stderr)
 
     try:

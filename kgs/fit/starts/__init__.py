@@ -16,8 +16,7 @@ from kgs.neighbours import log_spacing
 
 from .files import read_points
 from .plane_sweep import dense_points
-from .tracks import find_tracks
-from .triangulate import camera_centers, project_all, triangulate_certain, unproject
+from .triangulate import camera_centers, find_tracks, project_all, triangulate_certain, unproject
 
 __all__ = ["FirstPoints", "first_points", "typical_depths"]
 
@@ -25,6 +24,7 @@ KINDS = ("dense", "sift", "random", "file")
 FEWEST_DENSE = 1000
 FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
 MAX_SPACING = 4.0  # of a point, in medians of all
+# Quantiles are NumPy's: torch.quantile refuses more than 16 million values.
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,8 @@ def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
     if not len(depths):
         _, depths = project_all(points, views.cameras)
         depths = depths[depths > 0]
-    return (_quantile(depths, 0.01), _quantile(depths, 0.5)) if len(depths) else (1.0, 1.0)
+    near, middle = np.quantile(depths, (0.01, 0.5)).tolist() if len(depths) else (1.0, 1.0)
+    return near, middle
 
 
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
@@ -137,15 +138,14 @@ def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera)
     _, depths = project_all(points, cameras)
     if not seen.any():
         return torch.zeros(len(points), dtype=torch.bool)
-    least, most = 0.5 * _quantile(depths[seen], 0.01), 2.0 * _quantile(depths[seen], 0.99)
-    return (((depths > least) & (depths < most)) | ~seen).all(1)
+    least, most = np.quantile(depths[seen], (0.01, 0.99)).tolist()
+    return (((depths > 0.5 * least) & (depths < 2.0 * most)) | ~seen).all(1)
 
 
 def _in_company(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
     """Whether points are as near to others as is usual: their spacing in the image is under `MAX_SPACING` medians.
 
-    A false match that satisfies the geometry lies alone, mostly before the scene, and would start as a Gaussian over
-    a good part of the images that the training views cannot tell from a right one.
+    A false match lies alone, mostly before the scene, and would start as a Gaussian over a good part of the images.
     """
     _, depths = project_all(points, cameras)
     focal = cameras.fx.double().cpu()
@@ -157,8 +157,8 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
     """Nearest and farthest depth to expect: from points if there are any, else from the cameras."""
     if len(points) > 1:
         _, depths = project_all(points, cameras)
-        depths = depths[depths > 0]
-        return 0.8 * _quantile(depths, 0.01), 1.25 * _quantile(depths, 0.99)
+        least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
+        return 0.8 * least, 1.25 * most
     centers, axes = camera_centers(cameras), cameras.extrinsics[:, 2, :3].double().cpu()
     # The point nearest to all optical axes; near-parallel axes (within some 5 degrees) do not tell where they meet.
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
@@ -219,7 +219,3 @@ def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:
     samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)[..., 0]
     weights = (seen / seen.sum(1, keepdim=True)).T[:, None].to(images.dtype)
     return torch.where(weights > 0, weights * samples, 0.0).sum(0).T.clamp(0.0, 1.0).contiguous()
-
-
-def _quantile(values: Tensor, fraction: float) -> float:
-    return float(np.quantile(values.numpy(), fraction))  # torch.quantile refuses more than 16 million values

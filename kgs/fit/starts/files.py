@@ -39,15 +39,14 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
     for magic, name in _PACKED.items():
         if head.startswith(magic):
             raise DataError(path, "", f"expected a point cloud or mesh, got a {name} archive: unpack it first")
-    points, colors = _splat(path, origin) if is_splat else _cloud(path, origin)
+    if is_splat:
+        model = load_ply(path, origin=origin)
+        points, colors = model.means.detach(), (0.5 + SH_C0 * model.sh_dc.detach()[:, 0]).clamp(0.0, 1.0)
+    else:
+        points, colors = _cloud(path, origin)
     if not len(points) or not bool(points.isfinite().all()):
         raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
     return points, colors
-
-
-def _splat(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
-    model = load_ply(path, origin=origin)
-    return model.means.detach(), (0.5 + SH_C0 * model.sh_dc.detach()[:, 0]).clamp(0.0, 1.0)
 
 
 def _cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -149,10 +149,9 @@ def _warp(image: Tensor, homography: Tensor) -> Tensor:
     height, width = image.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = torch.from_numpy(cv2.warpPerspective(image.numpy(), homography.numpy(), (width, height), flags=flags))
-    corners = torch.tensor([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)], dtype=torch.float64)
-    if bool((corners @ homography[2] > 0).all()):
-        return warped
     x, y, one = homography[2]
+    if min(x * (width - 1), 0) + min(y * (height - 1), 0) + one > 0:
+        return warped
     return torch.where(x * torch.arange(width) + (y * torch.arange(height))[:, None] + one > 0, warped, 0.0)
 
 
