@@ -7,8 +7,7 @@ gives the same within the rounding of its dtype and differentiates the same. Arg
     "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
     "loss"         (image (1, K, H, W), its TargetMoments one by one, windows left out or None) -> mean SSIM, 0-d
 
-The lists of tiles are no stage of their own: they are laid out for the kernels that read them, so each "compositing"
-makes its own. They decide nothing: a pixel depends on the alphas of its layers alone.
+The lists of tiles are no stage: each "compositing" makes its own, laid out for its kernels.
 """
 
 from collections.abc import Callable

@@ -8,12 +8,11 @@ For the layers k = 1, 2, ... of a pixel, nearest first (Kerbl et al. 2023, eq. 3
 with alpha below `alpha_threshold` taken as 0, and T below `transmittance_stop` taken as 0 from then on. Both rules act
 on each pixel and layer alone, so the image does not depend on tiles or chunks.
 
-How it is computed. K consecutive entries of a tile are a chunk; the same chunk of many tiles is a step. In coordinates
-relative to the tile's centre the exponent is a quadratic polynomial of the pixel, so a step is one matrix product of
-six coefficients per entry with six monomials per pixel, an exponential, a scan over K, and one product with the
-colours. T at the beginning of each step is kept and, where memory allows, the alphas; else these are computed again.
-The backward pass visits the steps from back to front and carries V_k, the colour along g that shows from layer k on,
-as if no light had been lost before it:
+K consecutive entries of a tile are a chunk; the same chunk of many tiles is a step. In coordinates relative to the
+tile's centre the exponent is a quadratic polynomial of the pixel, so a step is one matrix product of six coefficients
+per entry with six monomials per pixel, an exponential, a scan over K, and one product with the colours. T before each
+step is kept and, where memory allows, the alphas. The backward pass visits the steps from back to front and carries
+V_k, the colour along g that shows from layer k on, as if no light had been lost before it:
 
     V_k = alpha_k (c_k . g) + (1 - alpha_k) V_{k+1},   V_end = g_T,   dL/d ln alpha_k = w_k (c_k . g - V_{k+1})
 

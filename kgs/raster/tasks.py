@@ -8,6 +8,7 @@ they are a fifth of it.
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -104,14 +105,14 @@ class Slice:
         most_tiles = max(1, self.rules.buffer_bytes // (_BUFFERS * self.table.element_size()) // pairs)
         shared = self.by_layer and sum(counts) * pairs >= _PAIRS_TO_SHARE
         most_chunks = -(-sum(counts) // 2) if shared else sum(counts)
-        groups, begin, work = [], 0, 0
+        bounds, work = [0], 0
         for i, count in enumerate(counts):
-            if i - begin == most_tiles or (i > begin and work + count > most_chunks):
-                groups.append(slice(begin, i))
-                begin, work = i, 0
+            if i - bounds[-1] == most_tiles or (i > bounds[-1] and work + count > most_chunks):
+                bounds.append(i)
+                work = 0
             work += count
-        groups.append(slice(begin, len(counts)))
-        return [Group(order[part], starts[part], ends[part], counts[part]) for part in groups if counts]
+        parts = [slice(*pair) for pair in pairwise([*bounds, len(counts)])] if counts else []
+        return [Group(order[part], starts[part], ends[part], counts[part]) for part in parts]
 
 
 def buffer_bytes(max_bytes: int, like: Tensor) -> int:
@@ -121,16 +122,6 @@ def buffer_bytes(max_bytes: int, like: Tensor) -> int:
     """
     step_pairs, share = (2**19, 16) if like.device.type == "cpu" else (2**24, 2)
     return min(step_pairs * _BUFFERS * like.element_size(), max_bytes // share)
-
-
-def bytes_per_span(dtype: torch.dtype) -> int:
-    """Working memory for one Gaussian in one row of tiles."""
-    return 32 + 16 * dtype.itemsize
-
-
-def bytes_per_entry(width: int, tile_size: int, dtype: torch.dtype) -> int:
-    """Working memory for one Gaussian in one tile: lists and sorting, gradients with their sum, and saved light."""
-    return 80 + (8 + 2 * width + tile_size**2 // 8) * dtype.itemsize
 
 
 def choose_chunk_size(reach: Reach) -> int:

@@ -15,7 +15,7 @@ from kgs.covariance import footprint_table, moment_gradients
 from kgs.full_precision import full_precision
 from kgs.types import Composited, ProjectedGaussians, RasterOptions
 
-from .tasks import Rules, Slice, buffer_bytes, bytes_per_entry, bytes_per_span, choose_chunk_size
+from .tasks import Rules, Slice, buffer_bytes, choose_chunk_size
 from .threads import run_all
 from .tiles import Reach, TileLists, to_images, to_tiles
 from .torch_steps import Backward, Forward
@@ -25,18 +25,15 @@ DepthSlices = list[tuple[tuple[int, int], Slice]]  # ranks, and what was done wi
 
 
 def composite_torch(
-    projected: ProjectedGaussians,
-    features: Tensor,
-    options: RasterOptions,
-    median_depth: bool = False,
-    chunk_size: int | None = None,
+    projected: ProjectedGaussians, features: Tensor, options: RasterOptions, median_depth: bool, chunk_size: int | None
 ) -> Composited:
     """`kgs.composite` in torch, for every device and dtype; trusts its arguments."""
     inputs = (projected.means2d, projected.factors, projected.opacities, features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    dtype, buffers = features.dtype, buffer_bytes(options.max_bytes, features)
+    buffers, number = buffer_bytes(options.max_bytes, features), features.element_size()
     budget = options.max_bytes - buffers * (4 if features.device.type == "cpu" else 1)  # some threads, one GPU
-    per_span, per_entry = bytes_per_span(dtype), bytes_per_entry(features.shape[1], options.tile_size, dtype)
+    # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, their sum, saved light
+    per_span, per_entry = 32 + 16 * number, 80 + (8 + 2 * features.shape[1] + options.tile_size**2 // 8) * number
     reach = Reach(projected, options.tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span)))
     slices = reach.row_slices(budget, per_span, per_entry)
     size = chunk_size or choose_chunk_size(reach)
@@ -102,11 +99,9 @@ class _Passes:
         means2d, factors, opacities, features = (x.index_select(0, lists.ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self.projected.eps2d), (0, 1))
         table[0, -1] = -torch.inf
-        depths: Tensor | None = None
-        if self.rules.median_depth:
-            depths = F.pad(self.projected.depths.detach().index_select(0, lists.ids), (0, 1))
-        features = torch.cat([features, features.new_zeros(1, features.shape[1])])
-        return Slice(table, features, depths, lists, self.rules)
+        depths = self.projected.depths.detach() if self.rules.median_depth else None
+        depths = None if depths is None else F.pad(depths.index_select(0, lists.ids), (0, 1))
+        return Slice(table, F.pad(features, (0, 0, 0, 1)), depths, lists, self.rules)
 
 
 class _Composite(torch.autograd.Function):
