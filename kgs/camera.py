@@ -40,13 +40,12 @@ class PosedCamera:
     Its tensors are kept as they are, not cloned: a parameter that an optimiser has changed is used by the next render.
 
     Convention:
-        - `model` projects points of the camera frame (x right, y down, z forward) to pixels with integer centres;
-          its `params` are `(P,)`, shared by all poses, or `(C, P)`, one row per pose.
-        - `extrinsics` are world-to-camera, `(C, 4, 4)`.
+        OpenCV axes (x right, y down, z forward), pixels with integer centres.
 
     Args:
-        model: a `kornia.sensors.camera.CameraModel` of any of its four types.
-        extrinsics: shape `(C, 4, 4)`.
+        model: a `kornia.sensors.camera.CameraModel` of any of its four types, from points of the camera frame to
+            pixels; its `params` are `(P,)`, shared by all poses, or `(C, P)`, one row per pose.
+        extrinsics: world-to-camera, `(C, 4, 4)`.
 
     Raises:
         TypeError: `model` is no Kornia camera model or `extrinsics` no tensor.
@@ -167,11 +166,10 @@ def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
         found: Tensor = PinholeCamera(matrix, pose, *size).project(world[None])[0]
         return found
 
-    return Lens(
-        extrinsics=pose[0],
-        project=lambda world, _: in_full_precision(pixels, matrix, pose, world),
-        jacobian=lambda points: _perspective_jacobian(matrix[0, :2, :2], points, limits),
-    )
+    def jacobian(points: Tensor) -> Tensor:
+        return _perspective_jacobian(matrix[0, :2, :2], points, limits)
+
+    return Lens(pose[0], lambda world, _: in_full_precision(pixels, matrix, pose, world), jacobian)
 
 
 def _modelled(cameras: PosedCamera, c: int) -> Lens:
@@ -201,13 +199,8 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
             points = torch.stack([*((points[:, i] / z).clamp(*limits[i]) * z for i in (0, 1)), z], 1)
         return _reverse_jacobian(pixels, points)
 
-    return Lens(
-        extrinsics=poses[c],
-        project=lambda _, points: pixels(points),
-        jacobian=jacobian,
-        parallel=parallel,
-        sees=None if plain else _before_fold(params.tolist(), brown_conrady),
-    )
+    sees = None if plain else _before_fold(params.tolist(), brown_conrady)
+    return Lens(poses[c], lambda _, points: pixels(points), jacobian, parallel, sees)
 
 
 def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor], Tensor] | None:

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_BACKENDS: list[Any] = (  # torch before 2.9 has one setting for all
-    [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if hasattr(torch.backends.mkldnn, "matmul") else []
-)
+_SEPARATE = hasattr(torch.backends.mkldnn, "matmul")  # torch before 2.9 has one setting for all
+_BACKENDS: list[Any] = [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if _SEPARATE else []
 _lock = threading.Lock()
 _inside = 0
 _put_back: Callable[[], None]  # set by who enters first
@@ -24,10 +23,9 @@ _put_back: Callable[[], None]  # set by who enters first
 
 @contextmanager
 def full_precision(device: torch.device) -> Iterator[None]:
-    """No autocast on `device` and no rounded float32 products inside; both are as before afterwards.
+    """No autocast on `device` (a state of the thread) and no rounded float32 products (one of the process) inside.
 
-    Autocast is a state of the thread, the precision of products one of the process: the first thread that enters
-    changes it, the last that leaves puts it back.
+    The first thread that enters changes the precision of products, the last that leaves puts it back.
     """
     global _inside, _put_back
     with _lock:

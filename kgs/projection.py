@@ -21,7 +21,7 @@ from .types import Gaussians, ProjectedGaussians, RasterOptions, check_tensor
 Touches = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
-def project(
+def project(  # noqa: D417 - options are described in one place
     gaussians: Gaussians,
     cameras: Cameras,
     *,
@@ -33,8 +33,8 @@ def project(
 ) -> ProjectedGaussians:
     """Project Gaussians into every camera of a batch.
 
-    Differentiable once, by `backward`, with respect to all Gaussian parameters, extrinsics and intrinsics (the
-    harmonics' view direction included).
+    Differentiable once, by `backward`, with respect to all Gaussian parameters, extrinsics and intrinsics. For
+    near_plane, eps2d and alpha_threshold (with 0 all in front of the camera are seen) see :class:`kgs.RasterOptions`.
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
@@ -42,9 +42,6 @@ def project(
     Args:
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        near_plane: see :class:`kgs.RasterOptions`, as for the next two.
-        eps2d: variance in px^2 added to each footprint.
-        alpha_threshold: with 0 every Gaussian in front of the camera is listed.
         colors: whether colours are wanted.
         backend: "auto", or the name of one, see `kgs.backends`.
 
@@ -60,9 +57,9 @@ def project(
     options = RasterOptions(near_plane=near_plane, eps2d=eps2d, alpha_threshold=alpha_threshold)
     if not isinstance(gaussians, Gaussians):
         raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
-    size, means = image_size(cameras), gaussians.means
+    size = image_size(cameras)
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
-        check_tensor("cameras", matrix, means, " as the Gaussians")
+        check_tensor("cameras", matrix, gaussians.means, " as the Gaussians")
     shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
     if shape[:-1] not in ((), (count,)):
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
@@ -147,10 +144,9 @@ def _project_one(
         seen, radii, overflow = touches(means2d, factors)
         if bool(overflow.any()):  # these must not take part at all: their gradients would not be finite
             ids, seen, radii = (_rows(x, (~overflow).nonzero()[:, 0]) for x in (ids, seen, radii))
+        kept = seen.nonzero()[:, 0]
     if ids.shape[0] != means.shape[0]:
         means, points, means2d, factors = footprints(ids)
-    with torch.no_grad():
-        kept = seen.nonzero()[:, 0]
     opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
     ids, radii = _rows(ids, kept), _rows(radii, kept)
     rgb = _rows(gaussians.colors, ids) if colors else means.new_zeros(ids.shape[0], 0)

@@ -129,14 +129,9 @@ class GaussianRenderer(nn.Module):
         if "depth" in outputs:
             covered = alpha >= 1e-6
             found["depth"] = torch.where(covered, found["depth"] / torch.where(covered, alpha, 1.0), 0.0)
-        return Rendering(
-            image=blend(found["image"], result.transmittance, background) if image else None,
-            alpha=alpha if "alpha" in outputs else None,
-            depth=found.get("depth"),
-            median_depth=result.median_depth,
-            projected=projected,
-            normal=found.get("normal"),
-        )
+        picture = blend(found["image"], result.transmittance, background) if image else None
+        shown, depth, normal = alpha if "alpha" in outputs else None, found.get("depth"), found.get("normal")
+        return Rendering(picture, shown, depth, result.median_depth, projected, normal)
 
     def extra_repr(self) -> str:
         """What `print` shows."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from .tiles import Reach, TileLists
 
 ALPHA_MAX = 0.99
+_STEP_PAIRS = {"cpu": 2**19, "cuda": 2**24}  # pairs (Gaussian, pixel) of a step: few operator calls, small buffers
 _BUFFERS = 7  # numbers per pair, intermediate values of products included
 _PAIRS_TO_SHARE = 2**22  # from here on a CPU has work for two groups, so for two threads
 
@@ -116,12 +117,10 @@ class Slice:
 
 
 def buffer_bytes(max_bytes: int, like: Tensor) -> int:
-    """What the buffers of one thread may take: all that they want, or a part of the bound where it is tight.
-
-    A step has as many pairs (Gaussian, pixel) as make few operator calls in small buffers.
-    """
-    step_pairs, share = (2**19, 16) if like.device.type == "cpu" else (2**24, 2)
-    return min(step_pairs * _BUFFERS * like.element_size(), max_bytes // share)
+    """What the buffers of one thread may take: all that they want, or a part of the bound where it is tight."""
+    device = like.device.type
+    wanted = _STEP_PAIRS.get(device, 2**24) * _BUFFERS * like.element_size()
+    return min(wanted, max_bytes // (16 if device == "cpu" else 2))
 
 
 def choose_chunk_size(reach: Reach) -> int:

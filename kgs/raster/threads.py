@@ -1,11 +1,9 @@
 """Runs independent pieces of CPU work on plain Python threads, each with one intra-op thread.
 
 Torch releases the GIL inside its operators, and an operator on an L2-sized buffer is too short to be worth an OpenMP
-barrier: whole chunks side by side gain 1.7x on two cores where intra-op threads gain 1.2x. Every piece is computed
-by one thread, whatever the number of threads, so results do not depend on it.
-
-`torch.set_num_threads` acts on the calling thread; only the default for threads born later is shared, and it is put
-back at once, so nothing changes for the rest of the process.
+barrier: whole groups side by side gain 1.7x on two cores where intra-op threads gain 1.2x. One thread computes a piece
+from begin to end, so results do not depend on their number. `torch.set_num_threads` acts on the calling thread; the
+default for threads born later is shared, and put back at once.
 """
 
 import os
