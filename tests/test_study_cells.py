@@ -193,10 +193,10 @@ def test_a_real_scene_needs_a_folder():
 
 def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
     cells = [tiny_cell("off"), tiny_cell("progressive 0.2"), tiny_cell("off", seed=1)]
-    monkeypatch.setattr(presets, "_quick_cells", lambda: cells[:2])
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: cells[:2])
     study(out=tmp_path, scheduler=threads)
     before = (tmp_path / "sparse.jsonl").read_bytes()
-    monkeypatch.setattr(presets, "_quick_cells", lambda: cells)
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: cells)
     capsys.readouterr()
     study(out=tmp_path, scheduler=threads)
     assert capsys.readouterr().out.startswith("2 of 3 cells are there")
@@ -211,17 +211,17 @@ def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
 
 
 def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell()])
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     study(out=tmp_path, scheduler=threads)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell("fixed 0.1")])
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell("fixed 0.1")])
     with pytest.raises(DataError, match="expected cells of --preset quick"):
         study(out=tmp_path, scheduler=threads)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_second_run_is_refused_and_writes_nothing(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell()])
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     study(out=tmp_path, scheduler=threads)
     for path in tmp_path.iterdir():
         if path.suffix != ".jsonl":
@@ -232,7 +232,7 @@ def test_a_second_run_is_refused_and_writes_nothing(tmp_path, monkeypatch, threa
 
 
 def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "_quick_cells", lambda: [tiny_cell()])
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     study(out=tmp_path, scheduler=threads)
     path = tmp_path / "sparse.jsonl"
     path.write_bytes(2 * path.read_bytes())

@@ -38,7 +38,7 @@ def cluster():
         yield cluster
 
 
-@pytest.fixture(params=["local", "dask"])
+@pytest.fixture(params=["local", pytest.param("dask", marks=pytest.mark.slow)])
 def where(request):
     """Where the cells run: arguments of run_grid."""
     if request.param == "local":

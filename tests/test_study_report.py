@@ -17,7 +17,7 @@ from kgs.bench.study.plots import STYLES
 from kgs.bench.study.presets import EQUAL_MEAN_RATE, FAMILIES, METHODS
 from kgs.bench.study.report import write_report
 
-TEXTS = ("sparse.csv", "summary.csv", "sparse.md", "sparse.tex", "index.html")
+TEXTS = ("sparse.csv", "sparse.md", "sparse.tex", "index.html")
 PLOTS = ("forest.png", "curves.png", "gap.png", "cost.png", "coadaptation.png", "thresholds.png")
 
 
@@ -233,21 +233,6 @@ def test_other_tables(markdown):
     assert cost[8] == f"{np.mean(adapted):.2f} ({np.std(adapted, ddof=1):.2f})"
     (scene,) = lines(markdown, "Scenes, splits", "blender/lego, 8 views")
     assert scene[1:] == ["8", "2", "18", "252x189", "drop 0.2, steps 2000"]
-
-
-def test_summary_csv(reports):
-    with (reports["full"][0] / "summary.csv").open(newline="") as file:
-        found = {tuple(row[k] for k in ("scene", "views", "start", "method")): row for row in csv.DictReader(file)}
-    line = found["llff/fern", "3", "dense", "far"]
-    far, off = psnrs(FULL, "llff/fern", "far"), psnrs(FULL, "llff/fern", "off")
-    assert (line["n"], line["seeds"]) == ("2", "0 1")
-    assert float(line["test_psnr_sd"]) == pytest.approx(np.std(far, ddof=1))
-    assert float(line["test_lpips_vgg_best"]) == pytest.approx(min(far) / 100)
-    for measure, scale in (("psnr", 1), ("ssim_zero_padded", 31), ("lpips_vgg_unscaled", 110)):
-        difference = np.mean(np.subtract(far, off[:2])) / scale
-        assert float(line[f"{measure}_over_off_mean"]) == pytest.approx(difference)
-    assert line["psnr_over_sift_mean"] == ""
-    assert found["llff/fern", "6", "dense", "off"]["test_psnr_sd"] == ""
 
 
 def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):

@@ -1,14 +1,11 @@
 """Held-out quality against training time: one knob of the fit at a time, around the default, on the study's grid."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from matplotlib.figure import Figure
 
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FAST, FitConfig
@@ -18,9 +15,8 @@ from .output import markdown_table, mean_sd
 from .scenes import SYNTHETIC, check_scenes
 from .study.cells import fit_and_measure
 from .study.grid import Cell, run_grid
+from .study.plots import panels
 from .study.tables import each
-
-__all__ = ["KNOBS", "fit_cell", "knob_cells", "training", "write_knobs"]
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
 KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
@@ -32,13 +28,7 @@ DECIMALS = dict(zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True))
 SIZE = (126, 168)  # of the synthetic pictures
 
 
-def training(
-    *,
-    out: Path,
-    quick: bool = False,
-    processes: int | None = None,
-    scheduler: str | None = None,
-) -> int:
+def training(*, out: Path, quick: bool = False, processes: int | None = None, scheduler: str | None = None) -> int:
     """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
 
     For example:
@@ -77,12 +67,9 @@ def knob_cells(quick: bool = False) -> list[Cell]:
 
 
 def fit_cell(cell: Cell) -> dict[str, Any]:
-    """One fit of "scene", "synthetic" or "fern" (found through KGS_DATA), from SIFT points.
-
-    "fast" says that the fit starts from that setting and not from the default; the rest are fields of FitConfig.
-    """
-    settings = FAST if cell.get("fast") else FitConfig()
+    """One fit of "scene" from SIFT points; "fast": with the settings of --fast; the rest are fields of FitConfig."""
     turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
+    settings = FAST if cell.get("fast") else FitConfig()
     config = FitConfig.from_dict(settings.to_dict() | {"init": "sift"} | turned)
     if cell["scene"] == SYNTHETIC:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
@@ -94,20 +81,16 @@ def fit_cell(cell: Cell) -> dict[str, Any]:
 
 
 def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
-    """Write training.csv, training.md and training.png: each setting's mean and standard deviation over seeds.
+    """Write training.csv, training.md (which it returns) and training.png: mean and deviation over seeds.
 
-    The gain over the default is in dB of test PSNR, from the seeds that both have; the two fits of a seed have the same
-    first points.
-
-    Returns:
-        What training.md holds.
+    The gain over the default is in dB of test PSNR, from the seeds that both have, which have the same first points.
     """
-    frame = pd.DataFrame([_knob(row["cell"]) | {key: row["result"].get(key) for key in HEADS} for row in rows])
+    frame = pd.DataFrame([_knob(**row["cell"]) | {key: row["result"].get(key) for key in HEADS} for row in rows])
     default = frame[frame.knob == "default"].set_index(["scene", "seed"]).psnr
     frame["gain"] = frame.psnr - default.reindex(pd.MultiIndex.from_frame(frame[["scene", "seed"]])).to_numpy()
     keys = ["scene", "knob", "value"]
     table = frame.groupby(keys, sort=False)[[*HEADS]].agg(["mean", "std"])
-    table.columns = [f"{column[0]}_sd" if column[1] == "std" else column[0] for column in table.columns]
+    table.columns = [f"{c[0]}_sd" if c[1] == "std" else c[0] for c in table.columns]
     table = table.assign(n=frame.groupby(keys, sort=False).size()).reset_index()
     table.to_csv(out / "training.csv", index=False)
     lines = [
@@ -118,26 +101,14 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     title = "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)"
     text = markdown_table(title, ["setting", "n", *HEADS.values()], lines, first="scene")
     (out / "training.md").write_text(text, encoding="utf-8")
-    _plot(out / "training.png", table)
+    lines_of = [table[table.knob.isin(("default", knob))].assign(label=knob) for knob in table.knob.unique()]
+    points = pd.concat(line.sort_values("cpu_seconds") for line in [*lines_of[1:], *lines_of[:1]])
+    points = points.rename(columns={"scene": "panel", "cpu_seconds": "x", "psnr": "y", "psnr_sd": "dy"})
+    axes = {"xscale": "log", "xlabel": "CPU seconds of the fit", "ylabel": "test PSNR [dB]"}
+    panels(points, {"default": ("black", "*")}, **axes).savefig(out / "training.png")
     return text
 
 
-def _knob(cell: Mapping[str, Any]) -> dict[str, Any]:
-    turned = {key: value for key, value in cell.items() if key not in ("scene", "seed")}
+def _knob(scene: str, seed: int, **turned: Any) -> dict[str, Any]:
     knob, value = next(iter(turned.items()), ("default", ""))
-    return {"scene": cell["scene"], "seed": cell["seed"], "knob": knob, "value": "" if value is True else str(value)}
-
-
-def _plot(path: Path, table: pd.DataFrame) -> None:
-    figure = Figure(figsize=(5.5 * table.scene.nunique(), 4), layout="constrained")
-    axes = figure.subplots(1, table.scene.nunique(), squeeze=False)[0]
-    for axis, (scene, lines) in zip(axes, table.groupby("scene", sort=False), strict=True):
-        is_default = lines.knob == "default"
-        for knob in lines.knob[~is_default].unique():
-            line = lines[is_default | (lines.knob == knob)].sort_values("cpu_seconds")
-            axis.errorbar(line.cpu_seconds, line.psnr, line.psnr_sd, marker=".", capsize=2, lw=1, label=knob)
-        axis.plot(lines.cpu_seconds[is_default], lines.psnr[is_default], "k*", markersize=12, label="default")
-        axis.set(xscale="log", title=scene, xlabel="CPU seconds of the fit", ylabel="test PSNR [dB]")
-        axis.grid(alpha=0.3, which="both")
-        axis.legend(frameon=False)
-    figure.savefig(path, dpi=120)
+    return {"scene": scene, "seed": seed, "knob": knob, "value": "" if value is True else str(value)}

@@ -1,7 +1,5 @@
 """The study of sparse views: a grid of fits whose finished cells are kept, and its report."""
 
-from __future__ import annotations
-
 import os
 import sys
 from functools import partial
@@ -9,8 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 from kgs.errors import DataError
-
-__all__ = ["study"]
 
 
 def study(
@@ -44,15 +40,14 @@ def study(
     Raises:
         DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
     """
+    from . import presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
-    from .presets import sparse_cells
     from .report import write_report
 
-    folder = os.environ.get("KGS_DATA")
-    cells = sparse_cells(preset, None if folder is None else Path(folder))
-    data, weights = (None if path is None else os.path.abspath(path) for path in (folder, lpips_weights))
-    path = out / "sparse.jsonl"
+    folder, path = os.environ.get("KGS_DATA"), out / "sparse.jsonl"
+    cells = presets.sparse_cells(preset, None if folder is None else Path(folder))
+    data, weights = (None if place is None else os.path.abspath(place) for place in (folder, lpips_weights))
     if read_rows(path) and not finished_rows(cells, path):
         raise DataError(path, "", f"expected cells of --preset {preset}, got others; give each preset its own folder")
     try:

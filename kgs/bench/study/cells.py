@@ -4,8 +4,6 @@ Sources: the probe of co-adaptation is that of "Quantifying and Alleviating Co-A
 Splatting" (NeurIPS 2025, arXiv 2508.12720); the Gaussians over the threshold are the DropGaussian paper's own evidence.
 """
 
-from __future__ import annotations
-
 import subprocess
 import time
 import warnings
@@ -34,8 +32,6 @@ from kgs.fit.trainer import Trainer
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-__all__ = ["coadaptation", "count_over_threshold", "fit_and_measure", "revision", "sparse_cell"]
-
 SIZE = (72, 96)  # of the synthetic pictures
 FULL = "full-model"  # a start that no fit may have: the upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
@@ -44,7 +40,7 @@ BINS = 6
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
-    """Fit once and measure.
+    """Fit once and measure; plain values.
 
     Fits of the same scene, views, start and seed begin with the same points and see the views in the same order.
 
@@ -54,16 +50,10 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
             "method" (a name, for the report), "seed", and "fit", the fields of FitConfig that are not the default's.
         data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
-
-    Returns:
-        Plain values: means of the measures under "test" and "train", "test_views" (PSNR of each), "init",
-        "coadaptation", "thresholds", "protocol", and what `fit_and_measure` gives.
     """
-    scene, points, seconds = _start(data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"])
+    scene, points, seconds = _start(data, *(cell[key] for key in ("scene", "views", "downscale", "start", "seed")))
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
-    trainer, metrics, result = fit_and_measure(
-        scene, _config(cell["start"], cell["seed"], **cell["fit"]), points, lpips
-    )
+    trainer, metrics, result = fit_and_measure(scene, _config(**cell), points, lpips)
     return result | {
         **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
         "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
@@ -77,13 +67,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
 def fit_and_measure(
     scene: Scene, config: FitConfig, points: FirstPoints, lpips: Lpips | None = None
 ) -> tuple[Trainer, dict[str, Any], dict[str, Any]]:
-    """Fit once.
-
-    Returns:
-        The fit, its metrics, and what every cell stores of it: "curve", "gaussians", "wall_seconds" of the training,
-        "cpu_seconds" of the training and its curve, "peak_rss_mb", "config" (all settings of the fit), "versions",
-        "revision" (of the package) and "date" (UTC).
-    """
+    """One fit, its metrics, and what every cell stores of it; "cpu_seconds" are of the training and its curve."""
     trainer = Trainer(scene, config, points)
     start = time.process_time()
     trainer.fit()
@@ -129,8 +113,8 @@ def _start(
     return scene, points, time.process_time() - begin
 
 
-def _config(start: str, seed: int, **fit: Any) -> FitConfig:
-    return FitConfig(**{"init": "model-points" if start == FULL else start, "seed": seed, **fit})
+def _config(start: str, seed: int, fit: dict[str, Any] | None = None, **_: Any) -> FitConfig:
+    return FitConfig(**{"init": "model-points" if start == FULL else start, "seed": seed, **(fit or {})})
 
 
 def _full_model(scene: Scene, seed: int) -> FirstPoints:
@@ -150,16 +134,8 @@ def coadaptation(
 ) -> float | None:
     """How much Gaussians rely on each other: the variance of renders of random halves, 0 where all halves look alike.
 
-    Args:
-        model: the Gaussians, on the CPU.
-        views: from where to look; their images are not used.
-        near_plane: of the renderer, in world units.
-        subsets: how many halves per view, at least 2. The opacities of those that stay are not raised.
-        seed: of the halves; each view has others.
-
-    Returns:
-        The variance between subsets (of clamped renders, unbiased), mean over channels and over the pixels of all views
-        that have an alpha above 0.8 in every subset; None where there are no such pixels.
+    Unbiased, of clamped renders whose opacities are not raised; the mean over channels and over the pixels of all views
+    that have an alpha above 0.8 in every one of the `subsets` (at least 2) halves; None where there are no such pixels.
     """
     if subsets < 2:
         raise ValueError(f"subsets: expected at least 2, got {subsets}")
@@ -180,18 +156,11 @@ def coadaptation(
 
 
 def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, Any]:
-    """Count Gaussians, and those whose mean gradient is over the densification threshold, by distance.
+    """Count Gaussians, and those whose mean gradient since the last densification is over the threshold, by distance.
 
-    The distance is that to the nearest training camera, in medians of the first points' distances; the edges are
-    quantiles of these, so that fits that begin alike are counted alike. What lies beyond the outer edges counts in the
-    outer bins. Where a fit is at its limit of Gaussians, those count that it could not densify.
-
-    Args:
-        trainer: a fit, with what its densifier has seen since the last densification.
-        first_points: where it began, `(P, 3)`.
-
-    Returns:
-        "distance": edges of the bins; "gaussians" and "over": a count for each bin.
+    The distance is that to the nearest training camera, in medians of the first points' distances. The edges of the
+    bins are quantiles of these, so that fits that begin alike are counted alike; what lies beyond them counts in the
+    outer bins. A fit at its limit of Gaussians keeps those that it could not densify.
     """
     centers = camera_centers(trainer.scene.train.cameras)
     clouds = (first_points, trainer.model.means)

@@ -1,11 +1,8 @@
 """Runs many cells of an experiment, each once: finished ones are kept in a file and not repeated.
 
-A cell is a dict of plain values: what to do and under which settings. Its result is appended to a JSONL file the moment
-it is there, so that a run that is killed loses no finished cell, and the next one goes on. Cells run on the workers of
-Dask, on this machine or on many.
+A cell is a dict of plain values. Its result is appended to a JSONL file the moment it is there, so that a run that is
+killed loses no finished cell, and the next one goes on. Cells run on the workers of Dask, here or on many machines.
 """
-
-from __future__ import annotations
 
 import asyncio
 import json
@@ -16,46 +13,38 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Security, wait
 from distributed.core import rpc
 
-__all__ = ["Cell", "finished_rows", "read_rows", "run_grid"]
-
 Cell = dict[str, Any]
-Result = dict[str, Any]
+Work = Callable[[Cell], dict[str, Any]]
 PATIENCE = 10  # seconds for a scheduler to answer
 _LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
 
 
 def run_grid(
     cells: Sequence[Cell],
-    work: Callable[[Cell], Result],
+    work: Work,
     path: Path,
     *,
     processes: int | None = None,
     scheduler: str | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
-    """Do the cells that the file does not have yet.
+    """Do the cells that the file does not have yet; return the lines of those that are there, in the cells' order.
 
     Args:
-        cells: what to do, each different from the others.
+        cells: what to do, each different from the others. One whose worker dies is tried once more.
         work: a function of a module (other processes import it); takes a cell, returns its result in plain values.
         path: JSONL, one line `{"cell": ..., "result": ...}` per finished cell; a last line that was cut short is
             dropped.
         processes: how many processes of this machine, None for one per core; they share the cores.
-        scheduler: address of a Dask scheduler, as tcp://127.0.0.1:8786; its workers take the place of local processes
-            and need the same packages and data. They may come and go. Start them with
-            `dask worker ADDRESS --nthreads 1`: one cell at a time each, on as many cores as OMP_NUM_THREADS says there.
-        say: where lines for the user go.
-
-    Returns:
-        The lines of the given cells, in their order, without those that failed; `say` has their errors. A cell whose
-        worker dies is tried once more.
+        scheduler: address of a Dask scheduler whose workers take the place of local processes, one cell at a time each;
+            they need the same packages and data, and may come and go.
+        say: where lines for the user go, errors of cells among them.
 
     Raises:
         ValueError: two cells are equal, `processes` is below 1, another run has the file, no scheduler answers, or it
@@ -63,40 +52,33 @@ def run_grid(
     """
     if processes is not None and processes < 1:
         raise ValueError(f"processes: expected at least 1, got {processes}")
-    keys = [_key(cell) for cell in cells]
-    if len(set(keys)) < len(keys):
+    if len({_key(cell) for cell in cells}) < len(cells):
         raise ValueError("cells: expected each one once, got two that are equal")
     failed = 0
     with _alone(path):
         done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
-        missing = [cell for cell, key in zip(cells, keys, strict=True) if key not in done]
+        missing = [cell for cell in cells if _key(cell) not in done]
         say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
-        if missing:
-            with _workers(processes, scheduler) as client:
-                for count, (cell, outcome) in enumerate(_outcomes(client, work, missing), 1):
-                    if isinstance(outcome, BaseException):
-                        failed += 1
-                        say(f"failed: {_key(cell)}: {type(outcome).__name__}: {outcome}")
-                    else:
-                        with path.open("a", encoding="utf-8") as file:
-                            file.write(json.dumps({"cell": cell, "result": outcome}, sort_keys=True) + "\n")
-                            file.flush()
-                            os.fsync(file.fileno())
-                        say(f"{count} of {len(missing)}: {_key(cell)}")
+        with _workers(processes, scheduler) if missing else nullcontext() as client:
+            for count, (cell, outcome) in enumerate(_outcomes(client, work, missing), 1):
+                if isinstance(outcome, BaseException):
+                    failed += 1
+                    say(f"failed: {_key(cell)}: {type(outcome).__name__}: {outcome}")
+                else:
+                    with path.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps({"cell": cell, "result": outcome}, sort_keys=True) + "\n")
+                        file.flush()
+                        os.fsync(file.fileno())
+                    say(f"{count} of {len(missing)}: {_key(cell)}")
     if failed:
         say(f"{failed} of {len(missing)} cells failed; run again to try them once more")
     return finished_rows(cells, path)
 
 
 def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
-    """The lines of a JSONL file, without a last one that was cut short; none where there is no file.
+    """The lines of a JSONL file, none where there is no file; ValueError: one before the last is damaged.
 
-    Args:
-        path: the file.
-        repair: also take that line out of the file, and end the last one.
-
-    Raises:
-        ValueError: another line than the last is damaged.
+    A last line that was cut short is left out; `repair` takes it out of the file, too, and ends the last whole one.
     """
     lines = path.read_bytes().splitlines() if path.exists() else []
     rows = []
@@ -154,9 +136,7 @@ async def _identify(address: str) -> None:
         raise ValueError(f"scheduler: {expected}, got {address!r} ({kind})")
 
 
-def _outcomes(
-    client: Any, work: Callable[[Cell], Result], cells: Sequence[Cell]
-) -> Iterator[tuple[Cell, Result | BaseException]]:
+def _outcomes(client: Any, work: Work, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Any]]:
     """Every cell with its result or error, as they come; one whose worker died is tried once more.
 
     A cell is tied to a free worker, and waits nowhere: Dask's own queues would have it die with another cell's worker,
@@ -199,12 +179,11 @@ def _alone(path: Path) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         try:
-            fcntl = import_module("fcntl")
-        except ImportError:  # Windows
-            yield
-            return
-        try:
+            import fcntl
+
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # Windows
+            pass
         except BlockingIOError as error:
             raise ValueError(f"{path}: expected no other run to write this file, but one does") from error
         yield

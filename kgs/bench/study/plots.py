@@ -1,140 +1,143 @@
-"""The plots of the study: one colour and marker per method in all of them."""
+"""The plots of the study and of the training sweep: one function draws them all, one colour and marker per method."""
 
-from __future__ import annotations
-
-import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from .presets import FAMILIES, FIXED, MAIN, OFF, PAPER
 from .tables import KEYS, STARTS, difference, each, main_cells
-
-__all__ = ["STYLES", "write_plots"]
 
 # Colours of Okabe and Ito, told apart by colour-blind people too; those that share one differ in the marker.
 STYLES = {OFF: ("#000000", "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
 for _colour, _names in zip(("#E69F00", "#CC79A7", "#009E73"), FAMILIES.values(), strict=True):
     STYLES = {**{name: (_colour, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
 _FILLS = dict(zip(STARTS, ("none", "left", "bottom", "top", "full", "right"), strict=True))  # of a start's markers
-_OTHER = ("#777777", "x")
 DPI = 110
-Draw = Callable[[Any, pd.DataFrame, dict[str, Any]], None]
+
+
+def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **axes: Any) -> Figure:
+    """One panel per value of the column "panel", two in a row, and one legend for all.
+
+    Args:
+        points: columns "panel", "label", "x", "y", and where they are known "dx" and "dy" (half the length of a bar),
+            "start" (fills the markers; without it a line joins them), and "name" (stands at the y axis).
+        styles: colour and marker by label; others get the next colour.
+        axes: settings of every panel, as matplotlib's Axes.set takes them.
+    """
+    titles, scattered, named = points.panel.unique(), "start" in points, "name" in points
+    columns, rows = min(2, len(titles)), -(-len(titles) // 2)
+    size = (9, 0.9 + 0.2 * len(points)) if named else (3.9 * columns + 0.4, 3.2 * rows + 0.5)
+    figure, found = Figure(size, dpi=DPI, layout="constrained"), dict[str, Any]()
+    for place, ((title,), some) in enumerate(each(points, "panel"), 1):
+        axis = figure.add_subplot(rows, columns, place)
+        for (label, start), part in each(some.assign(start=some.get("start", "")), "label", "start"):
+            colour, marker = styles.get(label, (f"C{len(found)}", "."))
+            look: dict[str, Any] = {"marker": marker, "ls": "" if scattered or named else "-", "alpha": 0.85, "ms": 5}
+            fill = _FILLS.get(start, "none" if scattered else "full")
+            bars = axis.errorbar(part.x, part.y, part.get("dy"), part.get("dx"), c=colour, fillstyle=fill, **look)
+            found.setdefault(label, bars)
+            if scattered:
+                found[f"from {start}"] = axis.plot([], [], "h", color="grey", fillstyle=fill)[0]
+        axis.set_title(title, fontsize=9)
+        axis.set(**axes)
+        axis.grid(alpha=0.3)
+        if named:
+            axis.set_yticks(some.y, some.name, fontsize=8)
+            axis.set_ylim(len(some) - 0.5, -0.5)
+            axis.axvline(0, color="#777777", linewidth=1)
+    if not named:
+        labels = sorted(found, key=lambda label: label.startswith("from "))
+        handles = [found[label] for label in labels]
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    return figure
 
 
 def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
-    """Write a PNG for each plot that has something to show; return the captions by name."""
-    points = main_cells(frame, STARTS)
-    points = points.assign(cost=points.cpu_seconds, coadaptation=1e3 * points.coadaptation)
-    points["gap"] = points["train.psnr"] - points["test.psnr"]
-    main = main_cells(frame[frame.method.isin(MAIN)])
-    rates = main[(main.method != FIXED) & main["thresholds.over"].notna()]
-    psnr, axes = "test PSNR [dB]", {"cost": "CPU time of the fit [s]", "coadaptation": "co-adaptation [1e-3]"}
-    axes["gap"] = "overfitting: PSNR of training views less that of test views [dB]"
-    captions = {"forest": "Paired differences of test PSNR over off, with 95 % intervals; n pairs"}
-    captions["curves"] = f"Test PSNR during the fit, {', '.join(MAIN)}: mean over seeds, band of one sd"
-    captions |= {n: f"Test PSNR against {x}; one point per cell, filled by its start" for n, x in axes.items()}
-    captions["thresholds"] = (
-        "Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, "
-        f"{OFF} and {PAPER}: mean over seeds, bars of one sd; each bin began with a sixth of the first points; a fit "
-        "at its limit of Gaussians keeps those that it could not densify"
-    )
-    figures = {"forest": _forest(frame), "curves": _panels(main[main.curve.str.len() > 0], _curve, "step", psnr)}
-    for name, label in axes.items():
-        cells = points.assign(x=points[name]).dropna(subset=["x", "test.psnr"])
-        figures[name] = _panels(cells, _scatter, label, psnr)
-    distance = "distance [median of the first points]"
-    figures["thresholds"] = _panels(rates, _thresholds, distance, "over the threshold [%]")
-    written = {name: figure for name, figure in figures.items() if figure is not None}
-    for name, figure in written.items():
-        figure.savefig(out / f"{name}.png")
-    return {f"{name}.png": captions[name] for name in written}
+    """Write a PNG for each plot that has something to show; return the captions by file name."""
+    captions = {}
+    for name, (points_of, xlabel, ylabel, caption) in _PLOTS.items():
+        points = points_of(frame)
+        if len(points):
+            panels(points, xlabel=xlabel, ylabel=ylabel).savefig(out / f"{name}.png")
+            captions[f"{name}.png"] = caption
+    return captions
 
 
-def _forest(frame: pd.DataFrame) -> Any:
+def _forest(frame: pd.DataFrame) -> pd.DataFrame:
     """Every difference over off: first the means over the scenes' main settings, then each setting's own."""
     main = main_cells(frame)
     groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in each(frame, *KEYS[:3])}
-    lines = []
-    for where, cells in groups.items():
-        gains = {method: difference(cells, "method", method, OFF) for method in cells.method.unique()}
-        lines += [
-            (f"{where}: {method} (n = {gain.pairs})", method, gain) for method, gain in gains.items() if gain.pairs
-        ]
-    if not lines:
-        return None
-    figure = _figure(9, 0.9 + 0.2 * len(lines))
-    axis = figure.subplots()
-    axis.set_yticks(range(len(lines)), [label for label, _, _ in lines], fontsize=8)
-    for level, (_, method, gain) in enumerate(lines):
-        colour, marker = STYLES.get(method, _OTHER)
-        axis.plot([gain.low, gain.high], [level, level], color=colour, linewidth=1.5)
-        axis.plot(gain.mean, level, marker, color=colour, markersize=5)
-    axis.axvline(0, color="#777777", linewidth=1)
-    axis.set(ylim=(len(lines) - 0.5, -0.5), xlabel="test PSNR over off, same first points and views [dB]")
-    axis.grid(axis="x", alpha=0.3)
-    return figure
+    lines = [
+        {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": gain.high - gain.mean}
+        for where, cells in groups.items()
+        for method in cells.method.unique()
+        if (gain := difference(cells, "method", method, OFF)).pairs
+    ]
+    return pd.DataFrame(lines).assign(panel="", y=range(len(lines)))
 
 
-def _curve(axis: Any, cells: pd.DataFrame, style: dict[str, Any]) -> None:
+def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
+    cells = main_cells(frame, STARTS)
+    known = {"gap": cells["train.psnr"] - cells["test.psnr"], "coadaptation": 1e3 * cells.coadaptation}
+    return _in_panels(cells.assign(x=known.get(x, cells.cpu_seconds), y=cells["test.psnr"]).dropna(subset=["x", "y"]))
+
+
+def _curves(frame: pd.DataFrame) -> pd.DataFrame:
+    main = main_cells(frame)
+    cells = main[main.method.isin(MAIN) & (main.curve.str.len() > 0)]
     curves = [{point["step"]: point["test_psnr"] for point in curve} for curve in cells.curve]
-    values = pd.DataFrame(curves, dtype=float).T.sort_index().dropna()
-    mean, spread = values.mean(axis=1), values.std(axis=1).fillna(0)
-    axis.plot(values.index, mean, markersize=4, **style)
-    axis.fill_between(values.index, mean - spread, mean + spread, color=style["color"], alpha=0.15, lw=0)
+    return _over_seeds(cells, [pd.DataFrame(curves, cells.index, dtype=float)])
 
 
-def _thresholds(axis: Any, cells: pd.DataFrame, style: dict[str, Any]) -> None:
-    over, counts, edges = (
-        np.array(cells[f"thresholds.{key}"].tolist(), float) for key in ("over", "gaussians", "distance")
-    )
-    shares = pd.DataFrame(100 * over / np.where(counts > 0, counts, np.nan))
-    places = np.arange(over.shape[1]) + 0.46 + 0.08 * (style["label"] == PAPER)
-    axis.errorbar(places, shares.mean(), shares.std().fillna(0), markersize=4, capsize=2, **style)
-    axis.set_xticks(range(edges.shape[1]), [f"{edge:.2g}" for edge in edges.mean(0)])
-    axis.set_ylim(bottom=0)
+def _thresholds(frame: pd.DataFrame) -> pd.DataFrame:
+    main = main_cells(frame)
+    cells = main[main.method.isin((OFF, PAPER)) & main["thresholds.over"].notna()]
+    shares = []
+    for _, some in each(cells, "scene", "views"):
+        keys = ("over", "gaussians", "distance")
+        over, counts, edges = (np.array(some[f"thresholds.{key}"].tolist(), float) for key in keys)
+        middle = (edges[:, 1:] + edges[:, :-1]).mean(0) / 2
+        shares.append(pd.DataFrame(100 * over / np.where(counts > 0, counts, np.nan), some.index, middle))
+    return _over_seeds(cells, shares)
 
 
-def _scatter(axis: Any, cells: pd.DataFrame, style: dict[str, Any]) -> None:
-    for (start,), some in each(cells, "start"):
-        fill = {"fillstyle": _FILLS.get(start, "none"), "markersize": 5, "alpha": 0.85, "linestyle": ""}
-        axis.plot(some.x, some["test.psnr"], **style | fill)
-        axis.plot([], [], "h", color="grey", fillstyle=fill["fillstyle"], label=f"from {start}")
+def _over_seeds(cells: pd.DataFrame, values: list[pd.DataFrame]) -> pd.DataFrame:
+    """Mean and standard deviation over the seeds, of tables with one row per cell and one column per place."""
+    cells, lines = _in_panels(cells), []
+    for (panel, label), some in each(cells, "panel", "label"):
+        table = next(t for t in values if some.index[0] in t.index).loc[some.index].dropna(axis=1, how="all")
+        table = table.sort_index(axis=1)
+        points = pd.DataFrame({"x": table.columns, "y": table.mean().array, "dy": table.std().fillna(0).array})
+        lines.append(points.assign(panel=panel, label=label))
+    return pd.concat(lines) if lines else cells
 
 
-def _panels(frame: pd.DataFrame, draw: Draw, x: str, y: str) -> Any:
-    """One panel per scene and number of views, two in a row, and one legend for all; None of no cells."""
-    if frame.empty:
-        return None
-    settings = list(each(frame, "scene", "views"))
-    columns, rows = min(2, len(settings)), math.ceil(len(settings) / 2)
-    figure = _figure(3.9 * columns + 0.4, 3.2 * rows + 0.5)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    found: dict[str, Any] = {}
-    for axis, ((scene, views), cells) in zip(axes[: len(settings)], settings, strict=True):
-        for (method,), some in each(cells, "method"):
-            colour, marker = STYLES.get(method, _OTHER)
-            draw(axis, some, {"color": colour, "marker": marker, "label": method})
-        counts = cells.groupby(list(KEYS)).size().agg(["min", "max"]).unique()
-        title = f"{scene}, {views} views, n = {' to '.join(map(str, counts))}"
-        axis.set(xlabel=x, ylabel=y)
-        axis.set_title(title, fontsize=9)
-        axis.grid(alpha=0.3)
-        found |= {label: handle for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    for axis in axes[len(settings) :]:
-        axis.remove()
-    labels = sorted(found, key=lambda label: label.startswith("from "))
-    figure.legend(
-        [found[label] for label in labels], labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8
-    )
-    return figure
+def _in_panels(cells: pd.DataFrame) -> pd.DataFrame:
+    """The cells with their panel, one per scene and number of views, and their label."""
+    counts = cells.groupby([*KEYS]).seed.transform("size").groupby([cells.scene, cells.views])
+    low, high = counts.transform("min").astype(str), counts.transform("max").astype(str)
+    n = low.where(low == high, low + " to " + high)
+    return cells.assign(panel=cells.scene + ", " + cells.views.astype(str) + " views, n = " + n, label=cells.method)
 
 
-def _figure(width: float, height: float) -> Any:
-    return Figure(figsize=(width, height), dpi=DPI, layout=ConstrainedLayoutEngine(wspace=0.08, hspace=0.08))
+_GAP = "overfitting: PSNR, training less test views [dB]"
+_GAIN = "test PSNR over off, same first points and views [dB]"
+_DISTANCE, _PSNR = "distance [median of the first points]", "test PSNR [dB]"
+_CELLS = "one point per cell, filled by its start"
+_CURVES = f"Test PSNR during the fit, {', '.join(MAIN)}: mean over seeds, bars of one sd"
+_SHARES = (
+    "Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, "
+    f"{OFF} and {PAPER}: mean over seeds, bars of one sd; each point stands for a sixth of the first points; a fit at "
+    "its limit of Gaussians keeps those that it could not densify"
+)
+# What each plot shows, its axes, and its caption.
+_PLOTS = {"forest": (_forest, _GAIN, "", "Paired differences of test PSNR over off, with 95 % intervals; n pairs")}
+_PLOTS["curves"] = (_curves, "step", _PSNR, _CURVES)
+for _name, _x in {"gap": _GAP, "cost": "CPU time of the fit [s]", "coadaptation": "co-adaptation [1e-3]"}.items():
+    _PLOTS[_name] = (partial(_scattered, x=_name), _x, _PSNR, f"Test PSNR against {_x}; {_CELLS}")
+_PLOTS["thresholds"] = (_thresholds, _DISTANCE, "over the threshold [%]", _SHARES)

@@ -1,17 +1,13 @@
 """Statistics over seeds and scenes: paired differences with their intervals, and the noise between seeds.
 
-Functions take a table with one row per seed and one column per group; NaN stands where a group lacks a seed.
+Tables have one row per seed and one column per group; NaN stands where a group lacks a seed.
 """
-
-from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
 import pandas as pd
 from scipy import stats
-
-__all__ = ["BEST_OF_5", "Difference", "Noise", "noise_floor", "paired_difference"]
 
 BEST_OF_5 = 1.163  # how far the best of five runs lies over the mean on average, in standard deviations
 
@@ -33,25 +29,19 @@ class Difference(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """The spread between seeds under identical settings, its degrees of freedom, and how many groups it is from."""
+    """The standard deviation between seeds under equal settings, its degrees of freedom, and from how many groups."""
 
     sd: float
     freedom: int
     groups: int
 
     def between_means(self, n: int) -> float:
-        """What the means of two sets of n seeds differ by at most, 95 times in 100, if the settings do nothing.
-
-        Student's t, as the standard deviation is itself from few numbers. For n = 1: two single runs.
-        """
+        """What two means of n seeds differ by at most, 95 times in 100, if the settings do nothing (Student's t)."""
         return float(stats.t.ppf(0.975, self.freedom)) * math.sqrt(2 / n) * self.sd
 
 
 def noise_floor(groups: pd.DataFrame) -> Noise:
-    """The standard deviation within groups: the root mean of their variances, weighted by their degrees of freedom.
-
-    Groups of fewer than two numbers say nothing; NaN of nothing else.
-    """
+    """The root of the groups' mean variance, weighted by degrees of freedom; NaN if no group has two numbers."""
     freedom = (groups.count() - 1).clip(lower=0)
     total = int(freedom.sum())
     variance = float((groups.var() * freedom).sum()) / total if total else math.nan
@@ -61,13 +51,12 @@ def noise_floor(groups: pd.DataFrame) -> Noise:
 def paired_difference(differences: pd.DataFrame) -> Difference:
     """The mean over scenes of each scene's mean difference, with its 95 % interval.
 
-    The scenes are taken as given, and the seeds as drawn: the interval is Student's t with the variance between seeds
-    pooled over the scenes, sum (n_s - 1) degrees of freedom. It says nothing of other scenes. For one scene it is the
-    usual interval of paired differences; where no scene has two pairs there is none.
+    The scenes are taken as given, the seeds as drawn: Student's t with the variance between seeds pooled over the
+    scenes, sum (n_s - 1) degrees of freedom. There is no interval where no scene has two pairs.
     """
     counts = differences.count()
     counts = counts[counts > 0]
     mean, noise = float(differences.mean().mean()), noise_floor(differences)
     error = noise.sd * math.sqrt((1 / counts).sum()) / max(1, len(counts))
-    half = float(stats.t.ppf(0.975, noise.freedom)) * error  # NaN without any freedom
+    half = float(stats.t.ppf(0.975, noise.freedom)) * error
     return Difference(int(counts.sum()), mean, mean - half, mean + half)

@@ -1,7 +1,6 @@
 """The tables of the study, each figure with its n; the paper's printed figures stand beside ours."""
 
-from __future__ import annotations
-
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,14 +13,11 @@ from .presets import EQUAL_MEAN_RATE, FAMILIES, FIXED, MAIN, METHODS, OFF, PAPER
 from .published import benchmark_of, published, published_difference
 from .statistics import BEST_OF_5, Difference, noise_floor, paired_difference
 
-__all__ = ["COLUMNS", "KEYS", "LPIPS", "QUALITY", "STARTS", "cells_frame", "difference", "each", "findings"]
-__all__ += ["main_cells", "sparse_tables", "wide"]
-
 KEYS = ("scene", "views", "start", "method")  # what cells have in common that differ in the seed alone
-COLUMNS = (
-    *(f"{part}.{name}" for part in ("test", "train") for name in MEASURES),
-    *("init.points", "init.seconds", "gaussians", "wall_seconds", "cpu_seconds", "peak_rss_mb", "coadaptation"),
-)
+COLUMNS = [f"{part}.{name}" for part in ("test", "train") for name in MEASURES]
+COLUMNS += ["init.points", "init.seconds", "gaussians", "wall_seconds", "cpu_seconds", "peak_rss_mb", "coadaptation"]
+_OTHERS = ["init.kind", "curve", *(f"thresholds.{key}" for key in ("distance", "gaussians", "over"))]
+_OTHERS += [f"protocol.{key}" for key in ("train", "test", "image_size")]
 STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
 LPIPS = "test.lpips_vgg_unscaled"
 QUALITY = {"test.psnr": 2, "test.ssim_zero_padded": 3, LPIPS: 3}  # and how many decimals
@@ -35,30 +31,21 @@ Lines = list[dict[str, str]]
 
 
 def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """One line per cell, scene by scene in the order of the rows: `KEYS`, "seed", "fit", numbers (NaN where absent).
+    """One line per cell of rows of "cell" and "result", by scene: `KEYS`, "seed", "fit", numbers (NaN where absent).
 
-    Args:
-        rows: dicts of "cell" and "result".
-
-    Raises:
-        ValueError: no rows, or two cells that differ in nothing but their fits' settings or size: those belong in two
-            reports.
+    ValueError: no rows, or two cells that differ in nothing but their fits' settings or size.
     """
     if not rows:
         raise ValueError("rows: expected at least one cell, got none")
-    cells = pd.DataFrame([dict(row["cell"]) for row in rows])[[*KEYS, "seed", "fit"]]
-    results = pd.json_normalize([dict(row["result"]) for row in rows])
-    numbers = results.reindex(columns=list(COLUMNS)).astype(float).replace([float("inf"), float("-inf")], float("nan"))
-    others = ["init.kind", "curve", "thresholds.distance", "thresholds.gaussians", "thresholds.over"]
-    others += ["protocol.train", "protocol.test", "protocol.image_size"]
-    frame = pd.concat([cells, numbers, results.reindex(columns=others)], axis=1)
-    for (*group, seed), some in each(frame, *KEYS, "seed"):
-        if len(some) > 1:
-            raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
-    order = {name: k for k, name in enumerate([*frame.scene.unique(), *STARTS, *METHODS])}
-    places = frame[["scene", "start", "method"]].apply(lambda column: column.map(order)).fillna(len(order))
-    places = pd.DataFrame(places).assign(views=frame.views).sort_values(list(KEYS), kind="stable")
-    return frame.iloc[places.index]
+    cells = pd.DataFrame([row["cell"] for row in rows])[[*KEYS, "seed", "fit"]]
+    results = pd.json_normalize([row["result"] for row in rows]).reindex(columns=COLUMNS + _OTHERS)
+    numbers = results[COLUMNS].astype(float)
+    for *group, seed in cells.loc[cells.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy():
+        raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
+    order = {name: k for k, name in enumerate([*cells.scene.unique(), *STARTS, *METHODS])}
+    places = cells[[*KEYS]].assign(**{key: cells[key].map(order).fillna(len(order)) for key in KEYS if key != "views"})
+    frame = pd.concat([cells, numbers.where(numbers.abs() < math.inf), results[_OTHERS]], axis=1)
+    return frame.iloc[places.sort_values([*KEYS], kind="stable").index]
 
 
 def each(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
@@ -96,14 +83,11 @@ def findings(frame: pd.DataFrame) -> list[str]:
     main, sentences = main_cells(frame, STARTS), []
     for what, pair in _COMPARISONS.items():
         cells = main[main.start == "dense"] if pair[0] == "method" else main[main.method == PAPER]
-        gain, cost, noise = (
-            difference(cells, *pair),
-            difference(cells, *pair, LPIPS),
-            noise_floor(differences(cells, *pair)),
-        )
+        gain, cost = difference(cells, *pair), difference(cells, *pair, LPIPS)
         by_scene = {name.rpartition("/")[2]: difference(some, *pair) for (name,), some in each(cells, "scene")}
         scenes = [f"{name} {found.text()}" for name, found in by_scene.items() if found.pairs]
         if scenes:
+            noise = noise_floor(differences(cells, *pair))
             spread = f", standard deviation of a pair: {noise.sd:.2f} dB" if noise.freedom else ""
             lpips = f" LPIPS (less is better): {cost.text(3)}." if cost.pairs else ""
             sentences.append(
@@ -134,68 +118,68 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {title: pd.DataFrame(lines) for title, lines in tables.items() if lines}
 
 
+def _settings(cells: pd.DataFrame) -> Lines:
+    return [line for _, some in each(cells, *KEYS[:3]) for line in _compared(some, MAIN)]
+
+
 def _methods(main: pd.DataFrame) -> Lines:
-    lines = [line for _, cells in each(main, *KEYS[:3]) for line in _compared(cells, MAIN)]
     found = main[main.method.isin(MAIN)]
     common = found[found.groupby("scene").method.transform("nunique") == found.method.nunique()]
     llff = common[(common.views == 3) & common.scene.map(lambda scene: benchmark_of(scene, 3) == "LLFF").astype(bool)]
-    for kind, cells in {"LLFF scenes": llff, "scenes": common if len(llff) < len(common) else llff[:0]}.items():
-        lines += _compared(cells, MAIN, kind) if cells.scene.nunique() > 1 else []
-    return lines
+    lines = _settings(main) + _compared(llff, MAIN, "LLFF scenes")
+    return lines + (_compared(common, MAIN, "scenes") if len(llff) < len(common) else [])
 
 
 def _views(frame: pd.DataFrame) -> Lines:
     dense = frame[frame.start == "dense"]
     several = dense[dense.groupby("scene").views.transform("nunique") > 1]
-    lines = [line for _, cells in each(several, *KEYS[:3]) for line in _compared(cells, MAIN)]
-    for (views,), cells in each(several.sort_values("views", kind="stable"), "views"):
-        lines += _compared(cells, MAIN, "scenes", f", {views} views") if cells.scene.nunique() > 1 else []
-    return lines
+    means = each(several.sort_values("views", kind="stable"), "views")
+    more = [line for (n,), cells in means for line in _compared(cells, MAIN, "scenes", f", {n} views")]
+    return _settings(several) + more
 
 
 def _ablations(cells: pd.DataFrame) -> dict[str, Lines]:
     where, benchmark, views = _setting(cells), _benchmark(cells), cells.views.iloc[0]
+    found = set(cells.method)
     tables = {
         f"{title} ({where})": _compared(cells, (OFF, PAPER, *family), bases=(OFF, PAPER))
         for title, family in FAMILIES.items()
-        if set(family) & set(cells.method)
+        if found & set(family)
     }
-    tables[f"A growing rate against a fixed one of the same mean ({where})"] = [
-        {
-            "": f"{method} over {base}",
-            "PSNR [dB] (pairs)": _counted(difference(cells, "method", method, base)),
-            "paper": published_difference(benchmark, views, method, base),
-        }
-        for method, base in EQUAL_MEAN_RATE.items()
-        if {method, base} <= set(cells.method)
-    ]
-    return tables
+    lines = []
+    for method, base in EQUAL_MEAN_RATE.items():
+        if {method, base} <= found:
+            line = {"": f"{method} over {base}", "PSNR [dB] (pairs)": _gain(cells, method, base)}
+            lines.append(line | {"paper": published_difference(benchmark, views, method, base)})
+    return tables | {f"A growing rate against a fixed one of the same mean ({where})": lines}
 
 
 def _compared(
     cells: pd.DataFrame, methods: Iterable[str], kind: str = "", more: str = "", bases: Sequence[str] = (OFF,)
 ) -> Lines:
     """One line per method that all scenes have: of one setting, or (`kind`) by seed of the mean over several."""
-    scenes, benchmark, views = cells.scene.unique(), _benchmark(cells), cells.views.iloc[0]
+    scenes, lines = cells.scene.unique(), Lines()
+    if kind and len(scenes) < 2:
+        return lines
+    benchmark, views = _benchmark(cells), cells.views.iloc[0]
     names = ", ".join(scene.rpartition("/")[2] for scene in scenes)
     name = f"mean of {len(scenes)} {kind} ({names}){more}" if kind else _setting(cells)
-    lines = []
     for method in methods:
         if cells[cells.method == method].scene.nunique() == len(scenes):
             psnr, ssim, lpips = (wide(cells, measure, method=method).dropna().mean(axis=1) for measure in QUALITY)
             line = ({"scene": name} if len(bases) == 1 else {}) | {"method": method} | _spread(psnr)
-            line |= {f"over {b} [dB] (pairs)": _counted(difference(cells, "method", method, b)) for b in bases}
+            line |= {f"over {base} [dB] (pairs)": _gain(cells, method, base) for base in bases}
             line |= {"SSIM": mean_sd(ssim, 3), "LPIPS": mean_sd(lpips, 3)}
             line["LPIPS over off"] = difference(cells, "method", method, OFF, LPIPS).text(3)
             line["paper: PSNR / SSIM / LPIPS"] = published(benchmark, views, method)
-            line |= {f"paper: over {b}": published_difference(benchmark, views, method, b) for b in bases}
+            line |= {f"paper: over {base}": published_difference(benchmark, views, method, base) for base in bases}
             lines.append(line)
     return lines
 
 
 def _starts(frame: pd.DataFrame) -> Lines:
     lines = []
-    for (scene, views, method), cells in each(frame[frame.method.isin(MAIN)], "scene", "views", "method"):
+    for (scene, views, method), cells in each(frame[frame.method.isin(MAIN)], *KEYS[:2], "method"):
         same = frame[(frame.scene == scene) & (frame.views == views)]
         for (start,), some in each(cells, "start") if cells.start.nunique() > 1 else ():
             gave = sorted({*some["init.kind"]} - {start}) if start in ("dense", "sift") else []
@@ -204,9 +188,9 @@ def _starts(frame: pd.DataFrame) -> Lines:
             line["start"] = f"{start} (gave {', '.join(gave)})" if gave else start + note
             line |= _spread(some["test.psnr"])
             line |= {"first points": mean_sd(some["init.points"], 0), "their CPU [s]": mean_sd(some["init.seconds"], 0)}
-            line["over sift [dB] (pairs)"] = _counted(difference(cells, "start", start, "sift"))
-            over_off = difference(same[same.start == start], "method", method, OFF)
-            lines.append(line | {"over off, same start [dB] (pairs)": _counted(over_off)})
+            line["over sift [dB] (pairs)"] = _gain(cells, start, "sift", "start")
+            line["over off, same start [dB] (pairs)"] = _gain(same[same.start == start], method, OFF)
+            lines.append(line)
     return lines
 
 
@@ -226,15 +210,13 @@ def _noise(frame: pd.DataFrame) -> Lines:
 
 
 def _cost(main: pd.DataFrame) -> Lines:
-    measures = {"wall clock [s]": "wall_seconds", "CPU [s]": "cpu_seconds", "Gaussians": "gaussians"}
-    measures["peak memory [MiB]"] = "peak_rss_mb"
+    main = main.assign(gap=main["train.psnr"] - main["test.psnr"], thousandths=1e3 * main.coadaptation)
+    heads = {"PSNR, training less test views [dB]": ("gap", 2), "wall clock [s]": ("wall_seconds", 0)}
+    heads |= {"CPU [s]": ("cpu_seconds", 0), "Gaussians": ("gaussians", 0), "peak memory [MiB]": ("peak_rss_mb", 0)}
+    heads["co-adaptation [1e-3]"] = ("thousandths", 2)
     return [
-        {
-            **{"scene": _setting(cells), "method": method, "n": str(len(cells))},
-            "PSNR, training less test views [dB]": mean_sd(cells["train.psnr"] - cells["test.psnr"], 2),
-            **{head: mean_sd(cells[measure], 0) for head, measure in measures.items()},
-            "co-adaptation [1e-3]": mean_sd(1e3 * cells.coadaptation, 2),
-        }
+        {"scene": _setting(cells), "method": method, "n": str(len(cells))}
+        | {head: mean_sd(cells[measure], decimals) for head, (measure, decimals) in heads.items()}
         for (*_, method), cells in each(main, *KEYS)
     ]
 
@@ -242,7 +224,7 @@ def _cost(main: pd.DataFrame) -> Lines:
 def _protocol(frame: pd.DataFrame) -> Lines:
     """Sizes, splits, and the settings that all fits of a scene and number of views share."""
     lines = []
-    for (scene, views), cells in each(frame.sort_values(["scene", "views"]), "scene", "views"):
+    for (scene, views), cells in each(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
         train, test, (height, width) = (cells[f"protocol.{key}"].iloc[0] for key in ("train", "test", "image_size"))
         shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
         counts = {"training views": len(train), "test views": len(test), "cells": len(cells)}
@@ -258,15 +240,16 @@ def _setting(cells: pd.DataFrame) -> str:
 
 def _benchmark(cells: pd.DataFrame) -> str | None:
     """The paper's benchmark that all these cells are from."""
-    found = {(benchmark_of(scene, views), views) for (scene, views), _ in each(cells, "scene", "views")}
+    found = {(benchmark_of(scene, views), views) for (scene, views), _ in each(cells, *KEYS[:2])}
     return found.pop()[0] if len(found) == 1 else None
 
 
-def _spread(psnr: pd.Series[float]) -> dict[str, str]:
+def _spread(psnr: "pd.Series[float]") -> dict[str, str]:
     """How many, mean (sd) and best, in dB."""
     best = f"{psnr.max():.2f}" if psnr.count() else "-"
     return {"n": str(psnr.count()), "PSNR [dB]": mean_sd(psnr, 2), "best": best}
 
 
-def _counted(gain: Difference) -> str:
+def _gain(cells: pd.DataFrame, value: str, base: str, key: str = "method") -> str:
+    gain = difference(cells, key, value, base)
     return f"{gain.text()} ({gain.pairs})" if gain.pairs else "-"
