@@ -28,6 +28,7 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
         styles: colour and marker by label; others get the next colour.
         axes: settings of every panel, as matplotlib's Axes.set takes them.
     """
+    styles = {label: (f"C{k}", ".") for k, label in enumerate(points.label.unique())} | styles
     titles, scattered, named = points.panel.unique(), "start" in points, "name" in points
     columns, rows = min(2, len(titles)), -(-len(titles) // 2)
     size = (9, 0.9 + 0.2 * len(points)) if named else (3.9 * columns + 0.4, 3.2 * rows + 0.5)
@@ -35,7 +36,7 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
     for place, ((title,), some) in enumerate(each(points, "panel"), 1):
         axis = figure.add_subplot(rows, columns, place)
         for (label, start), part in each(some.assign(start=some.get("start", "")), "label", "start"):
-            colour, marker = styles.get(label, (f"C{len(found)}", "."))
+            colour, marker = styles[label]
             look: dict[str, Any] = {"marker": marker, "ls": "" if scattered or named else "-", "alpha": 0.85, "ms": 5}
             fill = _FILLS.get(start, "none" if scattered else "full")
             bars = axis.errorbar(part.x, part.y, part.get("dy"), part.get("dx"), c=colour, fillstyle=fill, **look)
