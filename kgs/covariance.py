@@ -50,7 +50,8 @@ class _FootprintFactors(torch.autograd.Function):
         r = _rotation_columns(q)
         turned = torch.stack([_dot(a[3 * i : 3 * i + 3], r[j::3]) for i in (0, 1) for j in (0, 1, 2)])
         ctx.save_for_backward(a, q, inverse_norm, s, turned)
-        return (turned.unflatten(0, (2, 3)) * s).permute(2, 0, 1).contiguous()
+        factors: Tensor = (turned.unflatten(0, (2, 3)) * s).permute(2, 0, 1).contiguous()
+        return factors
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:

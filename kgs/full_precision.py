@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 _SEPARATE = hasattr(torch.backends.mkldnn, "matmul")  # torch before 2.9 has one setting for all
-_BACKENDS: list[Any] = [torch.backends.mkldnn.matmul, torch.backends.cuda.matmul] if _SEPARATE else []
+_MKLDNN: Any = torch.backends.mkldnn
+_BACKENDS: list[Any] = [_MKLDNN.matmul, torch.backends.cuda.matmul] if _SEPARATE else []
 _lock = threading.Lock()
 _inside = 0
 _put_back: Callable[[], None]  # set by who enters first

@@ -78,15 +78,11 @@ def project_torch(
     with full_precision(device):
         parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]
     counts = torch.tensor([part[0].shape[0] for part in parts], device=device)
-    return ProjectedGaussians(
-        torch.repeat_interleave(torch.arange(len(parts), device=device), counts),
-        *(field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)),
-        image_size=size,
-        num_cameras=len(parts),
-        num_gaussians=len(gaussians),
-        num_nonfinite=(~finite).sum(),
-        eps2d=options.eps2d,
-    )
+    camera_ids = torch.repeat_interleave(torch.arange(len(parts), device=device), counts)
+    joined = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
+    ids, means2d, factors, depths, radii, opacities, rgb = joined
+    tensors = (camera_ids, ids, means2d, factors, depths, radii, opacities, rgb)
+    return ProjectedGaussians(*tensors, size, len(parts), len(gaussians), (~finite).sum(), options.eps2d)
 
 
 register("projection", "torch", project_torch)

@@ -147,18 +147,19 @@ class Backward(_Worker):
         grads = self.grads.index_select(0, group.tiles)
         behind = self.behind.index_select(0, group.tiles)[:, 0]
         for step in reversed(group.steps):
-            columns = (group.tiles, group.starts, group.ends, grads, behind)
+            columns = [group.tiles, group.starts, group.ends, grads, behind]
             if step.rows is None:
-                self._step(step, *(x[: step.count] for x in columns))
+                self._step(step, [x[: step.count] for x in columns])
             else:
                 rows = step.rows[: step.count]
-                *before, later = (x.index_select(0, rows) for x in columns)
-                self._step(step, *before, later)
-                behind.index_copy_(0, rows, later)
+                columns = [x.index_select(0, rows) for x in columns]
+                self._step(step, columns)
+                behind.index_copy_(0, rows, columns[-1])
         self.behind.index_copy_(0, group.tiles, behind[:, None])
 
-    def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
-        """Gradients of one step; `behind` becomes V before the step, see `kgs.raster`."""
+    def _step(self, step: Step, columns: list[Tensor]) -> None:
+        """Gradients of one step; the last column, V behind it, becomes V before the step, see `kgs.raster`."""
+        tiles, starts, ends, grads, behind = columns
         part, n, size = self.part, step.count, self.part.chunk_size
         positions, beyond, ids = self.entries(starts, ends, step.chunk)
         alpha = self.buffer(1, size, n) if step.alpha is None else step.alpha
