@@ -1,7 +1,9 @@
-"""JSON from files of unknown origin: every number finite, a limit on the size, one kind of error."""
+"""JSON from files of unknown origin (finite numbers, a limit on the size, one kind of error), and whole files."""
 
 import json
 import math
+import os
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,19 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
     return value
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all; a link stays one, and after an OSError what was there is untouched."""
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".kgs-{uuid.uuid4().hex}.tmp")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def parse_json(text: bytes) -> Any:

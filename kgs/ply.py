@@ -7,7 +7,6 @@ w x y z, and f_rest runs through one colour channel after the other.
 
 import os
 import re
-import uuid
 import warnings
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .errors import DataError
+from .json_files import write_whole
 from .model import GaussianModel
 from .types import SH_SIZES
 
@@ -65,13 +65,7 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
         position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
     header = f"ply\nformat binary_little_endian 1.0\ncomment kgs sh_degree {model.sh_degree}\nelement vertex {n}\n"
     header += "".join(f"property {position if name in 'xyz' else 'float'} {name}\n" for name in names) + "end_header\n"
-    target = Path(os.path.realpath(path))
-    unfinished = target.with_name(f".kgs-{uuid.uuid4().hex}.tmp")
-    try:
-        unfinished.write_bytes(header.encode("ascii") + columns.tobytes())
-        os.replace(unfinished, target)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_whole(Path(path), header.encode("ascii") + columns.tobytes())
 
 
 def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> GaussianModel:

@@ -8,7 +8,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
-from kgs.fit.starts.triangulate import Tracks
+from kgs.fit.starts.tracks import Tracks
 
 WIDTH, HEIGHT = 240, 180
 SMALL = (80, 60)

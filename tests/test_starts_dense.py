@@ -12,7 +12,8 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.starts import _sweep_range, first_points
-from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, _warp, dense_points, sweep_depths
+from kgs.fit.starts.dense import dense_points
+from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, _warp, sweep_depths
 from kgs.fit.starts.triangulate import project_all
 
 
@@ -79,8 +80,6 @@ def test_planes_out_of_range(views: Views) -> None:
     for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0)):
         with pytest.raises(ValueError, match="near, far"):
             sweep_depths(views, near, far)
-    with pytest.raises(ValueError, match="planes: expected at least 3, got 2"):
-        sweep_depths(views, 1.0, 2.0, planes=2)
 
 
 @pytest.mark.parametrize("count", [2, 10])

@@ -19,7 +19,8 @@ from start_scenes import (
 )
 
 from kgs.datasets.scene import Views
-from kgs.fit.starts.triangulate import Tracks, find_tracks, triangulate, triangulate_certain
+from kgs.fit.starts.tracks import Tracks, find_tracks
+from kgs.fit.starts.triangulate import triangulate, triangulate_certain
 
 
 @pytest.fixture(scope="module")

@@ -43,34 +43,16 @@ def demo(
         device: cpu, cuda, ...
     """
     from kgs.datasets import synthetic_scene
-    from kgs.ply import save_ply
 
-    from .outputs import check_folder, write_curve, write_json, write_sheet
-    from .run import choose_points, measure, train
-    from .trainer import Trainer
+    from .demo import run_demo
+    from .outputs import check_folder
 
     config = replace(DEMO, seed=seed, steps=steps, device=device)
     if min(size) < _SMALLEST:
         raise ValueError(f"size: expected at least {_SMALLEST} pixels a side, got {size[0]} {size[1]}")
     _prepare(device, "matplotlib")
     check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
-    scene = synthetic_scene(train_views=3, size=size, seed=seed)
-    points = choose_points(scene, config, each)
-    say(f"{len(scene.train)} training and {len(scene.test)} test views of {size[1]}x{size[0]}")
-    say(f"first points: {len(points.points)} ({points.kind})")
-    runs, renders, curves = dict[str, Any](), dict[str, Any](), dict[str, Any]()
-    for name, drop in (("without", 0.0), ("with", config.drop)):
-        trainer, title = Trainer(scene, replace(config, drop=drop), points), f"{name} DropGaussian"
-        if signal := train(trainer, None, title=title):
-            raise SystemExit(128 + signal)
-        runs[name], curves[title] = measure(trainer), trainer.curve
-        renders[title] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
-    save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
-    write_json(out / "metrics.json", runs)
-    write_curve(out / "curve.png", curves)
-    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs["without"]["test"]["views"]]
-    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
-    write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
+    runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), config, out)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
     level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():

@@ -15,11 +15,12 @@ from kgs.ply import save_ply
 
 from .checkpoint import previous
 from .config import FitConfig
+from .figures import write_curve
 from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, locked, publish
 from .lpips import Lpips
 from .machine import check_device, peak_rss_mb, versions
 from .metrics import evaluate
-from .outputs import check_folder, is_own, png_names, write_curve, write_json, write_png
+from .outputs import check_folder, is_own, png_names, write_json, write_png
 from .progress import Stage, each, progress, say, silent
 from .starts import FirstPoints, first_points
 from .trainer import Trainer

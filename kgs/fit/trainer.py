@@ -110,7 +110,7 @@ class Trainer:
         their copies while densifying, and what projection and harmonics keep for their backward passes.
         """
         images = self.scene.train.images
-        pictures = images[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * images.nbytes
+        pictures: int = images[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * images.nbytes
         return _BYTES_AT_FIRST_USE + self.config.max_bytes + self.max_gaussians * _BYTES_PER_GAUSSIAN + pictures
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:

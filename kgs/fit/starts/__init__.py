@@ -14,9 +14,10 @@ from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 from kgs.neighbours import log_spacing
 
+from .dense import dense_points
 from .files import read_points
-from .plane_sweep import dense_points
-from .triangulate import camera_centers, find_tracks, project_all, triangulate_certain, unproject
+from .tracks import find_tracks
+from .triangulate import camera_centers, project_all, triangulate_certain, unproject
 
 __all__ = ["FirstPoints", "first_points", "typical_depths"]
 

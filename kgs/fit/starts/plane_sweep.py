@@ -1,6 +1,4 @@
-"""A dense first cloud, where depth maps of the training views agree, each from a plane sweep.
-
-Planes parallel to a view's image are warped, compared, smoothed and refined.
+"""Depth maps from a plane sweep: planes parallel to a view's image are warped, compared, smoothed and refined.
 
 Sources: Collins, "A Space-Sweep Approach to True Multi-Image Matching" (CVPR 1996) for the sweep; Hirschmüller, "Stereo
 Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equations 11 to 14, for the smoothing.
@@ -19,7 +17,7 @@ from torch import Tensor
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
-from .triangulate import camera_centers, matrices, project_all, unproject
+from .triangulate import camera_centers, matrices
 
 PLANES = 128
 WINDOW = 7  # pixels, the side of the patches that are compared
@@ -27,9 +25,6 @@ NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
 # Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
 STEP, JUMP, EDGE = 0.06, 0.5, 0.04
-SCORE = 0.6  # a patch of a point has to match at least so well
-MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000
-AGREEMENT = 0.01  # relative difference of the depths that two views have of a point
 _VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
 
 
@@ -48,59 +43,18 @@ class DepthMap:
     is_inner: Tensor
 
 
-def dense_points(
-    views: Views, near: float, far: float, count: int, generator: torch.Generator, stage: Stage = silent
-) -> tuple[Tensor, Tensor]:
-    """At most `count` points of the surfaces that at least two views agree on, drawn at random, and their colours.
-
-    `near` and `far` bound the depths that are searched. Where the views have masks, points lie where both are above
-    0.5. Large pictures, and many of them, are swept at half the width and height, or a quarter: they give enough
-    points, in bounded time and memory. Returns points `(P, 3)` float32 in the views' frame and RGB in [0, 1], `(P, 3)`.
-    """
-    while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
-        views = views.halved()
-    maps = sweep_depths(views, near, far, stage=stage)
-    certain = [there.is_inner & (there.scores > SCORE) for there in maps]
-    if views.masks is not None:
-        certain = [pixels & (mask[0] > 0.5).cpu() for pixels, mask in zip(certain, views.masks, strict=True)]
-    found = [_agreed(views, maps, certain, view) for view in range(len(views))]
-    points, colors = (torch.cat(parts) for parts in zip(*found, strict=True))
-    chosen = torch.randperm(len(points), generator=generator)[:count]
-    return points[chosen].float(), colors[chosen]
-
-
-def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor]:
-    """The points of one view's certain pixels that another view's have too, and their colours in that view."""
-    here = maps[view].depths
-    rows, columns = certain[view].nonzero().unbind(1)
-    pixels = torch.stack([columns, rows], 1)
-    points = unproject(pixels, here[rows, columns].double(), torch.full_like(rows, view), views.cameras)
-    pixels, depths = project_all(points, views.cameras)
-    limits = torch.tensor(here.mT.shape)
-    agreed = torch.zeros(len(points), dtype=torch.bool)
-    for other in set(range(len(views))) - {view}:
-        places, depth = pixels[:, other].round(), depths[:, other]
-        inside = ((places >= 0) & (places < limits)).all(1) & (depth > 0)
-        x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
-        close = (maps[other].depths[y, x] / depth - 1).abs() < AGREEMENT
-        agreed |= inside & close & certain[other][y, x]
-    return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]
-
-
-def sweep_depths(views: Views, near: float, far: float, planes: int = PLANES, stage: Stage = silent) -> list[DepthMap]:
+def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent) -> list[DepthMap]:
     """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
 
     A view from whose place no other differs has no depths, and scores of -1.
 
     Raises:
-        ValueError: the range is empty or not in front of the cameras, or there are fewer than 3 planes.
+        ValueError: the range is empty or not in front of the cameras.
     """
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
-    if planes < 3:
-        raise ValueError(f"planes: expected at least 3, got {planes}")
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
-    inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
+    inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
     depth = 1 / float(inverse.mean())
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):

@@ -1,0 +1,38 @@
+"""The demonstration: one scene, fitted without and with DropGaussian from equal starts."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from kgs.datasets.scene import Scene
+from kgs.ply import save_ply
+
+from .config import FitConfig
+from .figures import write_curve, write_sheet
+from .outputs import write_json
+from .progress import each, say
+from .run import choose_points, measure, train
+from .trainer import Trainer
+
+
+def run_demo(scene: Scene, config: FitConfig, out: Path) -> dict[str, dict[str, Any]]:
+    """Fit a scene twice, write demo.png, curve.png, metrics.json and splat.ply, and return what metrics.json holds."""
+    points = choose_points(scene, config, each)
+    height, width = scene.train.images.shape[-2:]
+    say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
+    say(f"first points: {len(points.points)} ({points.kind})")
+    runs, renders, curves = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+    for name, drop in (("without", 0.0), ("with", config.drop)):
+        trainer, title = Trainer(scene, replace(config, drop=drop), points), f"{name} DropGaussian"
+        if signal := train(trainer, None, title=title):
+            raise SystemExit(128 + signal)
+        runs[name], curves[title] = measure(trainer), trainer.curve
+        renders[title] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
+    save_ply(out / "splat.ply", trainer.model, offset=scene.offset)
+    write_json(out / "metrics.json", runs)
+    write_curve(out / "curve.png", curves)
+    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs["without"]["test"]["views"]]
+    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
+    write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
+    return runs
