@@ -30,7 +30,7 @@ _BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")  # i
 _COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
 # What is used; then how tools sort, frame or normalise a scene and what they did to the world, which stays the file's.
 _KNOWN = """
-    frames file_path transform_matrix train_filenames val_filenames test_filenames
+    frames file_path transform_matrix
     camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
     aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
     applied_transform applied_scale orientation_override auto_scale_poses_override
@@ -88,7 +88,8 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     entries = data.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(source, "frames", "expected a list of objects, not empty")
-    notes = _check_keys(source, [data, *entries])
+    split = {f"{part}_filenames" for part in ("train", "val", "test")} if name == "transforms.json" else set[str]()
+    notes = _check_keys(source, [{key: data[key] for key in data.keys() - split}, *entries])
     names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
     paths = [path_inside(source, root, name) for name in names]
     size = next((read_size(path) for path in paths if path.is_file()), (1, 1))
@@ -113,7 +114,7 @@ def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
     for key, value in chain.from_iterable(item.items() for item in objects):
         if key in known or _says_nothing(value):
             continue
-        if _GEOMETRY.search(key):
+        if _GEOMETRY.search(key) or key.endswith("_filenames"):
             raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
         unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()

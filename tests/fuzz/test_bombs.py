@@ -68,13 +68,11 @@ def test_small_files_that_ask_for_much_memory_are_refused(
     assert is_cheap(outcome), outcome
 
 
-# Lists of files, which say what is trained on, have their place at the top of nerfstudio's file alone.
 PLACES = [
     (write, key, in_a_frame)
     for write in (write_blender, write_nerfstudio)
     for key in GEOMETRIC_KEYS
     for in_a_frame in (False, True)
-    if not key.endswith("_filenames") or (write is write_nerfstudio and not in_a_frame)
 ]
 
 
