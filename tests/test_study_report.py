@@ -17,7 +17,7 @@ from kgs.bench.study.plots import STYLES
 from kgs.bench.study.presets import EQUAL_MEAN_RATE, FAMILIES, METHODS
 from kgs.bench.study.report import write_report
 
-TEXTS = ("sparse.csv", "sparse.md", "sparse.tex", "index.html")
+TEXTS = ("sparse.csv", "sparse.md", "index.html")
 PLOTS = ("forest.png", "curves.png", "gap.png", "cost.png", "coadaptation.png", "thresholds.png")
 
 
@@ -52,19 +52,6 @@ class Balanced(HTMLParser):
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
-
-
-def assert_latex_is_sound(text):
-    text = re.sub("^%.*\n", "", text, flags=re.MULTILINE)
-    bare = re.sub(r"\\[\\{}&%$#_]", "", text)
-    assert bare.count("{") == bare.count("}")
-    assert bare.count("$") % 2 == 0
-    assert not re.search(r"[#%_^~]", bare)
-    for environment in ("table", "tabular"):
-        assert text.count(rf"\begin{{{environment}}}") == text.count(rf"\end{{{environment}}}")
-    for columns, body in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", text, re.DOTALL):
-        for line in re.findall(r"(.*?) \\\\", body):
-            assert line.replace(r"\&", "").count("&") == len(columns) - 1
 
 
 FULL = full()
@@ -111,7 +98,6 @@ def test_every_part_of_the_study_gives_sound_files(case, reports):
         found = list(csv.DictReader(file))
     assert [row["method"] for row in found] == [row["cell"]["method"] for row in rows]
     assert all(None not in row and None not in row.values() for row in found)
-    assert_latex_is_sound((out / "sparse.tex").read_text())
     page = Balanced()
     page.feed((out / "index.html").read_text())
     assert not page.open
@@ -247,8 +233,6 @@ def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
 def test_text_is_escaped(reports):
     out, _ = reports["unknown method, no LPIPS"]
     assert "<b>" not in (out / "index.html").read_text()
-    assert r"<b> \& \_" in (out / "sparse.tex").read_text()
-    assert r"$-$" in (reports["full"][0] / "sparse.tex").read_text()
 
 
 def test_the_page_can_be_cited(reports):

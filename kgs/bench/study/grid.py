@@ -1,8 +1,4 @@
-"""Runs many cells of an experiment, each once: finished ones are kept in a file and not repeated.
-
-A cell is a dict of plain values. Its result is appended to a JSONL file the moment it is there, so that a run that is
-killed loses no finished cell, and the next one goes on. Cells run on the workers of Dask, here or on many machines.
-"""
+"""Runs many cells of an experiment on the workers of Dask, each once: finished ones are kept in a file."""
 
 import asyncio
 import json
@@ -37,10 +33,9 @@ def run_grid(
     """Do the cells that the file does not have yet; return the lines of those that are there, in the cells' order.
 
     Args:
-        cells: what to do, each different from the others. One whose worker dies is tried once more.
+        cells: dicts of plain values, each different. One whose worker dies is tried once more.
         work: a function of a module (other processes import it); takes a cell, returns its result in plain values.
-        path: JSONL, one line `{"cell": ..., "result": ...}` per finished cell; a last line that was cut short is
-            dropped.
+        path: JSONL, a line `{"cell": ..., "result": ...}` as soon as a cell is done; one that was cut short is dropped.
         processes: how many processes of this machine, None for one per core; they share the cores.
         scheduler: address of a Dask scheduler whose workers take the place of local processes, one cell at a time each;
             they need the same packages and data, and may come and go.
@@ -64,12 +59,12 @@ def run_grid(
                 if isinstance(outcome, BaseException):
                     failed += 1
                     say(f"failed: {_key(cell)}: {type(outcome).__name__}: {outcome}")
-                else:
-                    with path.open("a", encoding="utf-8") as file:
-                        file.write(json.dumps({"cell": cell, "result": outcome}, sort_keys=True) + "\n")
-                        file.flush()
-                        os.fsync(file.fileno())
-                    say(f"{count} of {len(missing)}: {_key(cell)}")
+                    continue
+                with path.open("a", encoding="utf-8") as file:
+                    file.write(_key({"cell": cell, "result": outcome}) + "\n")
+                    file.flush()
+                    os.fsync(file.fileno())
+                say(f"{count} of {len(missing)}: {_key(cell)}")
     if failed:
         say(f"{failed} of {len(missing)} cells failed; run again to try them once more")
     return finished_rows(cells, path)
@@ -116,7 +111,10 @@ def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
     try:
         if scheduler is not None:
             with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
-                thread.submit(asyncio.run, _identify(scheduler)).result()
+                found = thread.submit(asyncio.run, _identify(scheduler))
+            if (kind := found.exception() or found.result()) != "Scheduler":
+                expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+                raise ValueError(f"scheduler: {expected}, got {scheduler!r} ({kind!r})")
         with nullcontext(scheduler) if scheduler else LocalCluster(**local) as place, Client(place) as client:
             yield client
     finally:
@@ -124,26 +122,16 @@ def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
             del os.environ[name]
 
 
-async def _identify(address: str) -> None:
-    """Asks what answers there. A Client would wait for ever for a port that is open and says nothing."""
-    try:
-        async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
-            kind = (await asyncio.wait_for(server.identity(), PATIENCE))["type"]
-    except Exception as error:  # whatever Dask makes of what answers there
-        kind = str(error) or "no answer"
-    if kind != "Scheduler":
-        expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
-        raise ValueError(f"scheduler: {expected}, got {address!r} ({kind})")
+async def _identify(address: str) -> str:
+    """What answers there. A Client would wait for ever for a port that is open and says nothing."""
+    async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
+        return str((await asyncio.wait_for(server.identity(), PATIENCE))["type"])
 
 
 def _outcomes(client: Any, work: Work, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Any]]:
-    """Every cell with its result or error, as they come; one whose worker died is tried once more.
-
-    A cell is tied to a free worker, and waits nowhere: Dask's own queues would have it die with another cell's worker,
-    and Dask would do a finished cell again whose worker is lost.
-    """
-    waiting, running = deque(cells), dict[Any, tuple[Cell, str]]()
-    again: list[Cell] = []
+    """Every cell with its result or error, as they come; one whose worker died is tried once more."""
+    # Each is tied to a free worker: Dask's queues would let it die with another's, and repeat what a lost one finished.
+    waiting, running, again = deque(cells), dict[Any, tuple[Cell, str]](), list[Cell]()
     while waiting or running:
         try:
             workers = client.nthreads()
@@ -175,7 +163,7 @@ def _key(cell: Cell) -> str:
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Holds the file, made if it is not there, against other runs; they would repeat cells and cut lines."""
+    """Holds the file, made if it is not there, against other runs."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         try:

@@ -1,5 +1,6 @@
 """The methods that the study compares, and which cells each preset has."""
 
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,9 @@ METHODS: dict[str, dict[str, Any]] = {
     **{f"progressive {rate}": {"drop": rate} for rate in (0.1, 0.3)},
     **{f"fixed {rate}": {"drop": rate} | _CONSTANT for rate in (0.05, 0.15, 0.2, 0.3)},
     **{by: {"drop": 0.2, "drop_by": by.replace(" ", "-")} for by in ("high gradient", "low gradient", "near", "far")},
-    **{
-        f"L1 {by} {weight}": {"drop": 0.0, "opacity_l1": weight, "opacity_l1_by": by}
-        for by, weight in product(("gradient", "distance"), (0.001, 0.01))
-    },
 }
+for _by, _weight in product(("gradient", "distance"), (0.001, 0.01)):
+    METHODS[f"L1 {_by} {_weight}"] = {"drop": 0.0, "opacity_l1": _weight, "opacity_l1_by": _by}
 FAMILIES = {
     "Rates and schedules": ["progressive 0.1", "progressive 0.3", *(f"fixed {r}" for r in (0.05, 0.1, 0.15, 0.2, 0.3))],
     "Selected Gaussians dropped instead of random ones": [name for name, fit in METHODS.items() if "drop_by" in fit],
@@ -33,9 +32,9 @@ EQUAL_MEAN_RATE = {"progressive 0.1": "fixed 0.05", "progressive 0.2": "fixed 0.
 SCENES = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3, "blender/lego": 8, "nerfstudio/fox": 12}
 # Numbers of views for the preset "paper", by the folder that a scene lies in.
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
-_FITS: dict[str, dict[str, Any]] = {"quick": {"steps": 200, "max_gaussians": 12_000}}
-_FITS |= {"cpu": {"steps": 2000}, "paper": {"steps": 10_000}}
-Setting = tuple[str, int, str, str, int]  # scene, views, start, method, seed
+_FITS = {"quick": {"steps": 200, "max_gaussians": 12_000}, "cpu": {"steps": 2000}, "paper": {"steps": 10_000}}
+# Cells by their product: seeds, scenes with their numbers of views, starts, methods.
+Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]
 
 
 def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
@@ -49,44 +48,42 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     if preset not in _FITS:
         raise ValueError(f"preset: expected one of {list(_FITS)}, got {preset!r}")
     if preset == "quick":
-        settings: list[Setting] = [(SYNTHETIC, 3, "dense", name, seed) for seed in range(3) for name in MAIN]
-        settings += [(SYNTHETIC, 3, "dense", name, 0) for name in ("fixed 0.2", "far", "L1 distance 0.01")]
-        settings += [(SYNTHETIC, 3, start, PAPER, 0) for start in ("sift", "random")]
+        scene, few = [(SYNTHETIC, 3)], ("fixed 0.2", "far", "L1 distance 0.01")
+        blocks: list[Block] = [(range(3), scene, ["dense"], MAIN), ([0], scene, ["dense"], few)]
+        blocks += [([0], scene, ["sift", "random"], [PAPER])]
     elif data is None:
         raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
     else:
-        settings = _cpu(data) if preset == "cpu" else _paper(data)
-    downscale = 2.0 if preset == "cpu" else None
-    keys = ("scene", "views", "start", "method", "seed")
-    cells = [dict(zip(keys, setting, strict=True)) | {"downscale": downscale} for setting in settings]
-    return [cell | {"fit": _FITS[preset] | METHODS[str(cell["method"])]} for cell in cells]
+        blocks = _cpu(data) if preset == "cpu" else _paper(data)
+    return [
+        {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
+        | {"downscale": 2.0 if preset == "cpu" else None, "fit": _FITS[preset] | METHODS[method]}
+        for block in blocks
+        for seed, (scene, views), start, method in product(*block)
+    ]
 
 
-def _cpu(data: Path) -> list[Setting]:
+def _cpu(data: Path) -> list[Block]:
     check_scenes(data, SCENES)
-    fern, flower = "llff/fern", "llff/flower"
-    settings: list[Setting] = []
+    fern, flower, bounds = "llff/fern", "llff/flower", ("random", "model-points", FULL)  # no fit may have the last two
+    blocks: list[Block] = []
     for seed in range(3):
-        settings += [(s, n, start, m, seed) for s, n in SCENES.items() for start in _starts(s) for m in MAIN]
-        settings += [(scene, views, "sift", PAPER, seed) for scene, views in SCENES.items()]
-    settings += [(s, views, "dense", name, 0) for s, views, name in product((fern, flower), (6, 9), (OFF, PAPER))]
-    settings += [(fern, 3, "dense", name, seed) for seed in range(3) for name in METHODS if name not in MAIN]
-    bounds = ("random", "model-points", FULL)  # no fit may have the last two
-    settings += [(fern, 3, start, PAPER, seed) for start in bounds for seed in range(3)]
-    return settings + [(flower, 3, start, PAPER, 0) for start in bounds]
+        blocks += [([seed], [scene], _starts(scene[0]), MAIN) for scene in SCENES.items()]
+        blocks += [([seed], SCENES.items(), ["sift"], [PAPER])]
+    blocks += [([0], [*product((fern, flower), (6, 9))], ["dense"], (OFF, PAPER))]
+    blocks += [(range(3), [(fern, 3)], ["dense"], [name for name in METHODS if name not in MAIN])]
+    blocks += [(range(3), [(fern, 3)], [start], [PAPER]) for start in bounds]
+    return [*blocks, ([0], [(flower, 3)], bounds, [PAPER])]
 
 
-def _paper(data: Path) -> list[Setting]:
+def _paper(data: Path) -> list[Block]:
     folders = [path for path in sorted(data.glob("*/*")) if path.is_dir() and path.parent.name in VIEWS]
     if not folders:
         raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
-    return [
-        (str(path.relative_to(data)), views, start, name, seed)
-        for seed, path in product(range(5), folders)
-        for views, start in product(VIEWS[path.parent.name], _starts(path.parent.name))
-        for name in METHODS
-        if name in MAIN or (path.parent.name == "llff" and views == 3)
-    ]
+    scenes = [(str(path.relative_to(data)), views) for path in folders for views in VIEWS[path.parent.name]]
+    every = [METHODS if scene.startswith("llff/") and views == 3 else MAIN for scene, views in scenes]
+    main = [([scene], _starts(scene[0]), methods) for scene, methods in zip(scenes, every, strict=True)]
+    return [([seed], *block) for seed in range(5) for block in main]
 
 
 def _starts(scene: str) -> tuple[str, ...]:

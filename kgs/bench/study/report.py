@@ -1,4 +1,4 @@
-"""The report of the study: CSV, Markdown, LaTeX, plots and a page that one can cite, from any part of its cells."""
+"""The report of the study: CSV, Markdown, plots and a page that one can cite, from any part of its cells."""
 
 import json
 import re
@@ -20,9 +20,7 @@ TITLE = "Sparse views: DropGaussian on and off at equal first points"
 
 
 def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int) -> str:
-    """Write sparse.csv (a line per cell), sparse.md, sparse.tex (for booktabs), plots and index.html.
-
-    Plots and tables that have nothing to show are left out. How to read all this is in notes.txt of this package.
+    """Write sparse.csv (a line per cell), sparse.md, index.html, and the plots that have something to show.
 
     Args:
         rows: dicts of "cell" and "result", any part of the study.
@@ -30,11 +28,7 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
         command: what makes this report again.
         planned: how many cells the study has when it is done.
 
-    Returns:
-        What sparse.md holds.
-
-    Raises:
-        ValueError: no rows, or two cells that differ in nothing but the settings of their fits.
+    Returns: what sparse.md holds. Raises ValueError as `cells_frame`.
     """
     frame = cells_frame(rows)
     out.mkdir(parents=True, exist_ok=True)
@@ -47,17 +41,14 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     page.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
     notes = page.get_template("notes.txt").render().splitlines()
     text = "\n".join([f"# {TITLE}", "", *(f"- {finding}" for finding in (*results, *origin)), "", ""])
-    latex = "".join(f"% {sentence}\n" for sentence in (*results, *origin, *notes))
     for title, table in tables.items():
         text += markdown_table(title, table.columns[1:], table.to_numpy().tolist(), table.columns[0])
-        body = table.to_latex(index=False, escape=True, caption=re.sub(r"([%_])", r"\\\1", title))
-        latex += f"{{\\scriptsize\n{re.sub(r'(?<![A-Za-z0-9_-])-(?=[0-9])', '$-$', body)}}}\n\n"
     text += "\n".join(f"- {note}" for note in notes) + "\n"
     content: dict[str, Any] = {"title": TITLE, "findings": results, "origin": origin, "notes": notes, "tables": tables}
     content["pictures"] = {caption: b64encode((out / name).read_bytes()).decode() for name, caption in plots.items()}
     html = page.get_template("page.html.jinja").render(**content, version=__version__)
-    for name, written in {"sparse.md": text, "sparse.tex": latex, "index.html": html}.items():
-        (out / name).write_text(written, encoding="utf-8")
+    (out / "sparse.md").write_text(text, encoding="utf-8")
+    (out / "index.html").write_text(html, encoding="utf-8")
     return text
 
 
@@ -65,9 +56,8 @@ def _origin(results: Sequence[Mapping[str, Any]], path: Path, planned: int) -> l
     """Where the figures are from: how many cells, their commit and dates, and the versions that they ran with."""
     dates, code = (sorted({r[key] for r in results if r.get(key)}) for key in ("date", "revision"))
     versions = {", ".join(f"{k} {v}" for k, v in sorted(r.get("versions", {}).items())): None for r in results}
-    commit = revision(path)
     made = [f"{len(results)} of {planned} cells"]
-    made += [f"{path.name} at commit {commit}"] if commit else []
+    made += [f"{path.name} at commit {commit}"] if (commit := revision(path)) else []
     made += [f"cells that say when they ran: {dates[0]} to {dates[-1]}"] if dates else []
     made += [f"cells that say of which code: {', '.join(code)}"] if code else []
     return [f"Figures: {'; '.join(made)}.", f"Versions: {'; '.join(versions)}."]
