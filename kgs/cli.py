@@ -25,7 +25,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": 
 _BENCHES = {
     "speed": "time and memory of rendering and of training steps",
     "precision": "errors of images, gradients and footprints against time",
-    "extremes": "errors, bounds and times of stiff and extreme cases",
+    "extremes": "errors of stiff and extreme cases, and their bounds",
     "starts": "depth errors, completeness and times of first points",
     "study": "DropGaussian on and off, its schedules and rivals, over scenes and seeds",
     "training": "test PSNR against time, one setting of a fit at a time",

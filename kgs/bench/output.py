@@ -1,4 +1,4 @@
-"""What the benchmarks write: tables in Markdown, CSV and JSON, and a mean with its spread."""
+"""What the benchmarks write: tables in Markdown, CSV and JSON, plots, and a mean with its spread."""
 
 import csv
 import math
@@ -32,19 +32,34 @@ def mean_sd(values: Iterable[float], decimals: int) -> str:
 
 
 def write_results(path: Path, rows: list[Row], tables: str, **more: Any) -> None:
-    """Write a benchmark's .csv, .json and .md file, and print the tables.
-
-    Args:
-        path: the files without their endings.
-        rows: lines of the CSV; all have the keys of the first.
-        tables: Markdown.
-        more: what the JSON holds beside "rows", "threads" and "versions".
-    """
+    """Print the tables, Markdown, and write them as path.md; path.csv: the rows; path.json: the rows and `more`."""
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    content = {"rows": rows, **more, "threads": torch.get_num_threads(), "versions": versions()}
-    write_json(path.with_suffix(".json"), content)
+    machine = {"threads": torch.get_num_threads(), "versions": versions()}
+    write_json(path.with_suffix(".json"), {"rows": rows, **more, **machine})
     path.with_suffix(".md").write_text(tables, encoding="utf-8")
     print(tables)
+
+
+def write_plot(path: Path, panels: dict[str, dict[str, tuple[Any, str]]], rows: int = 1, **axes: Any) -> None:
+    """Panels by title, in each lines by label: points `(P, 2)` and matplotlib's format string; both axes logarithmic.
+
+    The first panel's legend is that of all; `axes` are settings of each, as matplotlib's Axes.set takes them.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, LogLocator
+
+    columns = math.ceil(len(panels) / rows)
+    figure = Figure(figsize=(3.6 * columns, 3.4 * rows + 0.4), layout="constrained")
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axis, (title, lines) in zip(grid.flat, panels.items(), strict=False):
+        for label, (points, look) in lines.items():
+            axis.loglog(*zip(*points, strict=True), look, markersize=5, linewidth=1, alpha=0.8, label=label)
+        axis.set(title=title, **axes)
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set(major_formatter=EngFormatter(sep=""), minor_formatter="")
+        axis.grid(alpha=0.3)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    figure.savefig(path, dpi=100)

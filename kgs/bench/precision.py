@@ -1,7 +1,6 @@
-"""Error against run time: what each knob of the renderer costs in accuracy, in the image and in its gradients.
+"""Error against run time of each knob of the renderer, against the dense float64 reference with both thresholds 0.
 
-Errors are against `kgs.reference`: dense, in float64, both thresholds 0. Scenes are drawn in float64 and rounded once
-for float32, so that rounding is part of the float32 error.
+Scenes are drawn in float64 and rounded once for float32, so that rounding is part of the float32 error.
 """
 
 import math
@@ -9,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,16 +18,16 @@ from kgs.projection import project
 from kgs.raster import composite
 from kgs.types import Gaussians, RasterOptions
 
-from .output import Row, markdown_table, write_results
+from .output import Row, markdown_table, write_plot, write_results
 from .scenes import DTYPES, PARAMETERS, Scene, cast, centred_camera, exact, gradients, layered_scene, relative_errors
 from .timing import take_turns
 
-LEVELS = {"half a grey level, 2e-3": (2e-3, "--"), "float32 floor, 1.4e-6": (1.4e-6, ":")}
+LEVELS = {"half a grey level, 2e-3": (2e-3, "k--"), "float32 floor, 1.4e-6": (1.4e-6, "k:")}
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to render, in the options of the renderer and of `composite`; the defaults are theirs."""
+    """One way to render; options and defaults are those of the renderer and of `composite`."""
 
     alpha_threshold: float = RasterOptions.alpha_threshold
     transmittance_stop: float = RasterOptions.transmittance_stop
@@ -47,6 +47,7 @@ KNOBS = {
     "tiles 4 to 64": [replace(DEFAULT, tile_size=t) for t in (4, 8, 16, 32, 64)],
     "chunks 4 to 256": [replace(DEFAULT, chunk_size=k) for k in (4, 16, 64, 256)],
 }
+_LOOKS = ("o-", "s-", "^-", "D-", "v-", "x-", "k*")  # of the knobs and the default in the plots
 _COLUMNS = {"default": DEFAULT, "alpha 1/1024": replace(DEFAULT, alpha_threshold=1 / 1024)}
 _COLUMNS |= {"exact, float32": EXACT, "exact, float64": EXACT64}
 
@@ -56,7 +57,6 @@ def precision(*, out: Path, quick: bool = False) -> None:
 
     For example:
       kgs bench precision -o precision
-      kgs bench precision -o precision --quick
 
     Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
 
@@ -70,8 +70,8 @@ def precision(*, out: Path, quick: bool = False) -> None:
         print(f"{name} ...")
         measured = make(*((300, 48) if quick else (3000, 96))).measure(repeats=1 if quick else 3)
         rows += [{"scene": name, **row} for row in measured]
-    _plot_scenes(out / "render.png", rows, "max_error", "forward_s", "largest error of the image")
-    _plot_scenes(out / "gradients.png", rows, "gradient", "backward_s", "largest relative error of a gradient")
+    _plot(out / "render.png", rows, "max_error", "forward_s", "largest error of the image, at least 1e-8")
+    _plot(out / "gradients.png", rows, "gradient", "backward_s", "relative error of a gradient, at least 1e-8")
     write_results(out / "precision", rows, _markdown(rows))
 
 
@@ -103,7 +103,7 @@ class Measured:
             error = (self.image(s) - expected).abs()
             parts = relative_errors(self.backward(s), expected_gradients)
             row = {**asdict(s), "max_error": float(error.max()), "rmse": float(error.square().mean().sqrt())}
-            row |= {"gradient": float(parts.max())}
+            row["gradient"] = float(parts.max())
             row |= {f"gradient_{name}": float(part) for name, part in zip(PARAMETERS, parts, strict=True)}
             for name, times in (("forward", forward[str(s)]), ("backward", backward[str(s)])):
                 row |= {f"{name}_s": times.wall, f"{name}_best_s": times.best, f"{name}_worst_s": times.worst}
@@ -156,34 +156,20 @@ def _find(rows: list[Row], scene: str, setting: Setting) -> Row:
 
 
 def _markdown(rows: list[Row]) -> str:
-    lines = []
-    for scene in dict.fromkeys(row["scene"] for row in rows):
+    lines: dict[str, list[str]] = {row["scene"]: [] for row in rows}
+    for scene, line in lines.items():
         found = (_find(rows, scene, setting) for setting in _COLUMNS.values())
-        lines.append([scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)])
-    title = "Largest error of the image / of a gradient, the latter over its largest value"
-    return markdown_table(title, _COLUMNS, lines)
+        line += [scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)]
+    return markdown_table("Largest error: image / gradient, relative to its largest value", _COLUMNS, lines.values())
 
 
-def _plot_scenes(path: Path, rows: list[Row], error: str, seconds: str, label: str) -> None:
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, ScalarFormatter
-
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    figure = Figure(figsize=(14, 7.5), layout="constrained")
-    axes = figure.subplots(2, math.ceil(len(scenes) / 2), sharey=True, squeeze=False)
-    for axis, scene in zip(axes.flat, scenes, strict=False):
-        for (knob, settings), marker in zip(KNOBS.items(), "os^Dvx", strict=True):
+def _plot(path: Path, rows: list[Row], error: str, seconds: str, label: str) -> None:
+    panels: dict[str, dict[str, tuple[Any, str]]] = {}
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        lines = panels[scene] = {}
+        for (knob, settings), marker in zip([*KNOBS.items(), ("the default", [DEFAULT])], _LOOKS, strict=True):
             found = (_find(rows, scene, setting) for setting in settings)
-            points = [(1e3 * row[seconds], max(row[error], 1e-8)) for row in found]
-            axis.loglog(*zip(*points, strict=True), f"{marker}-", markersize=4, linewidth=1, alpha=0.8, label=knob)
-        row = _find(rows, scene, DEFAULT)
-        axis.loglog(1e3 * row[seconds], row[error], "k*", markersize=13, label="the default", zorder=5)
-        for name, (level, style) in LEVELS.items():
-            axis.axhline(level, color="grey", linestyle=style, label=name)
-        axis.set(title=scene, xlabel="wall time [ms]", ylim=(6e-9, 2))
-        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.xaxis.set(major_formatter=ScalarFormatter(), minor_formatter="")
-        axis.grid(alpha=0.3)
-    figure.supylabel(f"{label}, at least 1e-8")
-    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
-    figure.savefig(path, dpi=100)
+            lines[knob] = [(1e3 * row[seconds], max(row[error], 1e-8)) for row in found], marker
+        times = [x for points, _ in lines.values() for x, _ in points]
+        lines |= {name: ([(min(times), y), (max(times), y)], look) for name, (y, look) in LEVELS.items()}
+    write_plot(path, panels, 2, xlabel="wall time [ms]", ylabel=label, ylim=(6e-9, 2))

@@ -29,9 +29,8 @@ _SHARES = np.array([0.10, 0.18, 0.22, 0.20, 0.16, 0.14])
 def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0) -> tuple[GaussianModel, PinholeCamera]:
     """A forward-facing scene such as training ends with: six blurred layers of depth, 15 % wider than the image.
 
-    Its float32 Gaussians have harmonics of degree 3. The footprints' standard deviations have a median of 2.3 pixels
-    whatever the count and the size (height, width), so the pairs of pixel and Gaussian are proportional to the count;
-    about a quarter of the centres lie beside the image.
+    Harmonics of degree 3, float32. The footprints' median standard deviation is 2.3 pixels whatever the count and size
+    (height, width), so pairs of pixel and Gaussian are proportional to the count; a quarter lie beside the image.
     """
     height, width = size
     rng = np.random.default_rng([seed, count])
@@ -74,9 +73,8 @@ def cast(scene: Scene, dtype: torch.dtype) -> Scene:
 
 def gradients(image: Tensor, gaussians: Gaussians) -> dict[str, Tensor]:
     """Those of a sum of the pixels with random weights, which are the same for all images of one size."""
-    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    leaves = [getattr(gaussians, name) for name in PARAMETERS]
-    found = torch.autograd.grad((image * weights.to(image.dtype)).sum(), leaves)
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(image.dtype)
+    found = torch.autograd.grad((image * weights).sum(), [getattr(gaussians, name) for name in PARAMETERS])
     return dict(zip(PARAMETERS, found, strict=True))
 
 

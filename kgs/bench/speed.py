@@ -20,9 +20,8 @@ from kgs.projection import project
 from kgs.raster import composite
 from kgs.raster.tiles import bin_to_tiles
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians
 
-from .output import Row, markdown_table, write_results
+from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene
 from .timing import CPU, seconds_of_exp, take_turns, time_parts
 
@@ -34,7 +33,6 @@ TARGETS = {
     "training step": {10_000: 0.125, 50_000: 0.330, 200_000: 0.540},
     "peak memory": {10_000: 250.0, 50_000: 450.0, 200_000: 900.0},
 }
-Change = Callable[[Gaussians], dict[str, Tensor]]
 
 
 def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
@@ -50,9 +48,6 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
         out: folder for the results, made if it is not there.
         quick: fewer Gaussians and repetitions.
         device: where to render: cpu, cuda, cuda:1, ...
-
-    Raises:
-        ValueError: the device is unknown or not there.
     """
     where = check_device(device)
     out.mkdir(parents=True, exist_ok=True)
@@ -75,7 +70,8 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
     exponents = {name: _exponent(of) for name, of in points.items()}
     more = {"peak_memory_mb": memory, "exp_s": unit, "exponents": exponents, "device": device}
-    _plot(out / "scaling.png", points)
+    panels = {f"by {name}": {"forward + backward": (of, "o-")} for name, of in points.items()}
+    write_plot(out / "scaling.png", panels, ylabel="wall time [s]")
     write_results(out / "speed", rows, _markdown(rows, memory, unit, exponents), **more)
 
 
@@ -98,21 +94,21 @@ class Cases:
 
     def of(self, table: str) -> dict[str, Callable[[], object]]:
         """What a table compares."""
-        if table == "left out":
-            return self.savings()
-        main = {"forward, no gradient": self.forward, "forward + backward": self.both, "training step": self.train}
-        return main if table == "main" else {"forward + backward": self.both}
+        scaling: dict[str, Callable[[], object]] = {"forward + backward": self.both}
+        main = {"forward, no gradient": self.forward, **scaling, "training step": self.train}
+        return {"main": main, "scaling": scaling, "left out": self.savings()}[table]
 
-    def forward(self) -> Tensor:
+    @torch.no_grad()
+    def forward(self) -> Any:
         """Render without gradient."""
-        with torch.no_grad():
-            image: Tensor = self.renderer(self.model(), self.camera).image
-        return image
+        return self.renderer(self.model(), self.camera).image
 
-    def both(self, change: Change = lambda _: {}, outputs: tuple[str, ...] = ("image",)) -> None:
-        """Render, some of the Gaussians' tensors changed, and go back to all parameters that they hang on."""
+    def both(self, frozen: tuple[str, ...] = (), outputs: tuple[str, ...] = ("image",), **factors: Tensor) -> None:
+        """Render, some of the Gaussians' tensors detached or multiplied, and go back to the model's parameters."""
         gaussians = self.model()
-        rendering = self.renderer(replace(gaussians, **change(gaussians)), self.camera, outputs=outputs)
+        changes = {name: getattr(gaussians, name).detach() for name in frozen}
+        changes |= {name: getattr(gaussians, name) * factor for name, factor in factors.items()}
+        rendering = self.renderer(replace(gaussians, **changes), self.camera, outputs=outputs)
         picture = rendering.image if rendering.image is not None else rendering.alpha
         (picture * self.weights[:, : picture.shape[1]]).sum().backward()
         self.model.zero_grad()
@@ -148,23 +144,17 @@ class Cases:
 
     def savings(self) -> dict[str, Callable[[], object]]:
         """Forward + backward with one thing less each time."""
-
-        def frozen(*names: str) -> Change:
-            return lambda g: {name: getattr(g, name).detach() for name in names}
-
         half = (torch.arange(self.count, device=self.device) % 2).float()
-        behind = torch.tensor([0.0, 0.0, -100.0], device=self.device) * (1 - half)[:, None]
-        changes: dict[str, Change] = {
-            "colours frozen": frozen("colors"),
-            "geometry frozen": frozen("means", "quats", "scales"),
-            "all but colours frozen": frozen(*PARAMETERS[:4]),
-            "harmonics of degree 0": lambda _: {"colors": self.model.sh_dc},
-            "half of the Gaussians dropped": lambda g: {"opacities": g.opacities * half},
-            "half of the Gaussians behind the camera": lambda g: {"means": g.means + behind},
+        return {
+            "everything": self.both,
+            "no gradient at all": self.forward,
+            "alpha only": partial(self.both, outputs=("alpha",)),
+            "colours frozen": partial(self.both, PARAMETERS[4:]),
+            "geometry frozen": partial(self.both, PARAMETERS[:3]),
+            "all but colours frozen": partial(self.both, PARAMETERS[:4]),
+            "half of the Gaussians dropped": partial(self.both, opacities=half),
+            "half of the Gaussians behind the camera": partial(self.both, means=(2 * half - 1)[:, None]),
         }
-        whole = {"everything": self.both, "no gradient at all": self.forward}
-        whole |= {"alpha only": partial(self.both, outputs=("alpha",))}
-        return whole | {name: partial(self.both, change) for name, change in changes.items()}
 
 
 def _memory_of_its_own(count: int) -> float:
@@ -205,15 +195,15 @@ def _markdown(rows: list[Row], memory: dict[int, float], unit: float, exponents:
     counts = [f"{row['gaussians'] // 1000}k" for row in next(iter(tables["main"].values()))]
     main = [[name, *map(_cell, found)] for name, found in tables["main"].items()]
     if memory:
-        held = ((mb, TARGETS["peak memory"].get(count)) for count, mb in memory.items())
-        cells = (f"{mb:.0f} MiB" + ("" if most is None else f"; {most:.0f}") for mb, most in held)
+        most = TARGETS["peak memory"]
+        cells = (f"{mb:.0f} MiB" + (f"; {most[count]:.0f}" if count in most else "") for count, mb in memory.items())
         main.append(["peak memory over importing", *cells])
     stages = [[name, *(f"{row['wall_s'] * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
     savings = [row for found in tables["left out"].values() for row in found]
-    whole = savings[0]["wall_s"]
-    left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", f"{row['wall_s'] / whole:.2f}"] for row in savings]
-    title = f"{SIZE[1]}x{SIZE[0]}, harmonics of degree 3: wall clock, median (least to largest); what it is held to"
-    less = f"What is not asked for is not computed, {savings[0]['gaussians']} Gaussians, forward + backward"
+    shares = (f"{row['wall_s'] / savings[0]['wall_s']:.2f}" for row in savings)
+    left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", share] for row, share in zip(savings, shares, strict=True)]
+    title = f"Wall clock, median (least to largest); target; {SIZE[1]}x{SIZE[0]}"
+    less = f"What is left out, {savings[0]['gaussians']} Gaussians, forward + backward"
     return (
         markdown_table(title, counts, main)
         + markdown_table("Parts of a training step, ms", counts, stages)
@@ -228,17 +218,3 @@ def _cell(row: Row) -> str:
     wall, best, worst = (1e3 * row[f"{name}_s"] for name in ("wall", "best", "worst"))
     held = "" if row["target_s"] is None else f"; {row['target_s'] * 1e3:.0f}"
     return f"{wall:.0f} ({best:.0f} to {worst:.0f}) ms{held}"
-
-
-def _plot(path: Path, points: dict[str, np.ndarray]) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
-    axes = figure.subplots(1, 3, sharey=True)
-    for axis, (name, of) in zip(axes, points.items(), strict=True):
-        axis.loglog(*of.T, "o-", markersize=4)
-        axis.set_xlabel(name)
-        axis.xaxis.set_minor_formatter("")
-        axis.grid(alpha=0.3, which="both")
-    axes[0].set_ylabel("forward + backward [s]")
-    figure.savefig(path, dpi=120)

@@ -42,18 +42,13 @@ def starts(*, out: Path, quick: bool = False) -> None:
 
     For example:
       KGS_DATA=SCENES kgs bench starts -o starts
-      kgs bench starts -o starts --quick
 
-    Writes starts.csv, starts.json and starts.md in 20 minutes, with --quick in 10 seconds.
-    The synthetic scene has exact depths. Real scenes, in the folder of the environment variable KGS_DATA, have counts
-    and times.
+    Writes starts.csv, starts.json and starts.md in 20 minutes, with --quick in 10 seconds. The synthetic scene has
+    exact depths. Real scenes, all in the folder of the environment variable KGS_DATA, have counts and times.
 
     Args:
         out: folder for the results, made if it is not there.
         quick: one small synthetic scene of three views with one seed.
-
-    Raises:
-        DataError: KGS_DATA is set and one of the scenes is not there.
     """
     data = None if quick else os.environ.get("KGS_DATA")
     if data is not None:
@@ -90,7 +85,7 @@ def _rows(scene: str, views: Views, seed: int = 0, truth: Tensor | None = None) 
 
 
 def _find(views: Views, asked: str, seed: int) -> tuple[Tensor, Row]:
-    """The points, all that there are (10 000 if random), and the columns about how they came."""
+    """The points, at most a million (10 000 if random), and the columns about how they came."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         wall, cpu = time.perf_counter(), time.process_time()
@@ -118,30 +113,24 @@ def _markdown(rows: list[Row]) -> str:
         heads = ("views", "size", "start", "n", *(head for head, _, _ in columns.values()))
         return markdown_table(f"{title}; mean (standard deviation over n seeds)", heads, lines, first="scene")
 
-    errors = "Points, at most a million, against exact depths, in percent: relative depth errors, and the share of the"
-    errors += " pixels with a surface that have a point within 2 pixels and 2 % of the depth"
-    seconds = f"Seconds that the points take, threads of torch: {torch.get_num_threads()}"
-    return table(errors, _MEASURES) + table(seconds, _SECONDS)
+    errors = "Relative depth errors and complete pixels (a point within 2 pixels and 2 % of the depth), in percent"
+    return table(errors, _MEASURES) + table(f"Seconds with {torch.get_num_threads()} threads of torch", _SECONDS)
 
 
 def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
-    """The relative error of each point's depth, in the nearest view that it is not hidden in.
+    """Depth over the surface's depth less 1, `(P,)` float64, in the view of the nearest camera that sees the point.
 
-    The depth of the surface is interpolated between pixels, as the inverse depth, which is linear on a plane; at an
-    edge (neighbours more than 5 % apart) it is that of the pixel the point falls into. A point more than 5 % behind
-    the surface counts as hidden in that view; one that is hidden in all views is judged in the nearest of them.
-
-    Convention:
-        Depth is z in the camera's frame (OpenCV axes); pixels have integer centres.
+    The inverse depth of the surface, linear on a plane, is interpolated between pixels; at an edge (neighbours over
+    5 % apart) it is that of the pixel the point falls into. Where a point is more than 5 % behind the surface it is
+    hidden; one that is hidden in all views is judged in the nearest of them.
 
     Args:
         points: `(P, 3)` in the frame of the views.
-        views: V of them; the nearest is that whose camera is nearest to the point, of those it projects into.
-        truth: exact depths, `(V, H, W)` float64; 0 where there is no surface.
+        views: V of them; depth is z in the camera's frame (OpenCV axes), pixels have integer centres.
+        truth: exact depths, `(V, H, W)` float64; 0 where there is no surface: the error is -1 there.
 
     Returns:
-        Depth over the surface's depth less 1, `(P,)` float64: negative before the surface, -1 before none; infinite
-        where no view has the point in its image.
+        Negative before the surface; infinite where no view has the point in its image.
     """
     errors = torch.stack([_view_errors(points, views, truth, view) for view in range(len(views))], 1)
     inside = ~errors.isnan()

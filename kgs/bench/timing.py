@@ -22,10 +22,7 @@ class Times(NamedTuple):
 def take_turns(
     cases: dict[str, Callable[[], object]], repeats: int = 5, device: torch.device = CPU
 ) -> dict[str, Times]:
-    """Run the cases one after the other, again and again, so that a slow minute of the machine slows all of them.
-
-    Each is run once before, to warm up. `repeats` rounds (>= 1) are timed; on a GPU each call is waited for.
-    """
+    """Run the cases in turn, so that a slow minute of the machine slows all: one warm-up and `repeats` timed rounds."""
 
     def one_round() -> Iterator[str]:
         for name, case in cases.items():
@@ -36,7 +33,7 @@ def take_turns(
 
 
 def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch.device = CPU) -> dict[str, Times]:
-    """Time the parts of something that says the name of each part when it has done it; otherwise as `take_turns`."""
+    """As `take_turns`, of the parts of `run`, which yields the name of each when it is done; a GPU is waited for."""
     wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
     found: dict[str, list[tuple[float, float]]] = {}
     for round_ in range(repeats + 1):
@@ -54,9 +51,5 @@ def seconds_of_exp(device: torch.device) -> float:
     """Seconds per element of `torch.exp` over 2^18 float32 in cache, on all threads: to compare two machines."""
     values = torch.full((2**18,), -1.0, device=device)
     results = torch.empty_like(values)
-
-    def exponentials() -> None:
-        for _ in range(50):
-            torch.exp(values, out=results)
-
-    return take_turns({"exp": exponentials}, 5, device)["exp"].best / 50 / len(values)
+    times = take_turns({"exp": lambda: [torch.exp(values, out=results) for _ in range(50)]}, 5, device)
+    return times["exp"].best / 50 / len(values)
