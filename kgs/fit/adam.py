@@ -28,11 +28,7 @@ def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Tensor]]
 
 
 def load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
-    """The inverse of `moments_of`; shapes and signs are checked, as torch does not.
-
-    Raises:
-        ValueError: they are not those of the optimiser's parameters.
-    """
+    """The inverse of `moments_of`; a ValueError where shapes or signs are wrong, which torch does not check."""
     groups, found = optimizer.state_dict()["param_groups"], {}
     for group, held in zip(groups, optimizer.param_groups, strict=True):
         shape, state = held["params"][0].shape, moments[group["name"]]

@@ -1,15 +1,14 @@
 """Checkpoints: safetensors files that are whole or absent and are verified on loading; the last two are kept.
 
-The tensors of a nested dict stand in the file under their keys joined by "/". All else of it is JSON in the file's
-metadata under "state", beside the format and the SHA-256 of the tensors and the JSON. There is no pickle in it: loading
-makes tensors and plain values and nothing else.
+The tensors of a nested dict stand in the file under their keys joined by "/". All else is JSON in the file's metadata
+under "state", beside the format and the SHA-256 of tensors and JSON. Loading makes tensors and plain values alone.
 """
 
 import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
-from functools import reduce
+from functools import partial, reduce
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,7 @@ from kgs.json_files import parse_json
 
 from .config import FitConfig
 
-_FORMAT = "kgs-checkpoint 3"
-_OLD = b"kgs-checkpoint "
+_FORMAT, _OLD = "kgs-checkpoint 3", b"kgs-checkpoint "
 
 
 def previous(path: Path) -> Path:
@@ -35,15 +33,10 @@ def previous(path: Path) -> Path:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts, with text as keys, of tensors and of what JSON knows.
+    """Write nested dicts, with text as keys, of tensors and of what JSON knows; the present file becomes the previous.
 
-    The file that was there becomes the previous one. Whenever the process dies, `newest_checkpoint` finds the old or
-    the new state.
-
-    Raises:
-        OSError: the file cannot be written; those that were there are untouched.
-        TypeError: `state` holds something else.
-        ValueError: a number outside a tensor is not finite.
+    Whenever the process dies, `newest_checkpoint` finds the old or the new state; after an OSError both files are as
+    they were. A state that holds something else is a TypeError, or a ValueError where a plain number is not finite.
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
@@ -67,8 +60,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
     """The newest state that verifies, that at `path` or the previous one, and what is wrong with the newer file or "".
 
-    Raises:
-        DataError: neither verifies; it is about the file at `path`.
+    Where neither verifies the DataError is about the file at `path`.
     """
     try:
         return load_checkpoint(path), ""
@@ -80,11 +72,10 @@ def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read what `save_checkpoint` wrote; tensors come on the CPU.
+    """Read what `save_checkpoint` wrote, with tensors on the CPU.
 
-    Raises:
-        DataError: the file is missing, is no checkpoint or one of an older version, its content does not match its
-            checksum, or a number is not finite. A right checksum is not taken as proof that the rest is well formed.
+    A DataError where the file is missing, no checkpoint, of an older version or damaged, or a number is not finite. A
+    right checksum is no proof that the rest is well formed.
     """
     old = path.with_suffix(".pt")
     try:
@@ -129,12 +120,9 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
 
 
 def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
-    """Make sure that a state can be used and belongs to the fit of this fingerprint and configuration.
+    """A KeyError, TypeError or ValueError unless a state is whole and of this fingerprint and configuration.
 
     Returns what the user should know where the fit goes on for more steps than it was begun with.
-
-    Raises:
-        KeyError, TypeError, ValueError: an entry is missing or wrong, or the scene or the configuration is another.
     """
     for name, (expected, is_right) in PLAIN.items():
         if not is_right(state[name]):
@@ -181,12 +169,10 @@ def _compare_scenes(saved: Any, asked: dict[str, Any]) -> None:
         raise ValueError("--background: expected the one that the fit was begun with, got another")
 
 
-def _digest(*tensors: Tensor) -> str:
-    """SHA-256 of the types, shapes and numbers of tensors, in hexadecimal digits."""
-    checksum = hashlib.sha256()
-    for tensor in tensors:
-        checksum.update(f"{tensor.dtype} {tuple(tensor.shape)} ".encode())
-        checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+def _digest(tensor: Tensor) -> str:
+    """SHA-256 of the type, shape and numbers of a tensor, in hexadecimal digits."""
+    checksum = hashlib.sha256(f"{tensor.dtype} {tuple(tensor.shape)} ".encode())
+    checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return checksum.hexdigest()
 
 
@@ -225,8 +211,7 @@ def is_number(value: Any, least: float = -1e300, whole: bool = False) -> bool:
     return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
 
 
-def _is_count(value: Any) -> bool:
-    return is_number(value, 0, whole=True)
+_is_count = partial(is_number, least=0, whole=True)
 
 
 def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:

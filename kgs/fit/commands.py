@@ -17,7 +17,6 @@ from .config import DEMO, FitConfig, Recipe
 from .progress import each, say
 
 _VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
-_SMALLEST = 12  # pixels a side: the window of SSIM
 _Background = Literal["black", "white"]
 
 
@@ -48,8 +47,8 @@ def demo(
     from .outputs import check_folder
 
     config = replace(DEMO, seed=seed, steps=steps, device=device)
-    if min(size) < _SMALLEST:
-        raise ValueError(f"size: expected at least {_SMALLEST} pixels a side, got {size[0]} {size[1]}")
+    if min(size) < 12:  # the window of SSIM
+        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     _prepare(device, "matplotlib")
     check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
     runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), config, out)

@@ -174,8 +174,7 @@ def timetable(config: FitConfig) -> Timetable:
     """Scale the recipe's counts by steps / 10 000.
 
     The interval of densification is shortened only as far as a short fit needs to densify about 20 times, and never
-    under 10 steps: on less evidence than the recipe's the number of Gaussians explodes. An opacity reset is left out
-    where fewer than `reset_recovery` steps follow before the next one or the end: the opacities would not come back.
+    under 10 steps: on less evidence than the recipe's the number of Gaussians explodes. See `reset_recovery` too.
     """
     recipe, steps = config.recipe, config.steps
     scale = steps / recipe.steps

@@ -12,10 +12,7 @@ from kgs.json_files import write_whole
 
 
 def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:
-    """Write a PNG of some views, one row per view: the photo, then one column per method.
-
-    `columns` maps a method's title to its renders `(3, H, W)` of all views.
-    """
+    """Write a PNG of some views, a row each: the photo, then, by their titles, columns of renders `(3, H, W)`."""
     height, width = views.images.shape[-2:]
     pictures = {"photo, not used in training": list(views.images), **columns}
     figure = _figure(3 * len(pictures), 3 * height / width * len(indices) + 0.3)

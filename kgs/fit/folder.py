@@ -95,14 +95,7 @@ def is_finished(out: Path) -> bool:
 
 
 def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
-    """Read the config.json that `kgs fit` wrote.
-
-    Returns:
-        The arguments of `load_scene` (scene, train_views, downscale, background, points), and the configuration.
-
-    Raises:
-        DataError: the file is missing or damaged, or an entry is missing or wrong.
-    """
+    """The arguments of `load_scene` and the configuration in a fit's config.json; a DataError where it is wrong."""
     settings = read_json(path)
     for name in ("request", "fit"):
         if not isinstance(settings.get(name), dict):
@@ -125,21 +118,13 @@ def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
 
 
 class SavedFit(NamedTuple):
-    """A fit for pictures and measures, without what training needs.
+    """A fit for pictures and measures, without what training needs."""
 
-    Args:
-        request: the arguments of `load_scene`, see :func:`read_settings`.
-        config: what the fit was asked to do.
-        model: the Gaussians, in the frame of the scene (world coordinates less `Scene.offset`).
-        near_plane: that of the fit's renders, in world units.
-        step: how many steps are done.
-    """
-
-    request: dict[str, Any]
+    request: dict[str, Any]  # the arguments of `load_scene`
     config: FitConfig
-    model: GaussianModel
-    near_plane: float
-    step: int
+    model: GaussianModel  # in the frame of the scene: world coordinates less `Scene.offset`
+    near_plane: float  # in world units
+    step: int  # steps that are done
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
@@ -151,11 +136,7 @@ class SavedFit(NamedTuple):
 
 
 def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
-    """Read what a fit left in its folder, without optimiser, densifier and the scene.
-
-    Raises:
-        DataError: config.json or the checkpoint is missing or damaged.
-    """
+    """Read what a fit left in its folder; a DataError where config.json or the checkpoint is missing or damaged."""
     if (out / _FINISHED / _LIST).exists():  # a kill stopped the move
         with locked(out):
             end_move(out)

@@ -72,9 +72,7 @@ class Lpips(nn.Module):
         The folder holds `<net>_features.npz` with the convolutions under torchvision's names (`features.0.weight`,
         OIHW) and `lpips_lin_<net>.npz` with the heads `lin0` to `lin4`. Published tables have `net` "vgg16".
 
-        Raises:
-            DataError: the folder, a file or an array is missing or not what it should be.
-            ValueError: `net` is unknown.
+        A DataError where the folder, a file or an array is missing or wrong, a ValueError for an unknown `net`.
         """
         with torch.device("meta"):
             module = cls(net)
@@ -92,10 +90,7 @@ class Lpips(nn.Module):
 
         H and W are at least 16 for "vgg16" and 31 for "alexnet". `rescale` brings the images to [-1, 1], which the
         network is meant for. False feeds them in [0, 1], as the published tables of Gaussian splatting do; the two
-        values cannot be compared.
-
-        Raises:
-            ValueError: shapes do not fit.
+        values cannot be compared. Other shapes are a ValueError.
         """
         smallest, taps = MIN_SIZE[self.net], TAPS[self.net]
         if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < smallest:

@@ -35,8 +35,9 @@ def versions() -> dict[str, str]:
 
 def peak_rss_mb() -> int:
     """Largest resident memory of this process so far, in MiB; 0 where the system does not tell (Windows)."""
-    status = Path("/proc/self/status")
-    if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
+    if (
+        status := Path("/proc/self/status")
+    ).exists():  # what getrusage says on Linux can be the peak of the process that started this one
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
         return round(int(line.split()[1]) / 2**10)
     try:

@@ -30,21 +30,16 @@ _WINDOW = 11
 
 @torch.no_grad()
 def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpips | None = None) -> dict[str, Any]:
-    """Render each view and compare it with its photo.
+    """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
-    Args:
-        render: from one camera, on the device of `views`, to an image `(1, 3, H, W)`; called without gradients.
-        views: the views to compare with, at least 6 x 6 pixels (16 x 16 with `lpips`).
-        lpips: a "vgg16" network on the device of the rendered images, or None for no LPIPS.
+    Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a "vgg16" network on the device of the renders. A ValueError
+    where it is another, or a render has another shape than its photo or holds NaN or infinity.
 
     Returns:
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
         published tables), "lpips_vgg" (images in [-1, 1], as the network is meant) and "lpips_vgg_unscaled" (in [0, 1],
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
         what was not measured, and for an infinite PSNR: of an image that equals its photo in every value, or a mean.
-
-    Raises:
-        ValueError: a render has another shape than its photo or holds NaN or infinity, or `lpips` is no "vgg16".
     """
     if lpips is not None and lpips.net != "vgg16":
         raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
@@ -64,10 +59,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
-    """What the metrics.json at `path` holds, with the renders measured again; without `lpips` its LPIPS stays.
-
-    `scene` is that of the fit, of the same views, else DataError; `render` and `lpips` are what `evaluate` takes.
-    """
+    """What the metrics.json at `path` holds, measured again, but LPIPS without `lpips`; DataError for other views."""
     fresh: dict[str, Any] = {}
     for part, views in (("test", scene.test), ("train", scene.train)):
         old = metrics.get(part) or {"views": []}

@@ -51,8 +51,8 @@ def fit_scene(
 ) -> tuple[dict[str, Any], int]:
     """Fit a scene and write splat.ply, metrics.json, config.json, curve.png, test/*.png and the checkpoint.
 
-    Results that are in the folder stay whole until all new ones are there; `unfinished` holds what there is until then.
-    A fit that a signal stopped writes its results too, but leaves those of a finished one in their place.
+    Results in the folder stay whole until all new ones are there, in `unfinished`. A fit that a signal stopped writes
+    its results too, but leaves those of a finished one in their place.
 
     Args:
         scene: posed training and test views.
@@ -122,13 +122,13 @@ def fit_scene(
             if not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)
             raise
-        replaces = not stopped_by or not is_finished(out)
-        if replaces:
+        notes = trainer.notes[told:]
+        if stopped_by and is_finished(out):
+            notes.append(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
+        else:
             publish(out)
-        for note in trainer.notes[told:]:
+        for note in notes:
             say(note)
-        if not replaces:
-            say(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
     return metrics, stopped_by
 
 
@@ -176,11 +176,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> FirstPoints:
-    """First points as `config.init` asks for; from training views alone, unless "model-points" is asked for.
-
-    Raises:
-        DataError: the scene has no points of its own, or the file has none.
-    """
+    """First points as `config.init` asks for; a DataError where the scene, or the file, has none."""
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
@@ -194,8 +190,8 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
     """Train to the end with a progress line and checkpoints, each minute and at evaluations.
 
-    On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved, and the signal's number returned, else 0. A checkpoint
-    that cannot be written (a full disk) stops nothing: a note says so, and the next one is tried.
+    On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved, and the signal's number returned, else 0. Where a
+    checkpoint cannot be written (a full disk) a note says so, and the next one is tried.
     """
     saved = time.monotonic()
 
@@ -223,16 +219,11 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """The signals that came: Ctrl-C, SIGTERM and SIGHUP are only noted; a second one acts as usual.
-
-    One that is ignored (SIGHUP under nohup) stays so.
-    """
+    """The signals that came: Ctrl-C, SIGTERM and SIGHUP are noted, unless ignored (nohup); a second acts as usual."""
     came: list[int] = []
     is_main = threading.current_thread() is threading.main_thread()
     names = ("SIGINT", "SIGTERM", "SIGHUP") if is_main else ()  # Python lets no other thread handle them
-    handlers = {
-        getattr(signal, name): signal.getsignal(getattr(signal, name)) for name in names if hasattr(signal, name)
-    }
+    handlers = {n: signal.getsignal(n) for n in (getattr(signal, name, None) for name in names) if n is not None}
     before = {number: handler for number, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
 
     def note(number: int, _: object) -> None:

@@ -25,17 +25,12 @@ class SelectiveDrop(DropGaussian):
     scores: Tensor | None = None
 
     def forward(self, opacities: Tensor) -> Tensor:
-        """Drop and rescale in `train()`, return `opacities` itself in `eval()`.
-
-        Raises:
-            ValueError: `scores` has another shape than `opacities`.
-        """
-        scores = self.scores
+        """Drop and rescale in `train()`, return `opacities` itself in `eval()`; scores have their shape."""
+        scores, rate = self.scores, self.rate
         if not self.training or scores is None:
             return super().forward(opacities)
         if scores.shape != opacities.shape:
             raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
-        rate = self.rate
         if rate == 0.0:
             return opacities
         per_camera = scores.ndim > 1 and scores.shape[-1] > 1
@@ -48,15 +43,10 @@ class SelectiveDrop(DropGaussian):
 def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Tensor:
     """A number for each Gaussian, `(N,)`, the highest for those that `by` is about.
 
-    Args:
-        by: "high-gradient" or "low-gradient": the mean gradient of the projected centre since the last densification.
-            "far" or "near": the distance from the camera's centre, in world units.
-        densifier: holds the Gaussians and what was observed of them.
-        camera: of the present step.
+    "high-gradient" or "low-gradient": the mean gradient of the projected centre since the last densification. "far" or
+    "near": the distance from the camera's centre, in world units.
     """
-    if by.endswith("gradient"):
-        scores = densifier.mean_gradients
-    else:
-        means = densifier.model.means.detach()
+    scores, means = densifier.mean_gradients, densifier.model.means.detach()
+    if not by.endswith("gradient"):
         scores = (means - camera_centers(camera).to(means)).norm(dim=1)
     return scores if by in ("high-gradient", "far") else -scores

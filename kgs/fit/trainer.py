@@ -32,7 +32,8 @@ from .machine import check_device
 from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
 
-# Measured, with some room; the first is what libraries load when they are used for the first time.
+# Measured, with some room: what libraries load when first used; per Gaussian the parameters, gradients, Adam's moments,
+# copies while densifying, and what backward passes keep.
 _BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 
 
@@ -104,11 +105,7 @@ class Trainer:
 
     @property
     def most_bytes(self) -> int:
-        """A bound for the memory in bytes that the fit takes beyond what there is now, known before it begins.
-
-        The renderer's budget, and for each Gaussian of the largest number the parameters, gradients, Adam's moments,
-        their copies while densifying, and what projection and harmonics keep for their backward passes.
-        """
+        """A bound for the bytes that the fit takes beyond what there is now, known before it begins."""
         images = self.scene.train.images
         pictures: int = images[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * images.nbytes
         return _BYTES_AT_FIRST_USE + self.config.max_bytes + self.max_gaussians * _BYTES_PER_GAUSSIAN + pictures

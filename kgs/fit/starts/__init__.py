@@ -127,30 +127,24 @@ def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
     if not len(depths):
         _, depths = project_all(points, views.cameras)
         depths = depths[depths > 0]
-    near, middle = np.quantile(depths, (0.01, 0.5)).tolist() if len(depths) else (1.0, 1.0)
-    return near, middle
+    near, median = np.quantile(depths, (0.01, 0.5)).tolist() if len(depths) else (1.0, 1.0)
+    return near, median
 
 
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Whether points lie between half the 1st and twice the 99th percentile of all depths in all views that see them.
-
-    Most false matches that satisfy the geometry by chance lie right before a camera or far behind the scene.
-    """
+    """Whether all views of a point have it between half the 1st and twice the 99th percentile of all depths."""
     _, depths = project_all(points, cameras)
     if not seen.any():
         return torch.zeros(len(points), dtype=torch.bool)
     least, most = np.quantile(depths[seen], (0.01, 0.99)).tolist()
-    return (((depths > 0.5 * least) & (depths < 2.0 * most)) | ~seen).all(1)
+    good: Tensor = ((depths > 0.5 * least) & (depths < 2.0 * most)) | ~seen
+    return good.all(1)
 
 
 def _in_company(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Whether points are as near to others as is usual: their spacing in the image is under `MAX_SPACING` medians.
-
-    A false match lies alone, mostly before the scene, and would start as a Gaussian over a good part of the images.
-    """
+    """Whether the points' spacing in the image is usual; a false match, alone, would cover much of the images."""
     _, depths = project_all(points, cameras)
-    focal = cameras.fx.double().cpu()
-    spacing = log_spacing(points).exp() * (focal / depths).masked_fill(~seen, 0.0).amax(1)
+    spacing = log_spacing(points).exp() * (cameras.fx.double().cpu() / depths).masked_fill(~seen, 0.0).amax(1)
     return spacing < MAX_SPACING * spacing.median()
 
 
@@ -173,10 +167,7 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
 
 
 def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
-    """Beyond all points: a background that is cut off costs decibels, a few planes of inverse depth cost nothing.
-
-    Only where a view has them: a point close beside a camera would leave hardly a plane for the scene.
-    """
+    """Beyond all points in an image: a background that is cut off costs decibels, a few more planes cost nothing."""
     depths = _seen_depths(points, views)
     return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 

@@ -17,11 +17,10 @@ AGREEMENT = 0.01  # relative difference of the depths that two views have of a p
 def dense_points(
     views: Views, near: float, far: float, count: int, generator: torch.Generator, stage: Stage = silent
 ) -> tuple[Tensor, Tensor]:
-    """At most `count` points of the surfaces that at least two views agree on, drawn at random, and their colours.
+    """At most `count` points between two depths that two views agree on, drawn at random, and RGB, both `(P, 3)`.
 
-    `near` and `far` bound the depths that are searched. Where the views have masks, points lie where both are above
-    0.5. Large pictures, and many of them, are swept at half the width and height, or a quarter: they give enough
-    points, in bounded time and memory. Returns points `(P, 3)` float32 in the views' frame and RGB in [0, 1], `(P, 3)`.
+    Where the views have masks, points lie where both are above 0.5. Large pictures, and many, are swept at half the
+    width and height, or a quarter: they give enough points, in bounded time and memory.
     """
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
         views = views.halved()

@@ -19,12 +19,9 @@ _PACKED = {b"PK\3\4": "zip", b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zX": "
 def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Positions `(P, 3)`, less `origin` `(3,)`, and RGB in [0, 1], `(P, 3)`, of a file's points or vertices; float32.
 
-    A splat has the colours of its harmonics of degree 0, and what has no colours is grey. Compressed files are refused:
-    a small one can hold more than the memory.
-
-    Raises:
-        DataError: the file is missing, broken, compressed, larger than 1 GiB (64 MiB where it is text and no splat),
-            or has no points or infinite ones.
+    A splat has the colours of its harmonics of degree 0, and what has no colours is grey. A DataError where the file is
+    missing, broken, compressed (a small one can hold more than the memory), larger than 1 GiB (64 MiB where it is text
+    and no splat), or has no points or infinite ones.
     """
     if not path.is_file():
         raise DataError(path, "", "expected a point cloud or mesh, found no such file")

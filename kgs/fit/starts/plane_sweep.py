@@ -30,26 +30,17 @@ _VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of every pixel of one view, `(H, W)`, and how well the patch matches there, from -1 to 1.
+    """What is known of each pixel of one view, `(H, W)`."""
 
-    `is_inner` says where the depth is not on the nearest or farthest plane.
-
-    Convention:
-        Depth is z in the camera's frame (OpenCV axes), in world units; pixels have integer centres.
-    """
-
-    depths: Tensor
-    scores: Tensor
-    is_inner: Tensor
+    depths: Tensor  # z in the camera's frame (OpenCV axes), in world units; pixels have integer centres
+    scores: Tensor  # how well the patch matches there, from -1 to 1
+    is_inner: Tensor  # where the depth is not on the nearest or farthest plane
 
 
 def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent) -> list[DepthMap]:
     """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
 
     A view from whose place no other differs has no depths, and scores of -1.
-
-    Raises:
-        ValueError: the range is empty or not in front of the cameras.
     """
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
@@ -109,8 +100,7 @@ def _warp(image: Tensor, homography: Tensor) -> Tensor:
     return torch.where(x * torch.arange(width) + (y * torch.arange(height))[:, None] + one > 0, warped, 0.0)
 
 
-def _box(image: Tensor) -> Tensor:
-    """Mean over the window of an image `(H, W)`."""
+def _box(image: Tensor) -> Tensor:  # mean over the window
     return torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
 
 
@@ -141,11 +131,10 @@ def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
 def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
     """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right per row."""
     rows = range(cost.shape[1])
-    before: Tensor | None = None
-    last = 0
+    before, last = torch.empty(0), -1
     for row in reversed(rows) if flip else rows:
         path = cost[:, row].clone()
-        if before is not None:
+        if last >= 0:
             came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
             least = came.amin(0)
             jump = (JUMP * EDGE / (EDGE + edge)).clamp_min(1.5 * STEP)

@@ -27,14 +27,10 @@ MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival m
 
 @dataclass(frozen=True)
 class Tracks:
-    """T scene points as V views see them: at `pixels` `(T, V, 2)`, float64, where `seen` `(T, V)`; on the CPU.
+    """T scene points as V views see them; on the CPU."""
 
-    Convention:
-        Integer pixel centres: the first pixel's centre is (0, 0).
-    """
-
-    pixels: Tensor
-    seen: Tensor
+    pixels: Tensor  # `(T, V, 2)`, float64; the first pixel's centre is (0, 0)
+    seen: Tensor  # `(T, V)`: whether a view sees a point
 
     def select(self, rows: Tensor) -> Self:
         """Some of the points, by a mask or by numbers."""
@@ -73,8 +69,7 @@ def _detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
     image = views.images[index].permute(1, 2, 0).cpu().numpy()
     grey = cv2.cvtColor((image.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
     mask = None if views.masks is None else (views.masks[index, 0] > 0.5).cpu().numpy().astype(np.uint8)
-    factor = 2 if grey.size < SMALL_IMAGE else 1
-    if factor > 1:
+    if (factor := 2 if grey.size < SMALL_IMAGE else 1) > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
         mask = None if mask is None else mask.repeat(factor, 0).repeat(factor, 1)
     # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
@@ -125,10 +120,7 @@ def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Ten
 
 
 def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
-    """Number the distinct places of all views: numbers by keypoint, places and views by number.
-
-    SIFT gives a keypoint with several orientations once for each; all of them are one place.
-    """
+    """Numbers by keypoint, places and views by number; SIFT repeats a keypoint for each orientation: one place."""
     numbers, distinct, owners = list[Tensor](), list[Tensor](), list[int]()
     for view, all_places in enumerate(places):
         unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)

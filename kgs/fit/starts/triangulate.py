@@ -15,10 +15,7 @@ MIN_ANGLE = 1.0  # degrees between the two most different rays of a point
 
 
 def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
-    """The points `(T, 3)` in float64 that the tracks see, from the null vectors of their projection equations.
-
-    Each is seen by at least two views. They are not finite, or behind cameras, where the rays do not meet.
-    """
+    """The points `(T, 3)`, float64, of tracks in two views or more; not finite, or behind, where rays do not meet."""
     intrinsics, extrinsics = matrices(cameras)
     # Unit focal lengths and an origin amid the cameras keep the equations well conditioned.
     origin = camera_centers(cameras).mean(0)
@@ -35,9 +32,8 @@ def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
 def triangulate_certain(tracks: Tracks, cameras: PinholeCamera) -> tuple[Tensor, Tracks]:
     """Triangulate, leave out what contradicts it, and keep the points whose depth is certain, with their tracks.
 
-    An observation goes if its camera has the point behind it or twice `MAX_ERROR` pixels or more away from its pixel;
-    the points are then found once more, and one that has an observation `MAX_ERROR` or more away goes, as does one
-    that fewer than two views are left to see, or whose rays all lie within `MIN_ANGLE` degrees.
+    Observations go that are behind their camera, or twice `MAX_ERROR` or more away from their pixel; points then found
+    once more go with an observation `MAX_ERROR` away, with fewer than two views, or with rays all within `MIN_ANGLE`.
     """
     for limit in (2.0 * MAX_ERROR, MAX_ERROR):
         points = triangulate(tracks, cameras)
@@ -48,7 +44,10 @@ def triangulate_certain(tracks: Tracks, cameras: PinholeCamera) -> tuple[Tensor,
         enough = kept.sum(1) >= 2
         points, agreeing = points[enough], agreeing[enough]
         tracks = Tracks(tracks.pixels[enough], kept[enough])
-    certain = agreeing & (_widest_angles(points, tracks.seen, cameras) >= MIN_ANGLE)
+    rays = torch.nn.functional.normalize(points[:, None] - camera_centers(cameras), dim=-1)
+    both = tracks.seen[:, :, None] & tracks.seen[:, None, :]
+    cosines = (rays @ rays.mT).masked_fill(~both, 1.0).flatten(1).amin(1)
+    certain = agreeing & (cosines.clamp(-1.0, 1.0).acos().rad2deg() >= MIN_ANGLE)
     return points[certain], tracks.select(certain)
 
 
@@ -78,10 +77,3 @@ def camera_centers(cameras: PinholeCamera) -> Tensor:
     """The centres of V cameras in the world, `(V, 3)` in float64."""
     _, extrinsics = matrices(cameras)
     return -(extrinsics[:, :3, :3].mT @ extrinsics[:, :3, 3:])[..., 0]
-
-
-def _widest_angles(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Degrees between the two most different rays of each point, `(P,)`."""
-    rays = torch.nn.functional.normalize(points[:, None] - camera_centers(cameras), dim=-1)
-    cosines = (rays @ rays.mT).masked_fill(~(seen[:, :, None] & seen[:, None, :]), 1.0).flatten(1).amin(1)
-    return cosines.clamp(-1.0, 1.0).acos().rad2deg()
