@@ -39,6 +39,7 @@ class Setting:
 DEFAULT, EXACT = Setting(), Setting(alpha_threshold=0.0, transmittance_stop=0.0)
 EXACT64 = replace(EXACT, dtype="float64")
 _ALPHAS = (0.0, 1e-4, 1 / 1024, 1 / 512, 1 / 255, 1 / 128)
+_GRADIENTS = ("gradient", *(f"gradient_{name}" for name in PARAMETERS))
 KNOBS = {
     "alpha threshold 0 to 1/128, stop 0": [replace(EXACT, alpha_threshold=a) for a in _ALPHAS],
     "alpha threshold 0 to 1/128, stop 1e-4": [replace(DEFAULT, alpha_threshold=a) for a in _ALPHAS],
@@ -68,8 +69,8 @@ def precision(*, out: Path, quick: bool = False) -> None:
     rows = []
     for name, make in SCENES.items():
         print(f"{name} ...")
-        measured = make(*((300, 48) if quick else (3000, 96))).measure(repeats=1 if quick else 3)
-        rows += [{"scene": name, **row} for row in measured]
+        count, size, repeats = (300, 48, 1) if quick else (3000, 96, 3)
+        rows += [{"scene": name, **row} for row in make(count, size).measure(repeats)]
     _plot(out / "render.png", rows, "max_error", "forward_s", "largest error of the image, at least 1e-8")
     _plot(out / "gradients.png", rows, "gradient", "backward_s", "relative error of a gradient, at least 1e-8")
     write_results(out / "precision", rows, _markdown(rows))
@@ -103,8 +104,7 @@ class Measured:
             error = (self.image(s) - expected).abs()
             parts = relative_errors(self.backward(s), expected_gradients)
             row = {**asdict(s), "max_error": float(error.max()), "rmse": float(error.square().mean().sqrt())}
-            row["gradient"] = float(parts.max())
-            row |= {f"gradient_{name}": float(part) for name, part in zip(PARAMETERS, parts, strict=True)}
+            row |= dict(zip(_GRADIENTS, [parts.max().item(), *parts.tolist()], strict=True))
             for name, times in (("forward", forward[str(s)]), ("backward", backward[str(s)])):
                 row |= {f"{name}_s": times.wall, f"{name}_best_s": times.best, f"{name}_worst_s": times.worst}
             rows.append(row)

@@ -21,9 +21,7 @@ SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 Scene = tuple[Gaussians, PinholeCamera]
-
-_DEPTHS = np.array([2.2, 3.0, 4.0, 5.5, 7.5, 9.5])
-_SHARES = np.array([0.10, 0.18, 0.22, 0.20, 0.16, 0.14])
+_DEPTHS, _SHARES = np.array([[2.2, 3.0, 4.0, 5.5, 7.5, 9.5], [0.10, 0.18, 0.22, 0.20, 0.16, 0.14]])
 
 
 def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0) -> tuple[GaussianModel, PinholeCamera]:
@@ -49,8 +47,8 @@ def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0)
         "sh_dc": ((np.clip(colors, 0.02, 0.98) - 0.5) / SH_C0)[:, None],
         "sh_rest": rng.normal(0, 0.06, (count, 15, 3)),
     }
-    tensors: dict[str, Any] = {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
-    return GaussianModel(**tensors), cast_camera(centred_camera(size, focal), torch.float32)
+    model: Any = {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
+    return GaussianModel(**model), cast_camera(centred_camera(size, focal), torch.float32)
 
 
 def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:

@@ -3,7 +3,7 @@
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from kgs.renderer import GaussianRenderer
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene
-from .timing import CPU, seconds_of_exp, take_turns, time_parts
+from .timing import CPU, Case, seconds_of_exp, take_turns, time_parts
 
 SIZE = (378, 504)
 # What kgs is held to on two cores, by count of Gaussians: seconds, and MiB over what importing takes.
@@ -80,9 +80,8 @@ class Cases:
 
     def __init__(self, count: int, size: tuple[int, int], device: torch.device) -> None:
         model, camera = layered_scene(count, size)
-        self.count, self.size, self.device = count, size, device
+        self.count, self.device, self.renderer = count, device, GaussianRenderer()
         self.model, self.camera = model.to(device), move_camera(camera, device)
-        self.renderer = GaussianRenderer()
         generator = torch.Generator().manual_seed(0)
         self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
         self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
@@ -92,9 +91,9 @@ class Cases:
             bins = bin_to_tiles(project(self.model(), self.camera))
         self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6
 
-    def of(self, table: str) -> dict[str, Callable[[], object]]:
+    def of(self, table: str) -> dict[str, Case]:
         """What a table compares."""
-        scaling: dict[str, Callable[[], object]] = {"forward + backward": self.both}
+        scaling: dict[str, Case] = {"forward + backward": self.both}
         main = {"forward, no gradient": self.forward, **scaling, "training step": self.train}
         return {"main": main, "scaling": scaling, "left out": self.savings()}[table]
 
@@ -142,7 +141,7 @@ class Cases:
         self.optimizer.zero_grad(set_to_none=True)
         yield "Adam"
 
-    def savings(self) -> dict[str, Callable[[], object]]:
+    def savings(self) -> dict[str, Case]:
         """Forward + backward with one thing less each time."""
         half = (torch.arange(self.count, device=self.device) % 2).float()
         return {
@@ -200,17 +199,14 @@ def _markdown(rows: list[Row], memory: dict[int, float], unit: float, exponents:
         main.append(["peak memory over importing", *cells])
     stages = [[name, *(f"{row['wall_s'] * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
     savings = [row for found in tables["left out"].values() for row in found]
-    shares = (f"{row['wall_s'] / savings[0]['wall_s']:.2f}" for row in savings)
-    left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", share] for row, share in zip(savings, shares, strict=True)]
-    title = f"Wall clock, median (least to largest); target; {SIZE[1]}x{SIZE[0]}"
-    less = f"What is left out, {savings[0]['gaussians']} Gaussians, forward + backward"
+    whole = savings[0]["wall_s"]
+    left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", f"{row['wall_s'] / whole:.2f}"] for row in savings]
+    grows = ", ".join(f"{name}^{power:.2f}" for name, power in exponents.items())
     return (
-        markdown_table(title, counts, main)
+        markdown_table(f"Wall clock, median (least to largest); target; {SIZE[1]}x{SIZE[0]}", counts, main)
         + markdown_table("Parts of a training step, ms", counts, stages)
-        + markdown_table(less, ["ms", "of everything"], left_out)
-        + f"Time grows as count^{exponents['Gaussians']:.2f}, pairs^{exponents['pairs']:.2f}, "
-        f"pixels^{exponents['pixels']:.2f} (at a fixed count).\n"
-        f"Calibration: exp {unit * 1e9:.2f} ns per element.\n"
+        + markdown_table(f"Left out, {savings[0]['gaussians']} Gaussians", ["ms", "of everything"], left_out)
+        + f"Time grows as {grows} (pixels: at one count). Calibration: exp {unit * 1e9:.2f} ns per element.\n"
     )
 
 

@@ -31,7 +31,6 @@ HIDDEN = 0.05  # a point so much farther than the surface before it is hidden th
 REACH = 2  # pixels, from a point to those it completes
 EDGE = 1.05  # ratio of depths of neighbouring pixels above which nothing is interpolated between them
 # Columns of the tables: head, decimals, factor.
-_POINTS = {"points": ("points", 0, 1)}
 _MEASURES = {"median_error": ("median error", 2, 100), "bias": ("median signed", 2, 100)}
 _MEASURES |= {"within_1": ("within 1 %", 1, 100), "within_2": ("within 2 %", 1, 100), "complete": ("complete", 1, 100)}
 _SECONDS = {"wall_seconds": ("wall s", 1, 1), "cpu_seconds": ("CPU s", 1, 1)}
@@ -104,7 +103,7 @@ def _markdown(rows: list[Row]) -> str:
 
     def table(title: str, columns: dict[str, tuple[str, int, int]]) -> str:
         """One line per group that has these measures."""
-        columns, lines = _POINTS | columns, []
+        columns, lines = {"points": ("points", 0, 1), **columns}, []
         for (*about, asked), of in groups.items():
             if None not in (of[0][name] for name in columns):
                 came = ", ".join(dict.fromkeys(row["came"] for row in of))
@@ -120,17 +119,10 @@ def _markdown(rows: list[Row]) -> str:
 def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     """Depth over the surface's depth less 1, `(P,)` float64, in the view of the nearest camera that sees the point.
 
-    The inverse depth of the surface, linear on a plane, is interpolated between pixels; at an edge (neighbours over
-    5 % apart) it is that of the pixel the point falls into. Where a point is more than 5 % behind the surface it is
-    hidden; one that is hidden in all views is judged in the nearest of them.
-
-    Args:
-        points: `(P, 3)` in the frame of the views.
-        views: V of them; depth is z in the camera's frame (OpenCV axes), pixels have integer centres.
-        truth: exact depths, `(V, H, W)` float64; 0 where there is no surface: the error is -1 there.
-
-    Returns:
-        Negative before the surface; infinite where no view has the point in its image.
+    Points are `(P, 3)`; `truth` holds exact depths along z `(V, H, W)` in float64, 0 without a surface (error -1).
+    The inverse depth, linear on a plane, is interpolated between pixels; at an edge (neighbours over 5 % apart) it is
+    that of the pixel the point falls into. A point is hidden where it is more than 5 % behind the surface; one that is
+    hidden in all views is judged in the nearest; the error is infinite where no view has the point in its image.
     """
     errors = torch.stack([_view_errors(points, views, truth, view) for view in range(len(views))], 1)
     inside = ~errors.isnan()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 
 CPU = torch.device("cpu")
+Case = Callable[[], object]
 
 
 class Times(NamedTuple):
@@ -19,9 +20,7 @@ class Times(NamedTuple):
     cpu: float
 
 
-def take_turns(
-    cases: dict[str, Callable[[], object]], repeats: int = 5, device: torch.device = CPU
-) -> dict[str, Times]:
+def take_turns(cases: dict[str, Case], repeats: int = 5, device: torch.device = CPU) -> dict[str, Times]:
     """Run the cases in turn, so that a slow minute of the machine slows all: one warm-up and `repeats` timed rounds."""
 
     def one_round() -> Iterator[str]:
@@ -49,7 +48,6 @@ def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch
 
 def seconds_of_exp(device: torch.device) -> float:
     """Seconds per element of `torch.exp` over 2^18 float32 in cache, on all threads: to compare two machines."""
-    values = torch.full((2**18,), -1.0, device=device)
-    results = torch.empty_like(values)
+    values, results = torch.full((2**18,), -1.0, device=device), torch.empty(2**18, device=device)
     times = take_turns({"exp": lambda: [torch.exp(values, out=results) for _ in range(50)]}, 5, device)
     return times["exp"].best / 50 / len(values)
