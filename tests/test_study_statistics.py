@@ -10,8 +10,16 @@ from study_rows import made_up, student
 
 from kgs.bench.output import mean_sd
 from kgs.bench.study.published import PUBLISHED, benchmark_of, published, published_difference
-from kgs.bench.study.statistics import BEST_OF_5, Difference, Noise, noise_floor, paired_difference
-from kgs.bench.study.tables import cells_frame, difference, wide
+from kgs.bench.study.tables import (
+    BEST_OF_5,
+    Difference,
+    Noise,
+    cells_frame,
+    difference,
+    noise_floor,
+    paired_difference,
+    wide,
+)
 
 PAPER = "progressive 0.2"
 

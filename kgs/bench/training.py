@@ -21,10 +21,8 @@ from .study.tables import each
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
 KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
 KNOBS |= {"max_gaussians": (5_000, 10_000), "drop": (0.0, 0.1, 0.3)}
-# What the table shows, with how many decimals.
 HEADS = {"psnr": "PSNR [dB]", "gain": "over the default", "ssim": "SSIM", "train_psnr": "PSNR of training views"}
 HEADS |= {"cpu_seconds": "CPU seconds", "gaussians": "Gaussians"}
-DECIMALS = dict(zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True))
 SIZE = (126, 168)  # of the synthetic pictures
 
 
@@ -32,10 +30,9 @@ def training(*, out: Path, quick: bool = False, processes: int | None = None, sc
     """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
 
     For example:
-      kgs bench training -o training
       KGS_DATA=SCENES kgs bench training -o training --processes 2
 
-    Writes training.jsonl, training.csv, training.md and training.png. With KGS_DATA, a folder of scenes, also on fern.
+    Writes training.jsonl, .csv, .md and .png. With KGS_DATA, a folder of scenes, also on fern.
 
     Args:
         out: folder for the results; cells that its training.jsonl has are not repeated.
@@ -51,10 +48,7 @@ def training(*, out: Path, quick: bool = False, processes: int | None = None, sc
 
 
 def knob_cells(quick: bool = False) -> list[Cell]:
-    """The default, `--fast`, and each other value of each knob, with three seeds; `quick`: two tiny cells instead.
-
-    On the built-in scene and, where KGS_DATA is set, on fern; DataError: the folder lacks it.
-    """
+    """The default, `--fast` and each value of each knob, with three seeds, or (`quick`) two tiny cells."""
     if quick:
         return [{"scene": SYNTHETIC, "seed": 0, "steps": steps} for steps in (20, 40)]
     scenes = [SYNTHETIC]
@@ -81,10 +75,7 @@ def fit_cell(cell: Cell) -> dict[str, Any]:
 
 
 def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
-    """Write training.csv, training.md (which it returns) and training.png: mean and deviation over seeds.
-
-    The gain over the default is in dB of test PSNR, from the seeds that both have, which have the same first points.
-    """
+    """Write training.csv, training.md (which it returns) and training.png: mean and deviation over seeds."""
     frame = pd.DataFrame([_knob(**row["cell"]) | {key: row["result"].get(key) for key in HEADS} for row in rows])
     default = frame[frame.knob == "default"].set_index(["scene", "seed"]).psnr
     frame["gain"] = frame.psnr - default.reindex(pd.MultiIndex.from_frame(frame[["scene", "seed"]])).to_numpy()
@@ -94,7 +85,12 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     table = table.assign(n=frame.groupby(keys, sort=False).size()).reset_index()
     table.to_csv(out / "training.csv", index=False)
     lines = [
-        [scene, f"{knob} {value}".strip(), len(cells), *(mean_sd(cells[key], d) for key, d in DECIMALS.items())]
+        [
+            scene,
+            f"{knob} {value}".strip(),
+            len(cells),
+            *(mean_sd(cells[key], d) for key, d in zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True)),
+        ]
         for (scene, knob, value), cells in each(frame, *keys)
     ]
     lines.sort(key=lambda line: (line[0], line[1] != "default", str(line[1]).split()[0]))

@@ -20,12 +20,10 @@ def study(
     """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
 
     For example:
-      kgs bench study -o study
       KGS_DATA=SCENES kgs bench study -o study-cpu --preset cpu
 
-    Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. The scenes lie in the
-    folder of the environment variable KGS_DATA. For many machines: `dask scheduler` on one,
-    `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
+    Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. For many machines:
+    `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
 
     Args:
         out: folder for the results; cells that its sparse.jsonl has are not repeated.
@@ -50,13 +48,13 @@ def study(
     data, weights = (None if place is None else os.path.abspath(place) for place in (folder, lpips_weights))
     if read_rows(path) and not finished_rows(cells, path):
         raise DataError(path, "", f"expected cells of --preset {preset}, got others; give each preset its own folder")
+    work = partial(sparse_cell, data=data, lpips_weights=weights)
     try:
-        work = partial(sparse_cell, data=data, lpips_weights=weights)
         run_grid(cells, work, path, scheduler=scheduler, processes=processes)
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
             scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
-            weighed = "" if lpips_weights is None else " --lpips-weights WEIGHTS"
-            write_report(rows, out, f"{scenes}kgs bench study --preset {preset}{weighed} -o OUT", len(cells))
+            options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
+            write_report(rows, out, f"{scenes}kgs bench study --preset {options} -o OUT", len(cells))
     return int(len(rows) < len(cells))

@@ -1,8 +1,4 @@
-"""One cell of the study: one fit, everything that the report says of it, and two probes of the fitted model.
-
-Sources: the probe of co-adaptation is that of "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian
-Splatting" (NeurIPS 2025, arXiv 2508.12720); the Gaussians over the threshold are the DropGaussian paper's own evidence.
-"""
+"""One cell of the study: one fit, everything that the report says of it, and two probes of the fitted model."""
 
 import subprocess
 import time
@@ -35,14 +31,11 @@ from kgs.renderer import GaussianRenderer
 SIZE = (72, 96)  # of the synthetic pictures
 FULL = "full-model"  # a start that no fit may have: the upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
-COVERED = 0.8  # alpha from which a pixel counts, in every subset
 BINS = 6
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
-    """Fit once and measure; plain values.
-
-    Fits of the same scene, views, start and seed begin with the same points and see the views in the same order.
+    """Fit once and measure; fits of the same scene, views, start and seed begin alike and see the views in one order.
 
     Args:
         cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
@@ -136,21 +129,19 @@ def coadaptation(
 
     Unbiased, of clamped renders whose opacities are not raised; the mean over channels and over the pixels of all views
     that have an alpha above 0.8 in every one of the `subsets` (at least 2) halves; None where there are no such pixels.
+    Source: "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", arXiv 2508.12720.
     """
     if subsets < 2:
         raise ValueError(f"subsets: expected at least 2, got {subsets}")
     renderer, generator = GaussianRenderer(near_plane=near_plane), torch.Generator().manual_seed(seed)
     gaussians, total, pixels = model(), 0.0, 0
     for view in range(len(views)):
-        images, alphas = [], []
-        for _ in range(subsets):
-            kept = torch.rand(gaussians.opacities.shape, generator=generator) < 0.5
-            half = replace(gaussians, opacities=gaussians.opacities * kept)
-            out = renderer(half, views.camera(view), outputs=("image", "alpha"))
-            images.append(out.image[0].clamp(0, 1).double())
-            alphas.append(out.alpha[0, 0])
-        covered = (torch.stack(alphas) > COVERED).all(0)
-        total += float(torch.stack(images).var(0).mean(0)[covered].sum())
+        kept = [torch.rand(gaussians.opacities.shape, generator=generator) < 0.5 for _ in range(subsets)]
+        halves = (replace(gaussians, opacities=gaussians.opacities * keep) for keep in kept)
+        renders = [renderer(half, views.camera(view), outputs=("image", "alpha")) for half in halves]
+        covered = torch.stack([out.alpha[0, 0] > 0.8 for out in renders]).all(0)
+        images = torch.stack([out.image[0].clamp(0, 1).double() for out in renders])
+        total += float(images.var(0).mean(0)[covered].sum())
         pixels += int(covered.sum())
     return total / pixels if pixels else None
 
@@ -159,8 +150,7 @@ def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, An
     """Count Gaussians, and those whose mean gradient since the last densification is over the threshold, by distance.
 
     The distance is that to the nearest training camera, in medians of the first points' distances. The edges of the
-    bins are quantiles of these, so that fits that begin alike are counted alike; what lies beyond them counts in the
-    outer bins. A fit at its limit of Gaussians keeps those that it could not densify.
+    bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.
     """
     centers = camera_centers(trainer.scene.train.cameras)
     clouds = (first_points, trainer.model.means)

@@ -37,13 +37,11 @@ def run_grid(
         work: a function of a module (other processes import it); takes a cell, returns its result in plain values.
         path: JSONL, a line `{"cell": ..., "result": ...}` as soon as a cell is done; one that was cut short is dropped.
         processes: how many processes of this machine, None for one per core; they share the cores.
-        scheduler: address of a Dask scheduler whose workers take the place of local processes, one cell at a time each;
-            they need the same packages and data, and may come and go.
+        scheduler: address of a Dask scheduler whose workers, with the same packages and data, take their place.
         say: where lines for the user go, errors of cells among them.
 
     Raises:
-        ValueError: two cells are equal, `processes` is below 1, another run has the file, no scheduler answers, or it
-            was lost; finished cells are kept.
+        ValueError: equal cells, `processes` below 1, a file that another run has, no scheduler, or one that was lost.
     """
     if processes is not None and processes < 1:
         raise ValueError(f"processes: expected at least 1, got {processes}")
@@ -71,10 +69,7 @@ def run_grid(
 
 
 def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
-    """The lines of a JSONL file, none where there is no file; ValueError: one before the last is damaged.
-
-    A last line that was cut short is left out; `repair` takes it out of the file, too, and ends the last whole one.
-    """
+    """The lines of a JSONL file, none without one; not a last one that is cut short, which `repair` takes out."""
     lines = path.read_bytes().splitlines() if path.exists() else []
     rows = []
     for number, line in enumerate(lines, 1):
@@ -101,12 +96,11 @@ def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
 def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
     """A client of the scheduler at this address, or of one of our own; all that waits or runs there goes with it."""
     cores = os.cpu_count() or 1
-    local = {
-        **{"n_workers": processes or cores, "threads_per_worker": 1, "processes": True},
-        "memory_limit": None,  # a cell may need any share of the memory; Dask would kill its process
-        "env": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // (processes or cores)))},
-        **{"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL},
-    }
+    count = processes or cores
+    local: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "processes": True}
+    local |= {"memory_limit": None}  # a cell may need any share of the memory; Dask would kill its process
+    local |= {"env": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // count))}}
+    local |= {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
     before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
     try:
         if scheduler is not None:
@@ -167,11 +161,10 @@ def _alone(path: Path) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         try:
-            import fcntl
+            with suppress(ImportError):  # Windows
+                import fcntl
 
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:  # Windows
-            pass
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ValueError(f"{path}: expected no other run to write this file, but one does") from error
         yield

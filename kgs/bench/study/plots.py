@@ -20,17 +20,14 @@ DPI = 110
 
 
 def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **axes: Any) -> Figure:
-    """One panel per value of the column "panel", two in a row, and one legend for all.
+    """One panel per value of the column "panel", two in a row, with these settings of Axes.set; one legend for all.
 
-    Args:
-        points: columns "panel", "label", "x", "y", and where they are known "dx" and "dy" (half the length of a bar),
-            "start" (fills the markers; without it a line joins them), and "name" (stands at the y axis).
-        styles: colour and marker by label; others get the next colour.
-        axes: settings of every panel, as matplotlib's Axes.set takes them.
+    `points` has "panel", "label", "x", "y", and where they are known "dx" and "dy" (half the length of a bar), "start"
+    (fills the markers; without it a line joins them), and "name" (stands at the y axis).
     """
     styles = {label: (f"C{k}", ".") for k, label in enumerate(points.label.unique())} | styles
-    titles, scattered, named = points.panel.unique(), "start" in points, "name" in points
-    columns, rows = min(2, len(titles)), -(-len(titles) // 2)
+    count, scattered, named = points.panel.nunique(), "start" in points, "name" in points
+    columns, rows = min(2, count), -(-count // 2)
     size = (9, 0.9 + 0.2 * len(points)) if named else (3.9 * columns + 0.4, 3.2 * rows + 0.5)
     figure, found = Figure(size, dpi=DPI, layout="constrained"), dict[str, Any]()
     for place, ((title,), some) in enumerate(each(points, "panel"), 1):
@@ -52,8 +49,9 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
             axis.axvline(0, color="#777777", linewidth=1)
     if not named:
         labels = sorted(found, key=lambda label: label.startswith("from "))
-        handles = [found[label] for label in labels]
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+        figure.legend(
+            [found[label] for label in labels], labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8
+        )
     return figure
 
 
@@ -61,15 +59,13 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
     """Write a PNG for each plot that has something to show; return the captions by file name."""
     captions = {}
     for name, (points_of, xlabel, ylabel, caption) in _PLOTS.items():
-        points = points_of(frame)
-        if len(points):
+        if len(points := points_of(frame)):
             panels(points, xlabel=xlabel, ylabel=ylabel).savefig(out / f"{name}.png")
             captions[f"{name}.png"] = caption
     return captions
 
 
 def _forest(frame: pd.DataFrame) -> pd.DataFrame:
-    """Every difference over off: first the means over the scenes' main settings, then each setting's own."""
     main = main_cells(frame)
     groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in each(frame, *KEYS[:3])}
@@ -91,31 +87,31 @@ def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
 def _curves(frame: pd.DataFrame) -> pd.DataFrame:
     main = main_cells(frame)
     cells = main[main.method.isin(MAIN) & (main.curve.str.len() > 0)]
-    curves = [{point["step"]: point["test_psnr"] for point in curve} for curve in cells.curve]
-    return _over_seeds(cells, [pd.DataFrame(curves, cells.index, dtype=float)])
+    steps, psnr = (
+        cells.curve.map(lambda curve, key=key: [point[key] for point in curve]) for key in ("step", "test_psnr")
+    )
+    return _over_seeds(cells.assign(place=steps, x=steps, y=psnr))
 
 
 def _thresholds(frame: pd.DataFrame) -> pd.DataFrame:
     main = main_cells(frame)
     cells = main[main.method.isin((OFF, PAPER)) & main["thresholds.over"].notna()]
-    shares = []
-    for _, some in each(cells, "scene", "views"):
-        keys = ("over", "gaussians", "distance")
-        over, counts, edges = (np.array(some[f"thresholds.{key}"].tolist(), float) for key in keys)
-        middle = (edges[:, 1:] + edges[:, :-1]).mean(0) / 2
-        shares.append(pd.DataFrame(100 * over / np.where(counts > 0, counts, np.nan), some.index, middle))
-    return _over_seeds(cells, shares)
+    over, counts, edges = (cells[f"thresholds.{key}"].map(np.array) for key in ("over", "gaussians", "distance"))
+    shares = 100 * over / counts.map(lambda count: np.where(count > 0, count, np.nan))
+    middle = edges.map(lambda edge: (edge[1:] + edge[:-1]) / 2)
+    return _over_seeds(cells.assign(place=counts.map(lambda count: range(len(count))), x=middle, y=shares))
 
 
-def _over_seeds(cells: pd.DataFrame, values: list[pd.DataFrame]) -> pd.DataFrame:
-    """Mean and standard deviation over the seeds, of tables with one row per cell and one column per place."""
-    cells, lines = _in_panels(cells), []
-    for (panel, label), some in each(cells, "panel", "label"):
-        table = next(t for t in values if some.index[0] in t.index).loc[some.index].dropna(axis=1, how="all")
-        table = table.sort_index(axis=1)
-        points = pd.DataFrame({"x": table.columns, "y": table.mean().array, "dy": table.std().fillna(0).array})
-        lines.append(points.assign(panel=panel, label=label))
-    return pd.concat(lines) if lines else cells
+def _over_seeds(cells: pd.DataFrame) -> pd.DataFrame:
+    """Mean and standard deviation over the seeds, of cells with lists of "place", "x" and "y"; each place has one x."""
+    points = _in_panels(cells).explode(["place", "x", "y"]).astype({"x": float, "y": float})
+    points["x"] = points.groupby(["panel", "place"]).x.transform("mean")
+    means = {"x": ("x", "first"), "y": ("y", "mean"), "dy": ("y", "std")}
+    lines = [
+        some.groupby("place").agg(**means).dropna(subset="y").fillna(0).assign(panel=panel, label=label)
+        for (panel, label), some in each(points, "panel", "label")
+    ]
+    return pd.concat(lines) if lines else points
 
 
 def _in_panels(cells: pd.DataFrame) -> pd.DataFrame:
@@ -126,19 +122,16 @@ def _in_panels(cells: pd.DataFrame) -> pd.DataFrame:
     return cells.assign(panel=cells.scene + ", " + cells.views.astype(str) + " views, n = " + n, label=cells.method)
 
 
-_GAP = "overfitting: PSNR, training less test views [dB]"
-_GAIN = "test PSNR over off, same first points and views [dB]"
-_DISTANCE, _PSNR = "distance [median of the first points]", "test PSNR [dB]"
-_CELLS = "one point per cell, filled by its start"
-_CURVES = f"Test PSNR during the fit, {', '.join(MAIN)}: mean over seeds, bars of one sd"
-_SHARES = (
-    "Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, "
-    f"{OFF} and {PAPER}: mean over seeds, bars of one sd; each point stands for a sixth of the first points; a fit at "
-    "its limit of Gaussians keeps those that it could not densify"
-)
+_SEEDS = "mean over seeds, bars of one sd"
+_SHARES = f"""Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, \
+{OFF} and {PAPER}: {_SEEDS}; each point stands for a sixth of the first points; a fit at its limit of Gaussians keeps \
+those that it could not densify"""
 # What each plot shows, its axes, and its caption.
-_PLOTS = {"forest": (_forest, _GAIN, "", "Paired differences of test PSNR over off, with 95 % intervals; n pairs")}
-_PLOTS["curves"] = (_curves, "step", _PSNR, _CURVES)
-for _name, _x in {"gap": _GAP, "cost": "CPU time of the fit [s]", "coadaptation": "co-adaptation [1e-3]"}.items():
-    _PLOTS[_name] = (partial(_scattered, x=_name), _x, _PSNR, f"Test PSNR against {_x}; {_CELLS}")
-_PLOTS["thresholds"] = (_thresholds, _DISTANCE, "over the threshold [%]", _SHARES)
+_OVER, _PSNR = "test PSNR over off, same first points and views [dB]", "test PSNR [dB]"
+_PLOTS = {"forest": (_forest, _OVER, "", "Paired differences of test PSNR over off, with 95 % intervals; n pairs")}
+_PLOTS["curves"] = (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join(MAIN)}: {_SEEDS}")
+_SCATTERED = {"gap": "overfitting: PSNR, training less test views [dB]", "cost": "CPU time of the fit [s]"}
+for _name, _x in {**_SCATTERED, "coadaptation": "co-adaptation [1e-3]"}.items():
+    _caption = f"Test PSNR against {_x}; one point per cell, filled by its start"
+    _PLOTS[_name] = (partial(_scattered, x=_name), _x, _PSNR, _caption)
+_PLOTS["thresholds"] = (_thresholds, "distance [median of the first points]", "over the threshold [%]", _SHARES)

@@ -1,8 +1,7 @@
-"""What the paper prints for our methods, to be set beside our figures: published.csv.
+"""What the paper prints for our methods (published.csv): means over 8 scenes (Mip-NeRF 360: 7), the best of five runs.
 
-Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting",
-CVPR 2025: means over 8 scenes (Mip-NeRF 360: 7), the best of five runs, LPIPS of unscaled inputs. One value for
-Mip-NeRF 360 is from its text. Our variants of each selection and penalty stand beside the same printed line.
+Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR
+2025. Our variants of each selection and penalty stand beside the same printed line.
 """
 
 from pathlib import Path
@@ -31,10 +30,7 @@ def published(benchmark: str | None, views: int, method: str) -> str:
 
 
 def published_difference(benchmark: str | None, views: int, method: str, base: str) -> str:
-    """PSNR of a method less that of another in each table that has the first, in dB, each once; "-" for none.
-
-    A table that lacks the other takes it from the first that has it.
-    """
+    """As `published`: PSNR of a method less that of another, in dB, of the same table if it has both."""
     lines, bases = (_lines(benchmark, views, name).set_index("table").psnr for name in (method, base))
     if bases.empty or method == base:
         return "-"

@@ -28,7 +28,7 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
         command: what makes this report again.
         planned: how many cells the study has when it is done.
 
-    Returns: what sparse.md holds. Raises ValueError as `cells_frame`.
+    Returns what sparse.md holds; ValueError as of `cells_frame`.
     """
     frame = cells_frame(rows)
     out.mkdir(parents=True, exist_ok=True)

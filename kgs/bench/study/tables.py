@@ -2,16 +2,16 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
+from scipy import stats
 
 from kgs.bench.output import mean_sd
 from kgs.fit.metrics import MEASURES
 
 from .presets import EQUAL_MEAN_RATE, FAMILIES, FIXED, MAIN, METHODS, OFF, PAPER
 from .published import benchmark_of, published, published_difference
-from .statistics import BEST_OF_5, Difference, noise_floor, paired_difference
 
 KEYS = ("scene", "views", "start", "method")  # what cells have in common that differ in the seed alone
 COLUMNS = [f"{part}.{name}" for part in ("test", "train") for name in MEASURES]
@@ -20,21 +20,68 @@ _OTHERS = ["init.kind", "curve", *(f"thresholds.{key}" for key in ("distance", "
 _OTHERS += [f"protocol.{key}" for key in ("train", "test", "image_size")]
 STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
 LPIPS = "test.lpips_vgg_unscaled"
-QUALITY = {"test.psnr": 2, "test.ssim_zero_padded": 3, LPIPS: 3}  # and how many decimals
+QUALITY = {"test.psnr": "PSNR [dB]", "test.ssim_zero_padded": "SSIM", LPIPS: "LPIPS"}
 _COMPARISONS = {
     f"The paper's rule ({PAPER}) over no dropping (off)": ("method", PAPER, OFF),
     f"A fixed rate of the same mean ({FIXED}) over no dropping (off)": ("method", FIXED, OFF),
     f"The paper's rule over the fixed rate of the same mean ({FIXED})": ("method", PAPER, FIXED),
     f"Dense first points over those of SIFT, both with {PAPER}": ("start", "dense", "sift"),
 }
+BEST_OF_5 = 1.163  # how far the best of five runs lies over the mean on average, in standard deviations
 Lines = list[dict[str, str]]
 
 
-def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """One line per cell of rows of "cell" and "result", by scene: `KEYS`, "seed", "fit", numbers (NaN where absent).
+class Difference(NamedTuple):
+    """How many pairs, the mean difference, its 95 % interval and the standard deviation of a pair, NaN if unknown."""
 
-    ValueError: no rows, or two cells that differ in nothing but their fits' settings or size.
+    pairs: int
+    mean: float
+    low: float
+    high: float
+    sd: float = math.nan
+
+    def text(self, decimals: int = 2) -> str:
+        """As "+0.31 [+0.10, +0.52]"; "+0.31" without an interval, "-" without pairs."""
+        if not self.pairs:
+            return "-"
+        mean, low, high = (f"{round(value, decimals) + 0.0:+.{decimals}f}" for value in self[1:4])  # + 0.0: no -0.00
+        return mean if math.isnan(self.low) else f"{mean} [{low}, {high}]"
+
+
+class Noise(NamedTuple):
+    """The standard deviation between seeds under equal settings, its degrees of freedom, and from how many groups."""
+
+    sd: float
+    freedom: int
+    groups: int
+
+    def between_means(self, n: int) -> float:
+        """What two means of n seeds differ by at most, 95 times in 100, if the settings do nothing (Student's t)."""
+        return float(stats.t.ppf(0.975, self.freedom)) * math.sqrt(2 / n) * self.sd
+
+
+def noise_floor(groups: pd.DataFrame) -> Noise:
+    """The root of the groups' mean variance, weighted by degrees of freedom; NaN if no group has two numbers."""
+    freedom = (groups.count() - 1).clip(lower=0)
+    total = int(freedom.sum())
+    variance = float((groups.var() * freedom).sum()) / total if total else math.nan
+    return Noise(math.sqrt(variance), total, int((freedom > 0).sum()))
+
+
+def paired_difference(differences: pd.DataFrame) -> Difference:
+    """The mean over scenes of each scene's mean difference, with its 95 % interval.
+
+    The scenes are taken as given, the seeds as drawn: Student's t with the variance between seeds pooled over scenes.
     """
+    counts = differences.count()[differences.count() > 0]
+    mean, noise = float(differences.mean().mean()), noise_floor(differences)
+    error = noise.sd * math.sqrt((1 / counts).sum()) / max(1, len(counts))
+    half = float(stats.t.ppf(0.975, noise.freedom)) * error
+    return Difference(int(counts.sum()), mean, mean - half, mean + half, noise.sd)
+
+
+def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """One line per cell, by scene; ValueError: no rows, or two that differ in the fit's settings or size alone."""
     if not rows:
         raise ValueError("rows: expected at least one cell, got none")
     cells = pd.DataFrame([row["cell"] for row in rows])[[*KEYS, "seed", "fit"]]
@@ -60,16 +107,11 @@ def wide(frame: pd.DataFrame, measure: str, **fixed: str) -> pd.DataFrame:
     return frame.pivot(index="seed", columns=[key for key in KEYS if key not in fixed], values=measure)
 
 
-def differences(frame: pd.DataFrame, key: str, value: str, base: str, measure: str = "test.psnr") -> pd.DataFrame:
-    """Of cells that differ in one field alone, the method or the start: value less base, as `wide`."""
-    if value == base or not {value, base} <= set(frame[key]):
-        return pd.DataFrame()
-    return wide(frame, measure, **{key: value}) - wide(frame, measure, **{key: base})
-
-
 def difference(frame: pd.DataFrame, key: str, value: str, base: str, measure: str = "test.psnr") -> Difference:
-    """The mean of `differences`, with its interval."""
-    return paired_difference(differences(frame, key, value, base, measure))
+    """Of cells that differ in one field alone, the method or the start: the mean of value less base."""
+    if value == base or not {value, base} <= set(frame[key]):
+        return paired_difference(pd.DataFrame())
+    return paired_difference(wide(frame, measure, **{key: value}) - wide(frame, measure, **{key: base}))
 
 
 def main_cells(frame: pd.DataFrame, starts: Sequence[str] = ("dense",)) -> pd.DataFrame:
@@ -87,13 +129,11 @@ def findings(frame: pd.DataFrame) -> list[str]:
         by_scene = {name.rpartition("/")[2]: difference(some, *pair) for (name,), some in each(cells, "scene")}
         scenes = [f"{name} {found.text()}" for name, found in by_scene.items() if found.pairs]
         if scenes:
-            noise = noise_floor(differences(cells, *pair))
-            spread = f", standard deviation of a pair: {noise.sd:.2f} dB" if noise.freedom else ""
+            spread = "" if math.isnan(gain.sd) else f", standard deviation of a pair: {gain.sd:.2f} dB"
             lpips = f" LPIPS (less is better): {cost.text(3)}." if cost.pairs else ""
-            sentences.append(
-                f"{what}: {gain.text()} dB of test PSNR (mean [95 % interval]; pairs: {gain.pairs}, scenes: "
-                f"{len(scenes)}{spread}).{lpips} By scene: {'; '.join(scenes)} dB."
-            )
+            counts = f"pairs: {gain.pairs}, scenes: {len(scenes)}{spread}"
+            found = f"{gain.text()} dB of test PSNR (mean [95 % interval]; {counts}).{lpips}"
+            sentences.append(f"{what}: {found} By scene: {'; '.join(scenes)} dB.")
     noise = noise_floor(wide(frame, "test.psnr"))
     if noise.freedom:
         single, three = (f"{noise.between_means(n):.2f} dB" for n in (1, 3))
@@ -118,40 +158,37 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {title: pd.DataFrame(lines) for title, lines in tables.items() if lines}
 
 
-def _settings(cells: pd.DataFrame) -> Lines:
-    return [line for _, some in each(cells, *KEYS[:3]) for line in _compared(some, MAIN)]
-
-
 def _methods(main: pd.DataFrame) -> Lines:
     found = main[main.method.isin(MAIN)]
     common = found[found.groupby("scene").method.transform("nunique") == found.method.nunique()]
     llff = common[(common.views == 3) & common.scene.map(lambda scene: benchmark_of(scene, 3) == "LLFF").astype(bool)]
-    lines = _settings(main) + _compared(llff, MAIN, "LLFF scenes")
+    lines = [line for _, some in each(main, *KEYS[:3]) for line in _compared(some, MAIN)]
+    lines += _compared(llff, MAIN, "LLFF scenes")
     return lines + (_compared(common, MAIN, "scenes") if len(llff) < len(common) else [])
 
 
 def _views(frame: pd.DataFrame) -> Lines:
     dense = frame[frame.start == "dense"]
     several = dense[dense.groupby("scene").views.transform("nunique") > 1]
+    lines = [line for _, some in each(several, *KEYS[:3]) for line in _compared(some, MAIN)]
     means = each(several.sort_values("views", kind="stable"), "views")
-    more = [line for (n,), cells in means for line in _compared(cells, MAIN, "scenes", f", {n} views")]
-    return _settings(several) + more
+    return lines + [line for (n,), cells in means for line in _compared(cells, MAIN, "scenes", f", {n} views")]
 
 
 def _ablations(cells: pd.DataFrame) -> dict[str, Lines]:
-    where, benchmark, views = _setting(cells), _benchmark(cells), cells.views.iloc[0]
-    found = set(cells.method)
+    where, found = _setting(cells), set(cells.method)
     tables = {
         f"{title} ({where})": _compared(cells, (OFF, PAPER, *family), bases=(OFF, PAPER))
         for title, family in FAMILIES.items()
         if found & set(family)
     }
-    lines = []
-    for method, base in EQUAL_MEAN_RATE.items():
-        if {method, base} <= found:
-            line = {"": f"{method} over {base}", "PSNR [dB] (pairs)": _gain(cells, method, base)}
-            lines.append(line | {"paper": published_difference(benchmark, views, method, base)})
-    return tables | {f"A growing rate against a fixed one of the same mean ({where})": lines}
+    tables[f"A growing rate against a fixed one of the same mean ({where})"] = [
+        {"": f"{method} over {base}", "PSNR [dB] (pairs)": _gain(cells, method, base)}
+        | {"paper": published_difference(*_benchmark(cells), method, base)}
+        for method, base in EQUAL_MEAN_RATE.items()
+        if {method, base} <= found
+    ]
+    return tables
 
 
 def _compared(
@@ -161,8 +198,7 @@ def _compared(
     scenes, lines = cells.scene.unique(), Lines()
     if kind and len(scenes) < 2:
         return lines
-    benchmark, views = _benchmark(cells), cells.views.iloc[0]
-    names = ", ".join(scene.rpartition("/")[2] for scene in scenes)
+    benchmark, names = _benchmark(cells), ", ".join(scene.rpartition("/")[2] for scene in scenes)
     name = f"mean of {len(scenes)} {kind} ({names}){more}" if kind else _setting(cells)
     for method in methods:
         if cells[cells.method == method].scene.nunique() == len(scenes):
@@ -171,9 +207,8 @@ def _compared(
             line |= {f"over {base} [dB] (pairs)": _gain(cells, method, base) for base in bases}
             line |= {"SSIM": mean_sd(ssim, 3), "LPIPS": mean_sd(lpips, 3)}
             line["LPIPS over off"] = difference(cells, "method", method, OFF, LPIPS).text(3)
-            line["paper: PSNR / SSIM / LPIPS"] = published(benchmark, views, method)
-            line |= {f"paper: over {base}": published_difference(benchmark, views, method, base) for base in bases}
-            lines.append(line)
+            line["paper: PSNR / SSIM / LPIPS"] = published(*benchmark, method)
+            lines.append(line | {f"paper: over {b}": published_difference(*benchmark, method, b) for b in bases})
     return lines
 
 
@@ -199,38 +234,34 @@ def _noise(frame: pd.DataFrame) -> Lines:
     lines = []
     for name, measure, cells in [*(scenes if len(scenes) > 1 else []), *(("all cells", m, frame) for m in QUALITY)]:
         noise = noise_floor(wide(cells, measure))
-        label = {"test.psnr": "PSNR [dB]", LPIPS: "LPIPS"}.get(measure, "SSIM")
+        label, decimals = QUALITY[measure], 3 if measure == "test.psnr" else 4
         line = {"scene": name, "measure": label, "groups": str(noise.groups), "degrees of freedom": str(noise.freedom)}
         numbers = {"sd between seeds": noise.sd, "two single runs": noise.between_means(1)}
         numbers |= {f"two means of {n}": noise.between_means(n) for n in (3, 5)}
         numbers["best of 5 over the mean"] = BEST_OF_5 * noise.sd
-        if noise.freedom:
-            lines.append(line | {key: f"{value:.{QUALITY[measure] + 1}f}" for key, value in numbers.items()})
+        lines += [line | {key: f"{value:.{decimals}f}" for key, value in numbers.items()}] if noise.freedom else []
     return lines
 
 
 def _cost(main: pd.DataFrame) -> Lines:
     main = main.assign(gap=main["train.psnr"] - main["test.psnr"], thousandths=1e3 * main.coadaptation)
-    heads = {"PSNR, training less test views [dB]": ("gap", 2), "wall clock [s]": ("wall_seconds", 0)}
-    heads |= {"CPU [s]": ("cpu_seconds", 0), "Gaussians": ("gaussians", 0), "peak memory [MiB]": ("peak_rss_mb", 0)}
-    heads["co-adaptation [1e-3]"] = ("thousandths", 2)
+    heads = {"PSNR, training less test views [dB]": "gap", "wall clock [s]": "wall_seconds", "CPU [s]": "cpu_seconds"}
+    heads |= {"Gaussians": "gaussians", "peak memory [MiB]": "peak_rss_mb", "co-adaptation [1e-3]": "thousandths"}
     return [
         {"scene": _setting(cells), "method": method, "n": str(len(cells))}
-        | {head: mean_sd(cells[measure], decimals) for head, (measure, decimals) in heads.items()}
+        | {head: mean_sd(cells[key], 2 if key in ("gap", "thousandths") else 0) for head, key in heads.items()}
         for (*_, method), cells in each(main, *KEYS)
     ]
 
 
 def _protocol(frame: pd.DataFrame) -> Lines:
-    """Sizes, splits, and the settings that all fits of a scene and number of views share."""
     lines = []
     for (scene, views), cells in each(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
         train, test, (height, width) = (cells[f"protocol.{key}"].iloc[0] for key in ("train", "test", "image_size"))
         shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
-        counts = {"training views": len(train), "test views": len(test), "cells": len(cells)}
-        line = {"scene": f"{scene}, {views} views", **{key: str(value) for key, value in counts.items()}}
-        fit = ", ".join(f"{key} {value}" for key, value in shared) or "-"
-        lines.append(line | {"size": f"{width}x{height}", "what all fits share": fit})
+        line = {"scene": f"{scene}, {views} views", "training views": str(len(train)), "test views": str(len(test))}
+        line |= {"cells": str(len(cells)), "size": f"{width}x{height}"}
+        lines.append(line | {"what all fits share": ", ".join(f"{key} {value}" for key, value in shared) or "-"})
     return lines
 
 
@@ -238,14 +269,13 @@ def _setting(cells: pd.DataFrame) -> str:
     return "{}, {} views, {}".format(*cells[[*KEYS[:3]]].iloc[0])
 
 
-def _benchmark(cells: pd.DataFrame) -> str | None:
-    """The paper's benchmark that all these cells are from."""
+def _benchmark(cells: pd.DataFrame) -> tuple[str | None, int]:
+    """The paper's benchmark that all these cells are from, and its number of views."""
     found = {(benchmark_of(scene, views), views) for (scene, views), _ in each(cells, *KEYS[:2])}
-    return found.pop()[0] if len(found) == 1 else None
+    return found.pop() if len(found) == 1 else (None, 0)
 
 
 def _spread(psnr: "pd.Series[float]") -> dict[str, str]:
-    """How many, mean (sd) and best, in dB."""
     best = f"{psnr.max():.2f}" if psnr.count() else "-"
     return {"n": str(psnr.count()), "PSNR [dB]": mean_sd(psnr, 2), "best": best}
 
