@@ -48,10 +48,8 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
             axis.set_ylim(len(some) - 0.5, -0.5)
             axis.axvline(0, color="#777777", linewidth=1)
     if not named:
-        labels = sorted(found, key=lambda label: label.startswith("from "))
-        figure.legend(
-            [found[label] for label in labels], labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8
-        )
+        found = dict(sorted(found.items(), key=lambda item: item[0].startswith("from ")))
+        figure.legend([*found.values()], [*found], loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
 
 
@@ -66,8 +64,7 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
 
 
 def _forest(frame: pd.DataFrame) -> pd.DataFrame:
-    main = main_cells(frame)
-    groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
+    groups = {"mean over scenes": main_cells(frame)[lambda main: main.groupby("method").scene.transform("nunique") > 1]}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in each(frame, *KEYS[:3])}
     lines = [
         {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": gain.high - gain.mean}
@@ -85,17 +82,14 @@ def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
 
 
 def _curves(frame: pd.DataFrame) -> pd.DataFrame:
-    main = main_cells(frame)
-    cells = main[main.method.isin(MAIN) & (main.curve.str.len() > 0)]
-    steps, psnr = (
-        cells.curve.map(lambda curve, key=key: [point[key] for point in curve]) for key in ("step", "test_psnr")
-    )
+    cells = main_cells(frame)[lambda main: main.method.isin(MAIN) & (main.curve.str.len() > 0)]
+    steps = cells.curve.map(lambda curve: [point["step"] for point in curve])
+    psnr = cells.curve.map(lambda curve: [point["test_psnr"] for point in curve])
     return _over_seeds(cells.assign(place=steps, x=steps, y=psnr))
 
 
 def _thresholds(frame: pd.DataFrame) -> pd.DataFrame:
-    main = main_cells(frame)
-    cells = main[main.method.isin((OFF, PAPER)) & main["thresholds.over"].notna()]
+    cells = main_cells(frame)[lambda main: main.method.isin((OFF, PAPER)) & main["thresholds.over"].notna()]
     over, counts, edges = (cells[f"thresholds.{key}"].map(np.array) for key in ("over", "gaussians", "distance"))
     shares = 100 * over / counts.map(lambda count: np.where(count > 0, count, np.nan))
     middle = edges.map(lambda edge: (edge[1:] + edge[:-1]) / 2)

@@ -21,12 +21,16 @@ _OTHERS += [f"protocol.{key}" for key in ("train", "test", "image_size")]
 STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
 LPIPS = "test.lpips_vgg_unscaled"
 QUALITY = {"test.psnr": "PSNR [dB]", "test.ssim_zero_padded": "SSIM", LPIPS: "LPIPS"}
+_COST = {"PSNR, training less test views [dB]": "gap", "wall clock [s]": "wall_seconds", "CPU [s]": "cpu_seconds"}
+_COST |= {"Gaussians": "gaussians", "peak memory [MiB]": "peak_rss_mb", "co-adaptation [1e-3]": "thousandths"}
 _COMPARISONS = {
     f"The paper's rule ({PAPER}) over no dropping (off)": ("method", PAPER, OFF),
     f"A fixed rate of the same mean ({FIXED}) over no dropping (off)": ("method", FIXED, OFF),
     f"The paper's rule over the fixed rate of the same mean ({FIXED})": ("method", PAPER, FIXED),
     f"Dense first points over those of SIFT, both with {PAPER}": ("start", "dense", "sift"),
 }
+_TITLE = """Test views: mean (sd) over n seeds; paired differences over off with their 95 % interval; the paper's \
+figures are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction"""
 BEST_OF_5 = 1.163  # how far the best of five runs lies over the mean on average, in standard deviations
 Lines = list[dict[str, str]]
 
@@ -75,8 +79,7 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     """
     counts = differences.count()[differences.count() > 0]
     mean, noise = float(differences.mean().mean()), noise_floor(differences)
-    error = noise.sd * math.sqrt((1 / counts).sum()) / max(1, len(counts))
-    half = float(stats.t.ppf(0.975, noise.freedom)) * error
+    half = float(stats.t.ppf(0.975, noise.freedom)) * (noise.sd * math.sqrt((1 / counts).sum()) / max(1, len(counts)))
     return Difference(int(counts.sum()), mean, mean - half, mean + half, noise.sd)
 
 
@@ -86,13 +89,12 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         raise ValueError("rows: expected at least one cell, got none")
     cells = pd.DataFrame([row["cell"] for row in rows])[[*KEYS, "seed", "fit"]]
     results = pd.json_normalize([row["result"] for row in rows]).reindex(columns=COLUMNS + _OTHERS)
-    numbers = results[COLUMNS].astype(float)
+    results[COLUMNS] = results[COLUMNS].astype(float).where(lambda numbers: numbers.abs() < math.inf)
     for *group, seed in cells.loc[cells.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy():
         raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
     order = {name: k for k, name in enumerate([*cells.scene.unique(), *STARTS, *METHODS])}
     places = cells[[*KEYS]].assign(**{key: cells[key].map(order).fillna(len(order)) for key in KEYS if key != "views"})
-    frame = pd.concat([cells, numbers.where(numbers.abs() < math.inf), results[_OTHERS]], axis=1)
-    return frame.iloc[places.sort_values([*KEYS], kind="stable").index]
+    return cells.join(results).iloc[places.sort_values([*KEYS], kind="stable").index]
 
 
 def each(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
@@ -134,8 +136,7 @@ def findings(frame: pd.DataFrame) -> list[str]:
             counts = f"pairs: {gain.pairs}, scenes: {len(scenes)}{spread}"
             found = f"{gain.text()} dB of test PSNR (mean [95 % interval]; {counts}).{lpips}"
             sentences.append(f"{what}: {found} By scene: {'; '.join(scenes)} dB.")
-    noise = noise_floor(wide(frame, "test.psnr"))
-    if noise.freedom:
+    if (noise := noise_floor(wide(frame, "test.psnr"))).freedom:
         single, three = (f"{noise.between_means(n):.2f} dB" for n in (1, 3))
         what = f"two single runs differ by up to {single}, and two means of three by up to {three}, 95 times in 100"
         sentences.append(f"Where nothing but the seed differs, {what} ({noise.groups} groups of runs).")
@@ -144,62 +145,62 @@ def findings(frame: pd.DataFrame) -> list[str]:
 
 def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """All tables that have a line, of text, by title; the main one first."""
-    main = main_cells(frame)
-    title = (
-        "Test views: mean (sd) over n seeds; paired differences over off with their 95 % interval; the paper's figures "
-        "are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction"
-    )
-    tables = {title: _methods(main), "Numbers of views": _views(frame), "First points": _starts(frame)}
+    main, dense = main_cells(frame), frame[frame.start == "dense"]
+    several = dense[dense.groupby("scene").views.transform("nunique") > 1]
+    by_views = _settings(several)
+    for (n,), cells in each(several.sort_values("views", kind="stable"), "views"):
+        by_views += _compared(cells, MAIN, f"mean of {{}} scenes ({{}}), {n} views")
+    tables = {_TITLE: _methods(main), "Numbers of views": by_views, "First points": _starts(frame)}
     for _, cells in each(main, *KEYS[:3]):
-        tables |= _ablations(cells) if set(cells.method) - set(MAIN) else {}
+        where, found = _setting(cells), set(cells.method)
+        if found <= set(MAIN):
+            continue
+        for title, family in FAMILIES.items():
+            if found & set(family):
+                tables[f"{title} ({where})"] = _compared(cells, (OFF, PAPER, *family), bases=(OFF, PAPER))
+        tables[f"A growing rate against a fixed one of the same mean ({where})"] = [
+            {"": f"{method} over {base}", "PSNR [dB] (pairs)": _gain(cells, method, base)}
+            | {"paper": published_difference(*_benchmark(cells), method, base)}
+            for method, base in EQUAL_MEAN_RATE.items()
+            if {method, base} <= found
+        ]
     title = "Noise between seeds under identical settings, pooled, and the difference that it makes 1 time in 20"
-    tables |= {title: _noise(frame), "Cost, overfitting and co-adaptation: mean (sd) over n seeds": _cost(main)}
-    tables |= {"Scenes, splits and settings": _protocol(frame)}
+    tables[title] = _noise(frame)
+    main = main.assign(gap=main["train.psnr"] - main["test.psnr"], thousandths=1e3 * main.coadaptation)
+    tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = [
+        {"scene": _setting(cells), "method": method, "n": str(len(cells))}
+        | {head: mean_sd(cells[key], 2 if key in ("gap", "thousandths") else 0) for head, key in _COST.items()}
+        for (*_, method), cells in each(main, *KEYS)
+    ]
+    tables["Scenes, splits and settings"] = protocol = Lines()
+    for (scene, views), cells in each(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
+        train, test, (height, width) = (cells[f"protocol.{key}"].iloc[0] for key in ("train", "test", "image_size"))
+        shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
+        line = {"scene": f"{scene}, {views} views", "training views": str(len(train)), "test views": str(len(test))}
+        line |= {"cells": str(len(cells)), "size": f"{width}x{height}"}
+        protocol.append(line | {"what all fits share": ", ".join(f"{key} {value}" for key, value in shared) or "-"})
     return {title: pd.DataFrame(lines) for title, lines in tables.items() if lines}
+
+
+def _settings(cells: pd.DataFrame) -> Lines:
+    return [line for _, some in each(cells, *KEYS[:3]) for line in _compared(some, MAIN)]
 
 
 def _methods(main: pd.DataFrame) -> Lines:
     found = main[main.method.isin(MAIN)]
     common = found[found.groupby("scene").method.transform("nunique") == found.method.nunique()]
     llff = common[(common.views == 3) & common.scene.map(lambda scene: benchmark_of(scene, 3) == "LLFF").astype(bool)]
-    lines = [line for _, some in each(main, *KEYS[:3]) for line in _compared(some, MAIN)]
-    lines += _compared(llff, MAIN, "LLFF scenes")
-    return lines + (_compared(common, MAIN, "scenes") if len(llff) < len(common) else [])
+    lines = _settings(main) + _compared(llff, MAIN, "mean of {} LLFF scenes ({})")
+    return lines + (_compared(common, MAIN, "mean of {} scenes ({})") if len(llff) < len(common) else [])
 
 
-def _views(frame: pd.DataFrame) -> Lines:
-    dense = frame[frame.start == "dense"]
-    several = dense[dense.groupby("scene").views.transform("nunique") > 1]
-    lines = [line for _, some in each(several, *KEYS[:3]) for line in _compared(some, MAIN)]
-    means = each(several.sort_values("views", kind="stable"), "views")
-    return lines + [line for (n,), cells in means for line in _compared(cells, MAIN, "scenes", f", {n} views")]
-
-
-def _ablations(cells: pd.DataFrame) -> dict[str, Lines]:
-    where, found = _setting(cells), set(cells.method)
-    tables = {
-        f"{title} ({where})": _compared(cells, (OFF, PAPER, *family), bases=(OFF, PAPER))
-        for title, family in FAMILIES.items()
-        if found & set(family)
-    }
-    tables[f"A growing rate against a fixed one of the same mean ({where})"] = [
-        {"": f"{method} over {base}", "PSNR [dB] (pairs)": _gain(cells, method, base)}
-        | {"paper": published_difference(*_benchmark(cells), method, base)}
-        for method, base in EQUAL_MEAN_RATE.items()
-        if {method, base} <= found
-    ]
-    return tables
-
-
-def _compared(
-    cells: pd.DataFrame, methods: Iterable[str], kind: str = "", more: str = "", bases: Sequence[str] = (OFF,)
-) -> Lines:
-    """One line per method that all scenes have: of one setting, or (`kind`) by seed of the mean over several."""
+def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases: Sequence[str] = (OFF,)) -> Lines:
+    """One line per method that all scenes have: of one setting, or (`mean`, their name) by seed over several."""
     scenes, lines = cells.scene.unique(), Lines()
-    if kind and len(scenes) < 2:
+    if mean and len(scenes) < 2:
         return lines
     benchmark, names = _benchmark(cells), ", ".join(scene.rpartition("/")[2] for scene in scenes)
-    name = f"mean of {len(scenes)} {kind} ({names}){more}" if kind else _setting(cells)
+    name = mean.format(len(scenes), names) if mean else _setting(cells)
     for method in methods:
         if cells[cells.method == method].scene.nunique() == len(scenes):
             psnr, ssim, lpips = (wide(cells, measure, method=method).dropna().mean(axis=1) for measure in QUALITY)
@@ -243,28 +244,6 @@ def _noise(frame: pd.DataFrame) -> Lines:
     return lines
 
 
-def _cost(main: pd.DataFrame) -> Lines:
-    main = main.assign(gap=main["train.psnr"] - main["test.psnr"], thousandths=1e3 * main.coadaptation)
-    heads = {"PSNR, training less test views [dB]": "gap", "wall clock [s]": "wall_seconds", "CPU [s]": "cpu_seconds"}
-    heads |= {"Gaussians": "gaussians", "peak memory [MiB]": "peak_rss_mb", "co-adaptation [1e-3]": "thousandths"}
-    return [
-        {"scene": _setting(cells), "method": method, "n": str(len(cells))}
-        | {head: mean_sd(cells[key], 2 if key in ("gap", "thousandths") else 0) for head, key in heads.items()}
-        for (*_, method), cells in each(main, *KEYS)
-    ]
-
-
-def _protocol(frame: pd.DataFrame) -> Lines:
-    lines = []
-    for (scene, views), cells in each(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
-        train, test, (height, width) = (cells[f"protocol.{key}"].iloc[0] for key in ("train", "test", "image_size"))
-        shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
-        line = {"scene": f"{scene}, {views} views", "training views": str(len(train)), "test views": str(len(test))}
-        line |= {"cells": str(len(cells)), "size": f"{width}x{height}"}
-        lines.append(line | {"what all fits share": ", ".join(f"{key} {value}" for key, value in shared) or "-"})
-    return lines
-
-
 def _setting(cells: pd.DataFrame) -> str:
     return "{}, {} views, {}".format(*cells[[*KEYS[:3]]].iloc[0])
 
@@ -276,8 +255,7 @@ def _benchmark(cells: pd.DataFrame) -> tuple[str | None, int]:
 
 
 def _spread(psnr: "pd.Series[float]") -> dict[str, str]:
-    best = f"{psnr.max():.2f}" if psnr.count() else "-"
-    return {"n": str(psnr.count()), "PSNR [dB]": mean_sd(psnr, 2), "best": best}
+    return {"n": str(psnr.count()), "PSNR [dB]": mean_sd(psnr, 2), "best": f"{psnr.max():.2f}" if psnr.count() else "-"}
 
 
 def _gain(cells: pd.DataFrame, value: str, base: str, key: str = "method") -> str:
