@@ -133,10 +133,7 @@ def whitening(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> tuple[Tensor, 
 
 
 def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
-    """What compositing needs of each footprint, `(10, M)`.
-
-    Rows: ln o; x, y; the coefficients of dx^2, dx dy, dy^2 in -q/2; the two whitening vectors.
-    """
+    """`(10, M)` for compositing: ln o; x, y; the coefficients of dx^2, dx dy, dy^2 in -q/2; two whitening vectors."""
     ax, ay, bx, by = whitening(*variances(factors, eps2d))
     x, y = means2d.unbind(1)
     quadratic = -0.5 * (ax * ax + bx * bx), -(ax * ay + bx * by), -0.5 * (ay * ay + by * by)
@@ -146,7 +143,9 @@ def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: 
 def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:
     """From moments s of dL/d ln alpha, `(n, 6)`, to gradients of means2d, factors and opacities.
 
-    With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 (Q M).
+    With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 (Q M). With the
+    rows a, b of M and w = a x b the rows of det Q M are e a + b x w and e b + w x a, without the cancellation of a
+    product: a needle's long axis is nearly in the kernel of Q.
     """
     s0, sx, sy, sxx, sxy, syy = columns(rows)
     xx, xy, yy, det = variances(factors, eps2d)
@@ -154,18 +153,8 @@ def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: fl
     def conic(x: Tensor, y: Tensor) -> Tensor:
         return torch.stack([yy * x - xy * y, xx * y - xy * x]).div_(det)
 
-    x, y = _whitened(factors, eps2d, det)
-    d_factors = conic(sxx * x + sxy * y, sxy * x + syy * y)
-    return conic(sx, sy).t(), d_factors.permute(2, 0, 1), s0 / opacities
-
-
-def _whitened(factors: Tensor, eps2d: float, det: Tensor) -> Tensor:
-    """Q M, `(2, 3, n)`, without the cancellation of a product: a needle's long axis is nearly in the kernel of Q.
-
-    With the rows a, b of M and w = a x b the rows of det Q M are e a + b x w and e b + w x a.
-    """
-    rows = columns(factors).unflatten(0, (2, 3))
-    a, b = rows
+    a, b = m = columns(factors).unflatten(0, (2, 3))
     w = torch.linalg.cross(a, b, dim=0)
     turned = torch.stack([torch.linalg.cross(b, w, dim=0), torch.linalg.cross(w, a, dim=0)])
-    return turned.add_(rows, alpha=eps2d).div_(det)
+    x, y = turned.add_(m, alpha=eps2d).div_(det)  # Q M
+    return conic(sx, sy).t(), conic(sxx * x + sxy * y, sxy * x + syy * y).permute(2, 0, 1), s0 / opacities

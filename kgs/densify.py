@@ -148,13 +148,11 @@ class Densifier:
             order = torch.where(hot, average, -1.0).argsort(descending=True, stable=True)
             hot = torch.zeros_like(hot).index_fill(0, order[:room], True)
         large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
-        masks = (hot & ~large, hot & large, opaque & ~(hot & large))
-        cloned, split, kept = (mask.nonzero().squeeze(1) for mask in masks)
+        cloned, split, kept = (x.nonzero().squeeze(1) for x in (hot & ~large, hot & large, opaque & ~(hot & large)))
         born = torch.cat([cloned, split.repeat(CHILDREN)])
         new = {name: parameter.index_select(0, born) for name, parameter in model.named_parameters()}
-        children = slice(len(cloned), None)
-        new["means"][children] += self._sample_offsets(split.repeat(CHILDREN))
-        new["log_scales"][children] -= math.log(SHRINK)
+        new["means"][len(cloned) :] += self._sample_offsets(split.repeat(CHILDREN))
+        new["log_scales"][len(cloned) :] -= math.log(SHRINK)
         for name, parameter in list(model.named_parameters()):
             self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
         self._observe_anew(self.mean_gradients[torch.cat([kept, born])])
@@ -172,8 +170,7 @@ class Densifier:
 
     def state_dict(self) -> dict[str, Tensor]:
         """The statistics and the generator's state, for a checkpoint."""
-        statistics = {name: value.clone() for name, value in self._statistics.items()}
-        return statistics | {"generator": self.generator.get_state()}
+        return {name: x.clone() for name, x in self._statistics.items()} | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from what `state_dict` returned; a ValueError unless it is whole and of as many Gaussians."""

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_SEPARATE = hasattr(torch.backends.mkldnn, "matmul")  # torch before 2.9 has one setting for all
-_MKLDNN: Any = torch.backends.mkldnn
-_BACKENDS: list[Any] = [_MKLDNN.matmul, torch.backends.cuda.matmul] if _SEPARATE else []
+_MKLDNN: Any = torch.backends.mkldnn  # without `matmul`, before torch 2.9, there is one setting for all
+_BACKENDS: list[Any] = [_MKLDNN.matmul, torch.backends.cuda.matmul] if hasattr(_MKLDNN, "matmul") else []
 _lock = threading.Lock()
 _inside = 0
 _put_back: Callable[[], None]  # set by who enters first

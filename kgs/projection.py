@@ -122,8 +122,7 @@ def _project_one(
     """The fields gaussian_ids to colors of `ProjectedGaussians` for one camera."""
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     with torch.no_grad():
-        front = (gaussians.means @ rotation[2] + translation[2] > near_plane) & finite
-        ids = front.nonzero()[:, 0]
+        ids = ((gaussians.means @ rotation[2] + translation[2] > near_plane) & finite).nonzero()[:, 0]
         if lens.sees is not None:
             seen = lens.sees(torch.addmm(translation, _rows(gaussians.means, ids), rotation.T))
             ids = _rows(ids, seen.nonzero()[:, 0])

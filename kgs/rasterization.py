@@ -57,7 +57,6 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     """Render N Gaussians in C pinhole cameras; a drop-in for `gsplat.rasterization`.
 
     Differentiable in all tensors, `viewmats` and `Ks` included. For other lenses and outputs see `GaussianRenderer`.
-
     For near_plane, eps2d, tile_size, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
     Without effect are packed, channel_chunk and segmented; only at the values with which they do nothing are accepted
     far_plane (1e10 or more), radius_clip, sparse_grad, absgrad, rasterize_mode, distributed, camera_model, and others.
@@ -119,8 +118,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     image, own = "RGB" in render_mode, sh_degree is None and colors.ndim == 3
     gaussians = Gaussians(means, quats, scales, opacities, colors[0] if own else colors)
     rules: dict[str, Any] = {"alpha_threshold": alpha_threshold, "backend": backend}
-    wanted = image and not own
-    projected = project(gaussians, posed, near_plane=near_plane, eps2d=eps2d, colors=wanted, **rules)
+    projected = project(gaussians, posed, near_plane=near_plane, eps2d=eps2d, colors=image and not own, **rules)
     half = 0.5 if pixel_centers == "half" else 0.0
     means2d = projected.means2d + half
     if means2d.requires_grad:

@@ -21,8 +21,7 @@ and V_{k+1} = 0 where layer k ends the light. V is a mean of colours: no sum gro
 product; they are shifted to its centre and summed over its tiles.
 
 An image that needs more than `max_bytes` is made in row slices. Where lists are long, a row slice is made in depth
-slices, nearest first: lists are made for the tiles alone that still have light, so that what is hidden is neither
-listed nor sorted.
+slices, nearest first, with lists for the tiles that still have light alone: what is hidden is not listed or sorted.
 """
 
 from torch import Tensor

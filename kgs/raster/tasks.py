@@ -1,9 +1,8 @@
 """What a pass works on: the data of a slice, its groups of tiles, and the record of a step.
 
-A slice has the tiles of a row slice, each with its entries of a depth slice. Its tiles are sorted by the length of
-their lists and taken in groups; a group is one piece of work for one thread. Within a group, step j does the j-th chunk
-of K entries of every tile that still has one and still lets light through; tiles that are done leave the group once
-they are a fifth of it.
+The tiles of a slice are sorted by the length of their lists and taken in groups; a group is one piece of work for one
+thread. Within a group, step j does the j-th chunk of K entries of every tile that still has one and still lets light
+through; tiles that are done leave the group once they are a fifth of it.
 """
 
 import math

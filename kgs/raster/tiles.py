@@ -149,8 +149,7 @@ class Reach:
             return self._all
         camera_row, first_row, num_rows = (x[low:high] for x in (self._camera_row, self._first_row, self._num_rows))
         if (begin, end) != (0, self.total_rows):
-            last = (camera_row + first_row + num_rows).clamp_(begin, end)
-            first = (camera_row + first_row).clamp_(begin, end)
+            first, last = ((camera_row + first_row + count).clamp_(begin, end) for count in (0, num_rows))
             first_row, num_rows = first - camera_row, last - first
         ranks = torch.repeat_interleave(_arange(num_rows), num_rows, output_size=int(num_rows.sum(dtype=torch.int64)))
         start = torch.cumsum(num_rows, 0, dtype=torch.int32) - num_rows
@@ -165,8 +164,7 @@ class Reach:
         def edge(sign: int) -> Tensor:
             dy = torch.minimum(torch.maximum(sign * rightmost, top), bottom)
             half = ((cut - dy * dy * inverse_yy).clamp_min_(0.0) * across).sqrt_()
-            found = torch.addcmul(x, slope, dy).add_(half, alpha=sign)
-            return torch.where(everywhere, sign * torch.inf, found)
+            return torch.where(everywhere, sign * torch.inf, torch.addcmul(x, slope, dy).add_(half, alpha=sign))
 
         left = torch.ceil(edge(-1)).clamp_(0, self._width)
         right = torch.floor(edge(1)).clamp_(-1, self._width - 1)
@@ -190,8 +188,9 @@ class Reach:
         if live is not None:
             alive = F.pad(torch.cumsum(live.int(), 0, dtype=torch.int32), (1, 0))
             left = (spans.rows - begin) * columns + spans.first
-            inside = alive.index_select(0, left + spans.counts) > alive.index_select(0, left)
-            spans = spans.take(inside.nonzero()[:, 0])
+            spans = spans.take(
+                (alive.index_select(0, left + spans.counts) > alive.index_select(0, left)).nonzero()[:, 0]
+            )
         counts, num_tiles = spans.counts, (end - begin) * columns
         # in the order of the Gaussians: entry e of a span is tile (row, first + e)
         start = torch.cumsum(counts, 0, dtype=torch.int32) - counts
@@ -202,8 +201,7 @@ class Reach:
             inside = live.index_select(0, tiles).nonzero()[:, 0]
             tiles, entries = tiles.index_select(0, inside), entries.index_select(0, inside)
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
-        per_tile = torch.bincount(keys, minlength=num_tiles)
-        offsets = torch.cat([per_tile.new_zeros(1), torch.cumsum(per_tile, 0)])
+        offsets = F.pad(torch.cumsum(torch.bincount(keys, minlength=num_tiles), 0), (1, 0))
         entries, ids = entries.index_select(0, order), self.ids[low:high]
         return TileLists(self.tile_size, self.grid, begin * columns, offsets, entries, ids, order)
 

@@ -46,10 +46,7 @@ def composite_torch(
 
 @dataclass(frozen=True)
 class _Passes:
-    """Both passes over a row slice: one depth slice after the other, nearest first, while light is left.
-
-    Lists are made for the tiles alone that the depth slices before have left light in.
-    """
+    """Both passes over a row slice: one depth slice after the other, nearest first, while light is left."""
 
     projected: ProjectedGaussians
     reach: Reach
@@ -85,13 +82,12 @@ class _Passes:
         up; `total` is `(n, 6 + F)`, without the columns that are not wanted.
         """
         for (low, high), part in reversed(done):
-            entries = part.lists.entries.shape[0]
+            lists, entries = part.lists, part.lists.entries.shape[0]
             if entries == 0:
                 continue
             rows = total.new_zeros(entries + 1, total.shape[1])
             run_all(part.groups, partial(Backward, part, grads, behind, rows, moments, features), rows.device)
             # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
-            lists = part.lists
             total[low:high] += F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
     def _slice(self, inputs: tuple[Tensor, ...], lists: TileLists, ranks: tuple[int, int]) -> Slice:

@@ -1,7 +1,4 @@
-"""One step of compositing, forward and backward, in torch, for one thread with its own buffers.
-
-The formulas are those of `kgs.raster`, the arrangement that of `tasks`.
-"""
+"""A step of compositing, forward and backward, for one thread; formulas as in `kgs.raster`, groups as in `tasks`."""
 
 import torch
 import torch.nn.functional as F
@@ -13,10 +10,7 @@ _LIVE_SHARE = 0.8  # a group is compacted when fewer of its tiles than this stil
 
 
 class _Worker:
-    """Buffers of one thread, and the alphas of a step in them.
-
-    Layer k of all tiles of a step is one contiguous slab: what goes from layer to layer runs over long vectors.
-    """
+    """Buffers of one thread; layer k of all tiles of a step is one contiguous slab, for scans over long vectors."""
 
     def __init__(self, part: Slice, buffers: int) -> None:
         self.part = part
@@ -38,8 +32,7 @@ class _Worker:
 
     def offsets(self, places: Tensor, tiles: Tensor) -> tuple[Tensor, Tensor]:
         """From the centres of n tiles to Gaussians at `places` `(2, K n)`."""
-        centres = self.part.centres.index_select(1, tiles)
-        ux, uy = (places.view(2, -1, tiles.shape[0]) - centres[:, None]).view(2, -1)
+        ux, uy = (places.view(2, -1, tiles.shape[0]) - self.part.centres.index_select(1, tiles)[:, None]).view(2, -1)
         return ux, uy
 
     def evaluate(self, ids: Tensor, tiles: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,22 +137,20 @@ class Backward(_Worker):
 
     def __call__(self, group: Group) -> None:
         """Differentiate a group."""
-        grads = self.grads.index_select(0, group.tiles)
-        behind = self.behind.index_select(0, group.tiles)[:, 0]
+        grads, behind = (x.index_select(0, group.tiles) for x in (self.grads, self.behind[:, 0]))
         for step in reversed(group.steps):
             columns = [group.tiles, group.starts, group.ends, grads, behind]
             if step.rows is None:
-                self._step(step, [x[: step.count] for x in columns])
+                self._step(step, *(x[: step.count] for x in columns))
             else:
                 rows = step.rows[: step.count]
                 columns = [x.index_select(0, rows) for x in columns]
-                self._step(step, columns)
+                self._step(step, *columns)
                 behind.index_copy_(0, rows, columns[-1])
         self.behind.index_copy_(0, group.tiles, behind[:, None])
 
-    def _step(self, step: Step, columns: list[Tensor]) -> None:
-        """Gradients of one step; the last column, V behind it, becomes V before the step, see `kgs.raster`."""
-        tiles, starts, ends, grads, behind = columns
+    def _step(self, step: Step, tiles: Tensor, starts: Tensor, ends: Tensor, grads: Tensor, behind: Tensor) -> None:
+        """Gradients of one step; `behind`, V behind it, becomes V before the step, see `kgs.raster`."""
         part, n, size = self.part, step.count, self.part.chunk_size
         positions, beyond, ids = self.entries(starts, ends, step.chunk)
         alpha = self.buffer(1, size, n) if step.alpha is None else step.alpha
