@@ -1,7 +1,4 @@
-"""What `kgs demo`, `fit`, `render` and `eval` do; their options are the arguments here.
-
-Everything that can be known is checked before work begins, and heavy packages are imported after that.
-"""
+"""What `kgs demo`, `fit`, `render` and `eval` do; options are arguments. Checks come before work and heavy imports."""
 
 import math
 import os

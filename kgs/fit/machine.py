@@ -35,14 +35,12 @@ def versions() -> dict[str, str]:
 
 def peak_rss_mb() -> int:
     """Largest resident memory of this process so far, in MiB; 0 where the system does not tell (Windows)."""
-    if (
-        status := Path("/proc/self/status")
-    ).exists():  # what getrusage says on Linux can be the peak of the process that started this one
+    status = Path("/proc/self/status")
+    if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
         return round(int(line.split()[1]) / 2**10)
     try:
         import resource
     except ModuleNotFoundError:
         return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10))
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10))

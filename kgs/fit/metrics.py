@@ -1,7 +1,6 @@
 """Measures of held-out views: PSNR, SSIM with both borders, LPIPS.
 
-Float renders clamped to [0, 1] are compared, never 8-bit files. Every measure is taken view by view, over all pixels
-and channels (masks are not used), and the mean is over views.
+Float renders clamped to [0, 1] are compared, never 8-bit files, over all pixels and channels (masks are not used).
 
 Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
 Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.

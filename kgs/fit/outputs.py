@@ -43,8 +43,7 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
     if has_photos or any((out / name).exists() for name in _SCENES):
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):
-        folder = path.parent
-        if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(folder) and not folder.is_dir()):
+        if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(path.parent) and not path.parent.is_dir()):
             raise DataError(path, "", f"was not written by kgs and would be overwritten: {advice}")
     if make:
         out.mkdir(parents=True, exist_ok=True)

@@ -105,8 +105,7 @@ def first_points(
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
     pixels, depths = project_all(points, views.cameras)
-    colors = _mean_colors(views, pixels, _inside(pixels, depths, views, near, far))
-    return FirstPoints(points.float(), colors, "random")
+    return FirstPoints(points.float(), _mean_colors(views, pixels, _inside(pixels, depths, views, near, far)), "random")
 
 
 def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
@@ -191,8 +190,7 @@ def _random_points(views: Views, count: int, near: float, far: float, generator:
 
 def _inside(pixels: Tensor, depths: Tensor, views: Views, near: float, far: float) -> Tensor:
     """Whether points `(P, V)` lie in the images of the views, between two depths."""
-    height, width = views.images.shape[-2:]
-    limits = torch.tensor([width - 0.5, height - 0.5], dtype=pixels.dtype)
+    limits = torch.tensor([views.images.shape[-1] - 0.5, views.images.shape[-2] - 0.5], dtype=pixels.dtype)
     return ((pixels > -0.5) & (pixels < limits)).all(-1) & (depths >= near) & (depths <= far)
 
 
@@ -205,8 +203,7 @@ def _seen_depths(points: Tensor, views: Views) -> Tensor:
 def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:
     """The mean of the images' colours at pixels `(P, V, 2)`, over the views where `seen` `(P, V)`."""
     images = views.images.cpu()
-    height, width = images.shape[-2:]
-    span = torch.tensor([max(width - 1, 1), max(height - 1, 1)])
+    span = torch.tensor([max(images.shape[-1] - 1, 1), max(images.shape[-2] - 1, 1)])
     grid = (2.0 * pixels / span - 1.0).transpose(0, 1)[:, :, None].to(images.dtype)
     samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)[..., 0]
     weights = (seen / seen.sum(1, keepdim=True)).T[:, None].to(images.dtype)

@@ -41,12 +41,10 @@ def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int
     pixels = torch.stack([columns, rows], 1)
     points = unproject(pixels, here[rows, columns].double(), torch.full_like(rows, view), views.cameras)
     pixels, depths = project_all(points, views.cameras)
-    limits = torch.tensor(here.mT.shape)
     agreed = torch.zeros(len(points), dtype=torch.bool)
     for other in set(range(len(views))) - {view}:
         places, depth = pixels[:, other].round(), depths[:, other]
-        inside = ((places >= 0) & (places < limits)).all(1) & (depth > 0)
+        inside = ((places >= 0) & (places < torch.tensor(here.mT.shape))).all(1) & (depth > 0)
         x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
-        close = (maps[other].depths[y, x] / depth - 1).abs() < AGREEMENT
-        agreed |= inside & close & certain[other][y, x]
+        agreed |= inside & ((maps[other].depths[y, x] / depth - 1).abs() < AGREEMENT) & certain[other][y, x]
     return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]

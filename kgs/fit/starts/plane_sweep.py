@@ -46,10 +46,9 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent) -
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
     inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
-    depth = 1 / float(inverse.mean())
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
-        if others := _neighbours(views, view, depth):
+        if others := _neighbours(views, view, 1 / float(inverse.mean())):
             scores = _combine(_scores(grey, views.cameras, view, other, inverse) for other in others)
             maps.append(_refine(_semi_global(1.0 - scores, grey[view]), scores, inverse))
         else:
@@ -83,8 +82,7 @@ def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse
         homography = intrinsics[other] @ turn @ back
         warped, inside = (_warp(layer, homography) for layer in (target, torch.ones_like(target)))
         there, spread = _moments(warped)
-        covariance = _box(image * warped) - mean * there
-        score = covariance * ((variance + _VARIANCE) * (spread + _VARIANCE)).rsqrt()
+        score = (_box(image * warped) - mean * there) * ((variance + _VARIANCE) * (spread + _VARIANCE)).rsqrt()
         found[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
     return found
 
@@ -137,8 +135,7 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
         if last >= 0:
             came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
             least = came.amin(0)
-            jump = (JUMP * EDGE / (EDGE + edge)).clamp_min(1.5 * STEP)
-            cheapest = torch.minimum(came, least + jump)
+            cheapest = torch.minimum(came, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(1.5 * STEP))
             cheapest[1:] = torch.minimum(cheapest[1:], came[:-1] + STEP)
             cheapest[:-1] = torch.minimum(cheapest[:-1], came[1:] + STEP)
             more = cheapest - least

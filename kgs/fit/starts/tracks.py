@@ -47,8 +47,7 @@ def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
     limit = min(max(48_000 // len(views), 1500), 12_000)
     features = [_detect(views, view, limit) for view in stage(range(len(views)), "keypoints", "view")]
-    cameras = views.cameras
-    projections = (cameras.intrinsics.double() @ cameras.extrinsics.double())[:, :3].cpu()
+    projections = (views.cameras.intrinsics.double() @ views.cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
     links = list[tuple[float, int, int]]()
     for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
@@ -95,16 +94,14 @@ def _match(
     targets = convert_points_to_homogeneous(places2).float().T
     candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
     for start in range(0, len(lines), CHUNK):
-        near_line = (lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE
-        rows, columns = near_line.nonzero().unbind(1)
+        rows, columns = ((lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
         # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
         differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
         candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
     rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
     nearest1, rival1 = _nearest(distances, rows, len(places1))
     nearest2, rival2 = _nearest(distances, columns, len(places2))
-    distinct = distances < MAX_RATIO * torch.minimum(rival1, rival2)
-    good = nearest1 & nearest2 & distinct & (distances < MAX_DISTANCE)
+    good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)
     return distances[good], rows[good], columns[good]
 
 

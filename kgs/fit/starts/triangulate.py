@@ -22,9 +22,8 @@ def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
     rotations, translations = extrinsics[:, :3, :3], extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]
     projections = torch.cat([rotations, translations[..., None]], dim=-1)
     rays = (torch.linalg.inv(intrinsics) @ convert_points_to_homogeneous(tracks.pixels)[..., None])[..., 0]
-    equations = rays[..., :2, None] * projections[:, None, 2] - projections[:, :2]
-    equations = (equations * tracks.seen[..., None, None]).flatten(1, 2)
-    null = torch.linalg.svd(equations, full_matrices=False).Vh[:, -1]
+    equations = (rays[..., :2, None] * projections[:, None, 2] - projections[:, :2]) * tracks.seen[..., None, None]
+    null = torch.linalg.svd(equations.flatten(1, 2), full_matrices=False).Vh[:, -1]
     points: Tensor = null[:, :3] / null[:, 3:] + origin
     return points
 
@@ -45,8 +44,7 @@ def triangulate_certain(tracks: Tracks, cameras: PinholeCamera) -> tuple[Tensor,
         points, agreeing = points[enough], agreeing[enough]
         tracks = Tracks(tracks.pixels[enough], kept[enough])
     rays = torch.nn.functional.normalize(points[:, None] - camera_centers(cameras), dim=-1)
-    both = tracks.seen[:, :, None] & tracks.seen[:, None, :]
-    cosines = (rays @ rays.mT).masked_fill(~both, 1.0).flatten(1).amin(1)
+    cosines = (rays @ rays.mT).masked_fill(~(tracks.seen[:, :, None] & tracks.seen[:, None, :]), 1.0).flatten(1).amin(1)
     certain = agreeing & (cosines.clamp(-1.0, 1.0).acos().rad2deg() >= MIN_ANGLE)
     return points[certain], tracks.select(certain)
 
