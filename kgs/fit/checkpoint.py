@@ -50,7 +50,12 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
         if path.exists():
             os.replace(path, previous(path))
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        if os.name == "posix":  # the new names survive a power cut
+            descriptor = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
@@ -74,8 +79,7 @@ def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read what `save_checkpoint` wrote, with tensors on the CPU.
 
-    A DataError where the file is missing, no checkpoint, of an older version or damaged, or a number is not finite. A
-    right checksum is no proof that the rest is well formed.
+    A DataError where the file is missing, no checkpoint, of an older version or damaged, or a number is not finite.
     """
     old = path.with_suffix(".pt")
     try:
@@ -110,9 +114,8 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
     """SHA-256 sums by which any change of a photo, mask, pose, intrinsics or the background is noticed and named."""
 
     def of(views: Views) -> dict[str, Any]:
-        cameras = views.cameras
         tensors = {"photos": views.images, "masks": views.masks}
-        tensors |= {"poses": cameras.extrinsics, "intrinsics": cameras.intrinsics}
+        tensors |= {"poses": views.cameras.extrinsics, "intrinsics": views.cameras.intrinsics}
         sums = {what: None if values is None else list(map(_digest, values)) for what, values in tensors.items()}
         return {"names": list(views.names), **sums}
 
@@ -140,7 +143,16 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
         wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
         raise ValueError(f"--steps: expected {wanted} got {config.steps}")
     _compare_settings(state["config"], asked)
-    _compare_scenes(state["scene"], scene)
+    for part in ("training", "test"):
+        for what, values in scene[part].items():
+            before = state["scene"][part][what]
+            if before != values:
+                both = zip(scene[part]["names"], before or [], values or [], strict=False)
+                changed = ", ".join(name for name, one, other in both if one != other)
+                which = f"{what} of the {part} views: expected those that the fit was begun with, got others"
+                raise ValueError(which + f" for {changed:.200}" * bool(changed))
+    if state["scene"]["background"] != scene["background"]:
+        raise ValueError("--background: expected the one that the fit was begun with, got another")
     if max(state["stack"], default=0) >= len(scene["training"]["names"]):
         raise ValueError(f"stack: expected views of the scene, got {state['stack']!s:.80}")
     return notes
@@ -156,17 +168,23 @@ def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], flag: str = 
             raise ValueError(f"{name}: expected {before!r}, as the fit was begun with, got {value!r}")
 
 
-def _compare_scenes(saved: Any, asked: dict[str, Any]) -> None:
-    for part in ("training", "test"):
-        for what, values in asked[part].items():
-            before = saved[part][what]
-            if before != values:
-                both = zip(asked[part]["names"], before or [], values or [], strict=False)
-                changed = ", ".join(name for name, one, other in both if one != other)
-                which = f"{what} of the {part} views: expected those that the fit was begun with, got others"
-                raise ValueError(which + f" for {changed:.200}" * bool(changed))
-    if saved["background"] != asked["background"]:
-        raise ValueError("--background: expected the one that the fit was begun with, got another")
+def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Tensor]]:
+    """Step and moments of each group by its name; an empty dict where it had no gradient yet."""
+    return {group["name"]: optimizer.state.get(group["params"][0], {}) for group in optimizer.param_groups}
+
+
+def load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
+    """The inverse of `moments_of`; a ValueError where shapes or signs are wrong, which torch does not check."""
+    groups, found = optimizer.state_dict()["param_groups"], {}
+    for group, held in zip(groups, optimizer.param_groups, strict=True):
+        shape, state = held["params"][0].shape, moments[group["name"]]
+        if state:
+            shapes = {"step": (), "exp_avg": shape, "exp_avg_sq": shape}
+            negative = any(bool((state[name] < 0).any()) for name in ("step", "exp_avg_sq"))
+            if negative or {name: tuple(value.shape) for name, value in state.items()} != shapes:
+                raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
+            found[group["params"][0]] = state
+    optimizer.load_state_dict({"state": found, "param_groups": groups})
 
 
 def _digest(tensor: Tensor) -> str:
@@ -194,16 +212,6 @@ def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
         else:
             rest[key] = _take_tensors(item, tensors, f"{path}{key}/")
     return rest
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new names survive a power cut, where the system has a way to."""
-    if os.name == "posix":
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def is_number(value: Any, least: float = -1e300, whole: bool = False) -> bool:

@@ -13,8 +13,7 @@ _LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit 
 def parameter_fault(model: GaussianModel) -> str:
     """The first parameter that is not finite, or overflows when it is activated; "" where there is none."""
     for name, parameter in model.named_parameters():
-        value = parameter.detach()
-        row = _first_row(value.exp() if name == "log_scales" else value)
+        row = _first_row(~torch.isfinite(parameter.detach().exp() if name == "log_scales" else parameter.detach()))
         if row is not None:
             return f"expected finite parameters, got others in {name} of Gaussian {row}"
     return ""
@@ -24,7 +23,7 @@ def gradient_fault(model: GaussianModel) -> str:
     """The first gradient whose square, which Adam keeps, is not finite (from 1e19 on); "" where there is none."""
     for name, parameter in model.named_parameters():
         if parameter.grad is not None and not math.isfinite(float(parameter.grad.square().sum())):
-            row = _first_row(parameter.grad.square())
+            row = _first_row(~torch.isfinite(parameter.grad.square()))
             whose = "all Gaussians together" if row is None else f"Gaussian {row}"
             return f"expected gradients below 1e19, got others in {name} of {whose}"
     return ""
@@ -32,14 +31,13 @@ def gradient_fault(model: GaussianModel) -> str:
 
 def scale_fault(model: GaussianModel, extent: float) -> str:
     """The first scale above a million extents; "" where there is none."""
-    rows = (model.log_scales.detach() > math.log(_LARGEST * extent)).any(1).nonzero()
-    if not len(rows):
+    row = _first_row(model.log_scales.detach() > math.log(_LARGEST * extent))
+    if row is None:
         return ""
-    row = int(rows[0, 0])
     largest = float(model.log_scales.detach()[row].max())
     return f"expected scales below {_LARGEST:g} times the extent, got e^{largest:.1f} in log_scales of Gaussian {row}"
 
 
-def _first_row(value: Tensor) -> int | None:
-    rows = (~torch.isfinite(value)).nonzero()
+def _first_row(is_wrong: Tensor) -> int | None:
+    rows = is_wrong.nonzero()
     return int(rows[0, 0]) if len(rows) else None

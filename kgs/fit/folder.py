@@ -72,9 +72,8 @@ def end_move(out: Path) -> None:
     names = [str(name) for name in read_json(done / _LIST).get("files", [])]  # of the moved ones as well
     (out / "test").mkdir(exist_ok=True)
     remove_others(out / "test", {Path(name).name for name in names if name.startswith("test/")})
-    for name in _OPTIONAL:
-        if name not in names:
-            (out / name).unlink(missing_ok=True)
+    for name in set(_OPTIONAL) - set(names):
+        (out / name).unlink(missing_ok=True)
     for name in _results(done):
         os.replace(done / name, out / name)
     shutil.rmtree(done)

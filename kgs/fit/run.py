@@ -122,12 +122,11 @@ def fit_scene(
             if not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)
             raise
-        notes = trainer.notes[told:]
         if stopped_by and is_finished(out):
-            notes.append(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
+            trainer.notes.append(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
         else:
             publish(out)
-        for note in notes:
+        for note in trainer.notes[told:]:
             say(note)
     return metrics, stopped_by
 
@@ -219,10 +218,9 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """The signals that came: Ctrl-C, SIGTERM and SIGHUP are noted, unless ignored (nohup); a second acts as usual."""
+    """Notes SIGINT, SIGTERM and SIGHUP in the main thread, unless ignored (nohup); a second one acts as usual."""
     came: list[int] = []
-    is_main = threading.current_thread() is threading.main_thread()
-    names = ("SIGINT", "SIGTERM", "SIGHUP") if is_main else ()  # Python lets no other thread handle them
+    names = ("SIGINT", "SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
     handlers = {n: signal.getsignal(n) for n in (getattr(signal, name, None) for name in names) if n is not None}
     before = {number: handler for number, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
 

@@ -1,7 +1,6 @@
 """The training loop: one training view per step, deterministic, resumable at every step.
 
-Random numbers come from three streams that never mix: the order of views, the children of splits, and the masks of
-DropGaussian. Two fits that differ in the drop rate alone therefore see the same views in the same order.
+The random streams of views, of splits and of masks never mix: fits of two drop rates see the same views in one order.
 """
 
 import copy
@@ -24,17 +23,17 @@ from kgs.losses import TargetMoments, opacity_l1, photometric_loss, target_momen
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .adam import adam, load_moments, moments_of
-from .checkpoint import PLAIN, check_state, fingerprint, newest_checkpoint, save_checkpoint
+from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
 from .config import FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
 from .machine import check_device
 from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
 
-# Measured, with some room: what libraries load when first used; per Gaussian the parameters, gradients, Adam's moments,
-# copies while densifying, and what backward passes keep.
+# Measured, with room: what libraries load at first use; parameters, gradients, moments and copies of each Gaussian.
 _BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
+_RATES = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacity"}
+_RATES |= {"sh_dc": "sh_dc", "sh_rest": "sh_rest"}
 
 
 class Trainer:
@@ -84,17 +83,16 @@ class Trainer:
         config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
         self.max_gaussians = config.max_gaussians or max(10 * config.steps, 2 * int(self.init["points"]))
         self.model = model.to(self.device)
-        self.optimizer = adam(self.model, recipe)
+        groups = [
+            {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
+            for name, rate in _RATES.items()  # the means first
+        ]
+        self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
         self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=seed + 1) if config.drop else None
         self.renderer = GaussianRenderer(self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes).train()
-        self.densifier = Densifier(
-            self.model,
-            self.optimizer,
-            self.extent,
-            max_gaussians=self.max_gaussians,
-            generator=torch.Generator().manual_seed(seed + 2),
-            **{name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")},
-        )
+        limits = {name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")}
+        limits |= {"max_gaussians": self.max_gaussians, "generator": torch.Generator().manual_seed(seed + 2)}
+        self.densifier = Densifier(self.model, self.optimizer, self.extent, **limits)
         self.order = torch.Generator().manual_seed(seed + 3)
 
     def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
@@ -235,9 +233,8 @@ class Trainer:
         config, recipe = self.config, self.config.recipe
         self.step += 1
         progress = self.step / config.steps
-        self.optimizer.param_groups[0]["lr"] = self.extent * math.exp(
-            (1 - progress) * math.log(recipe.lr_means) + progress * math.log(recipe.lr_means_final)
-        )
+        first, last = math.log(recipe.lr_means), math.log(recipe.lr_means_final)
+        self.optimizer.param_groups[0]["lr"] = self.extent * math.exp((1 - progress) * first + progress * last)
         degree = sum(self.step >= step for step in self.times.sh)
         self.model.sh_degree = max(self.model.sh_degree, degree)  # a fit that is trained on keeps what it has
         views = self._coarse_views if self.step <= self.times.coarse else self._views
