@@ -64,7 +64,8 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
 
 
 def _forest(frame: pd.DataFrame) -> pd.DataFrame:
-    groups = {"mean over scenes": main_cells(frame)[lambda main: main.groupby("method").scene.transform("nunique") > 1]}
+    main = main_cells(frame)
+    groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in each(frame, *KEYS[:3])}
     lines = [
         {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": gain.high - gain.mean}
