@@ -55,23 +55,20 @@ def knob_cells(quick: bool = False) -> list[Cell]:
     if "KGS_DATA" in os.environ:
         check_scenes(Path(os.environ["KGS_DATA"]), ["llff/fern"])
         scenes.append("fern")
-    settings: list[Cell] = [{}, {"fast": True}]
-    settings += [{knob: value} for knob, values in KNOBS.items() for value in values]
+    settings: list[Cell] = [{}, {"fast": True}, *({knob: value} for knob in KNOBS for value in KNOBS[knob])]
     return [{"scene": scene, "seed": seed, **setting} for seed in range(3) for setting in settings for scene in scenes]
 
 
 def fit_cell(cell: Cell) -> dict[str, Any]:
     """One fit of "scene" from SIFT points; "fast": with the settings of --fast; the rest are fields of FitConfig."""
     turned = {key: value for key, value in cell.items() if key not in ("scene", "fast")}
-    settings = FAST if cell.get("fast") else FitConfig()
-    config = FitConfig.from_dict(settings.to_dict() | {"init": "sift"} | turned)
+    config = FitConfig.from_dict((FAST if cell.get("fast") else FitConfig()).to_dict() | {"init": "sift"} | turned)
     if cell["scene"] == SYNTHETIC:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
     else:
         scene = load_scene(Path(os.environ["KGS_DATA"]) / "llff" / cell["scene"], train_views=3, downscale=2)
     _, metrics, result = fit_and_measure(scene, config, choose_points(scene, config))
-    test, train = metrics["test"], metrics["train"]
-    return result | {"psnr": test["psnr"], "ssim": test["ssim"], "train_psnr": train["psnr"]}
+    return result | {key: metrics["test"][key] for key in ("psnr", "ssim")} | {"train_psnr": metrics["train"]["psnr"]}
 
 
 def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
@@ -84,13 +81,9 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     table.columns = [f"{c[0]}_sd" if c[1] == "std" else c[0] for c in table.columns]
     table = table.assign(n=frame.groupby(keys, sort=False).size()).reset_index()
     table.to_csv(out / "training.csv", index=False)
+    digits = dict(zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True))
     lines = [
-        [
-            scene,
-            f"{knob} {value}".strip(),
-            len(cells),
-            *(mean_sd(cells[key], d) for key, d in zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True)),
-        ]
+        [scene, f"{knob} {value}".strip(), len(cells), *(mean_sd(cells[key], d) for key, d in digits.items())]
         for (scene, knob, value), cells in each(frame, *keys)
     ]
     lines.sort(key=lambda line: (line[0], line[1] != "default", str(line[1]).split()[0]))

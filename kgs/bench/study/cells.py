@@ -28,10 +28,10 @@ from kgs.fit.trainer import Trainer
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-SIZE = (72, 96)  # of the synthetic pictures
 FULL = "full-model"  # a start that no fit may have: the upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
 BINS = 6
+_lpips = lru_cache(maxsize=1)(Lpips.load)
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
@@ -64,24 +64,20 @@ def fit_and_measure(
     trainer = Trainer(scene, config, points)
     start = time.process_time()
     trainer.fit()
-    cpu_seconds = time.process_time() - start
+    stored: dict[str, Any] = {"cpu_seconds": round(time.process_time() - start, 2)}
     metrics = measure(trainer, lpips)
-    stored = {"curve": trainer.curve, "gaussians": len(trainer.model), "config": config.to_dict()}
-    stored |= {"wall_seconds": round(trainer.seconds, 2), "cpu_seconds": round(cpu_seconds, 2)}
-    stored |= {"peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
+    stored |= {"curve": trainer.curve, "gaussians": len(trainer.model), "config": config.to_dict()}
+    stored |= {"wall_seconds": round(trainer.seconds, 2), "peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
     stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
     return trainer, metrics, stored
 
 
 def revision(path: Path) -> str | None:
     """The commit that last changed a file or folder, as "1a2b3c4 of 2026-11-22"; None where git does not know it."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(path.parent), *arguments, "--", path.name]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
+    options = (("log", "-1", "--format=%h of %cs"), ("status", "--porcelain"))
+    calls = (["git", "-C", str(path.parent), *arguments, "--", path.name] for arguments in options)
     try:
-        commit, changes = git("log", "-1", "--format=%h of %cs"), git("status", "--porcelain")
+        commit, changes = (subprocess.run(c, capture_output=True, text=True, check=True).stdout.strip() for c in calls)
     except (OSError, subprocess.CalledProcessError):
         return None
     return commit + (" and later changes" if changes else "") if commit else None
@@ -93,15 +89,13 @@ def _start(
 ) -> tuple[Scene, FirstPoints, float]:
     """A scene, its first points, and the processor's seconds that they took."""
     if name == SYNTHETIC:
-        scene = synthetic_scene(train_views=views, size=SIZE)
+        scene = synthetic_scene(train_views=views, size=(72, 96))
     elif data is None:
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
-        kind = "model-points" if start == "model-points" else "none"
-        scene = load_scene(Path(data) / name, views, downscale, points=kind)
+        scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
     begin = time.process_time()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a start that fell back says so by its kind
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # a start that fell back says so by its kind
         points = _full_model(scene, seed) if start == FULL else choose_points(scene, _config(start, seed))
     return scene, points, time.process_time() - begin
 
@@ -116,9 +110,6 @@ def _full_model(scene: Scene, seed: int) -> FirstPoints:
     chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
     points = everything.points[chosen].double() + (everything.offset - scene.offset)
     return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
-
-
-_lpips = lru_cache(maxsize=1)(Lpips.load)
 
 
 @torch.no_grad()
@@ -158,8 +149,6 @@ def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, An
     edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
     bins = torch.bucketize(now, edges[1:-1])
     over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
-    return {
-        "distance": [round(float(edge / first.median()), 4) for edge in edges],
-        "gaussians": torch.bincount(bins, minlength=BINS).tolist(),
-        "over": torch.bincount(bins[over], minlength=BINS).tolist(),
-    }
+    distance = [round(float(edge / first.median()), 4) for edge in edges]
+    counts = [torch.bincount(chosen, minlength=BINS).tolist() for chosen in (bins, bins[over])]
+    return {"distance": distance, "gaussians": counts[0], "over": counts[1]}

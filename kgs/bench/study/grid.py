@@ -17,6 +17,7 @@ from distributed.core import rpc
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
+_key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
 PATIENCE = 10  # seconds for a scheduler to answer
 _LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
 
@@ -96,10 +97,9 @@ def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
 def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
     """A client of the scheduler at this address, or of one of our own; all that waits or runs there goes with it."""
     cores = os.cpu_count() or 1
-    count = processes or cores
-    local: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "processes": True}
+    local: dict[str, Any] = {"n_workers": processes or cores, "threads_per_worker": 1, "processes": True}
     local |= {"memory_limit": None}  # a cell may need any share of the memory; Dask would kill its process
-    local |= {"env": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // count))}}
+    local |= {"env": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS") or str(cores // (processes or cores) or 1)}}
     local |= {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
     before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
     try:
@@ -149,10 +149,6 @@ def _outcomes(client: Any, work: Work, cells: Sequence[Cell]) -> Iterator[tuple[
             else:
                 again.append(cell)
                 waiting.append(cell)
-
-
-def _key(cell: Cell) -> str:
-    return json.dumps(cell, sort_keys=True)
 
 
 @contextmanager

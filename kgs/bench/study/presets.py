@@ -12,12 +12,11 @@ from .cells import FULL
 from .grid import Cell
 
 OFF, PAPER, FIXED = MAIN = ("off", "progressive 0.2", "fixed 0.1")
-_CONSTANT = {"drop_schedule": "constant"}
 # The settings of each method's fit that are not the default's. Tables and plots keep this order.
 METHODS: dict[str, dict[str, Any]] = {
-    **{OFF: {"drop": 0.0}, PAPER: {"drop": 0.2}, FIXED: {"drop": 0.1} | _CONSTANT},
+    **{OFF: {"drop": 0.0}, PAPER: {"drop": 0.2}, FIXED: {"drop": 0.1, "drop_schedule": "constant"}},
     **{f"progressive {rate}": {"drop": rate} for rate in (0.1, 0.3)},
-    **{f"fixed {rate}": {"drop": rate} | _CONSTANT for rate in (0.05, 0.15, 0.2, 0.3)},
+    **{f"fixed {rate}": {"drop": rate, "drop_schedule": "constant"} for rate in (0.05, 0.15, 0.2, 0.3)},
     **{by: {"drop": 0.2, "drop_by": by.replace(" ", "-")} for by in ("high gradient", "low gradient", "near", "far")},
 }
 for _by, _weight in product(("gradient", "distance"), (0.001, 0.01)):
@@ -28,13 +27,11 @@ FAMILIES = {
     "An L1 penalty on opacities instead of dropping": [name for name in METHODS if name.startswith("L1")],
 }
 EQUAL_MEAN_RATE = {"progressive 0.1": "fixed 0.05", "progressive 0.2": "fixed 0.1", "progressive 0.3": "fixed 0.15"}
-# The scenes of the preset "cpu" and how many views each is given.
+# The scenes of the preset "cpu" and how many views each is given; for "paper" the numbers by the scene's folder.
 SCENES = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3, "blender/lego": 8, "nerfstudio/fox": 12}
-# Numbers of views for the preset "paper", by the folder that a scene lies in.
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
 _FITS = {"quick": {"steps": 200, "max_gaussians": 12_000}, "cpu": {"steps": 2000}, "paper": {"steps": 10_000}}
-# Cells by their product: seeds, scenes with their numbers of views, starts, methods.
-Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]
+Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]  # seeds, scenes, starts, methods
 
 
 def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
@@ -66,10 +63,8 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
 def _cpu(data: Path) -> list[Block]:
     check_scenes(data, SCENES)
     fern, flower, bounds = "llff/fern", "llff/flower", ("random", "model-points", FULL)  # no fit may have the last two
-    blocks: list[Block] = []
-    for seed in range(3):
-        blocks += [([seed], [scene], _starts(scene[0]), MAIN) for scene in SCENES.items()]
-        blocks += [([seed], SCENES.items(), ["sift"], [PAPER])]
+    main = [*(([scene], _starts(scene[0]), MAIN) for scene in SCENES.items()), (SCENES.items(), ["sift"], [PAPER])]
+    blocks: list[Block] = [([seed], *block) for seed in range(3) for block in main]
     blocks += [([0], [*product((fern, flower), (6, 9))], ["dense"], (OFF, PAPER))]
     blocks += [(range(3), [(fern, 3)], ["dense"], [name for name in METHODS if name not in MAIN])]
     blocks += [(range(3), [(fern, 3)], [start], [PAPER]) for start in bounds]

@@ -1,7 +1,6 @@
 """What the paper prints for our methods (published.csv): means over 8 scenes (Mip-NeRF 360: 7), the best of five runs.
 
-Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR
-2025. Our variants of each selection and penalty stand beside the same printed line.
+H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025.
 """
 
 from pathlib import Path
@@ -25,17 +24,15 @@ def benchmark_of(scene: str, views: int) -> str | None:
 
 def published(benchmark: str | None, views: int, method: str) -> str:
     """All different "PSNR / SSIM / LPIPS" that the paper prints for a method, with "or" between them; "-" for none."""
-    lines = _lines(benchmark, views, method)[["psnr", "ssim", "lpips"]].drop_duplicates()
-    return " or ".join("{:.2f} / {:.3f} / {:.3f}".format(*line) for line in lines.to_numpy()) or "-"
+    lines = PUBLISHED.query("benchmark == @benchmark and views == @views and method == @method")
+    figures = lines[["psnr", "ssim", "lpips"]].drop_duplicates().to_numpy()
+    return " or ".join("{:.2f} / {:.3f} / {:.3f}".format(*line) for line in figures) or "-"
 
 
 def published_difference(benchmark: str | None, views: int, method: str, base: str) -> str:
     """As `published`: PSNR of a method less that of another, in dB, of the same table if it has both."""
-    lines, bases = (_lines(benchmark, views, name).set_index("table").psnr for name in (method, base))
+    table = PUBLISHED.query("benchmark == @benchmark and views == @views").set_index("table")
+    lines, bases = (table.psnr[table.method == name] for name in (method, base))
     if bases.empty or method == base:
         return "-"
     return " or ".join(dict.fromkeys(f"{psnr - bases.get(t, bases.iloc[0]):+.2f}" for t, psnr in lines.items())) or "-"
-
-
-def _lines(benchmark: str | None, views: int, method: str) -> pd.DataFrame:
-    return PUBLISHED.query("benchmark == @benchmark and views == @views and method == @method")

@@ -36,7 +36,14 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     lines = lines[[*KEYS, "seed", *COLUMNS, "init.kind", "fit"]]
     lines.rename(columns=lambda name: name.replace(".", "_")).to_csv(out / "sparse.csv", index=False)
     tables, plots, results = sparse_tables(frame), write_plots(frame, out), findings(frame)
-    origin = [f"Command: {command}.", *_origin([row["result"] for row in rows], out / "sparse.jsonl", planned)]
+    done = [row["result"] for row in rows]
+    dates, code = (sorted({result[key] for result in done if result.get(key)}) for key in ("date", "revision"))
+    versions = {", ".join(f"{k} {v}" for k, v in sorted(result.get("versions", {}).items())): None for result in done}
+    made = [f"{len(done)} of {planned} cells"]
+    made += [f"sparse.jsonl at commit {commit}"] if (commit := revision(out / "sparse.jsonl")) else []
+    made += [f"cells that say when they ran: {dates[0]} to {dates[-1]}"] if dates else []
+    made += [f"cells that say of which code: {', '.join(code)}"] if code else []
+    origin = [f"Command: {command}.", f"Figures: {'; '.join(made)}.", f"Versions: {'; '.join(versions)}."]
     page = Environment(loader=PackageLoader("kgs.bench.study", ""), autoescape=True, trim_blocks=True)
     page.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
     notes = page.get_template("notes.txt").render().splitlines()
@@ -50,14 +57,3 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     (out / "sparse.md").write_text(text, encoding="utf-8")
     (out / "index.html").write_text(html, encoding="utf-8")
     return text
-
-
-def _origin(results: Sequence[Mapping[str, Any]], path: Path, planned: int) -> list[str]:
-    """Where the figures are from: how many cells, their commit and dates, and the versions that they ran with."""
-    dates, code = (sorted({r[key] for r in results if r.get(key)}) for key in ("date", "revision"))
-    versions = {", ".join(f"{k} {v}" for k, v in sorted(r.get("versions", {}).items())): None for r in results}
-    made = [f"{len(results)} of {planned} cells"]
-    made += [f"{path.name} at commit {commit}"] if (commit := revision(path)) else []
-    made += [f"cells that say when they ran: {dates[0]} to {dates[-1]}"] if dates else []
-    made += [f"cells that say of which code: {', '.join(code)}"] if code else []
-    return [f"Figures: {'; '.join(made)}.", f"Versions: {'; '.join(versions)}."]
