@@ -1,7 +1,5 @@
 """What an image's bytes say before they are decoded: its size, whether it is whole, how its pixels are stored.
 
-Decoding takes up to 24 bytes per pixel (16 bit RGBA, also as float32): out of all proportion to a file it is refused.
-
 Sources: PNG (ISO 15948, 11.2.1), JPEG (ITU T.81, B.2), WebP (RFC 9649), BMP (Windows' BITMAPCOREHEADER and
 BITMAPINFOHEADER), TIFF 6.0 (sections 2, 8 and 18).
 """
@@ -16,6 +14,7 @@ from kgs.errors import DataError
 
 Buffer = bytes | mmap.mmap
 _WIDTH, _HEIGHT, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPLES = 256, 257, 274, 277, 322, 323, 338
+_MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd7\xff])")  # JPEG's; those without length are passed over
 
 
 def image_size(path: Path, data: Buffer) -> tuple[int, int]:
@@ -91,9 +90,6 @@ def _jpeg(data: Buffer) -> tuple[int, ...]:
         if marker in (0xD9, 0xDA):
             break
     raise ValueError
-
-
-_MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd7\xff])")  # those without length are passed over
 
 
 def _markers(data: Buffer) -> Iterator[tuple[int, int]]:

@@ -15,7 +15,6 @@ from kgs.errors import DataError
 from .image_size import image_size, plain_jpeg, plain_tiff
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-
 Image = NDArray[np.float32]
 Maps = tuple[Image, Image]
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}

@@ -94,9 +94,8 @@ def load_scene(
         is_finer = photos and downscale is not None and fine_downscale < downscale
         views = partial(_views, offset=offset, background=color, photos=photos)
         finer = views(train, _common_size(train, fine_downscale)) if is_finer else None
-        both = views(train, size), views(test, size)
-        moved, colors = (cloud.points - offset).float(), cloud.colors.float()
-        return Scene(*both, moved, colors, cloud.kind, offset, color, root, finer, found.notes)
+        first = (cloud.points - offset).float(), cloud.colors.float(), cloud.kind
+        return Scene(views(train, size), views(test, size), *first, offset, color, root, finer, found.notes)
 
 
 def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:
@@ -165,6 +164,5 @@ def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, backg
     masks = torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None
     poses = torch.stack([frame.pose for frame in frames])
     u, _, vh = torch.linalg.svd(poses[:, :3, :3])  # u @ vh is a rotation exactly
-    world_to_camera = kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])
-    cameras = pinholes(intrinsics, kg.Rt_to_matrix4x4(*world_to_camera).float(), size)
-    return Views(cameras, images, tuple(frame.name for frame in frames), masks)
+    extrinsics = kg.Rt_to_matrix4x4(*kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])).float()
+    return Views(pinholes(intrinsics, extrinsics, size), images, tuple(frame.name for frame in frames), masks)

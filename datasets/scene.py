@@ -72,8 +72,7 @@ class Views:
             image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.cameras` and `kgs.rasterization`
             take them with `pixel_centers="integer"`, index, name, and mask `(1, H, W)` where there are masks.
         """
-        given = operator.index(index)
-        if not -len(self) <= given < len(self):
+        if not -len(self) <= (given := operator.index(index)) < len(self):
             raise IndexError(f"index: expected a whole number below {len(self)}, the number of views, got {given}")
         i = given % len(self)
         matrices = {"extrinsics": self.cameras.extrinsics[i], "intrinsics": self.cameras.intrinsics[i, :3, :3]}

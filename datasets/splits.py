@@ -15,9 +15,8 @@ def split_by_name(names: Sequence[str], train_views: int | None = None) -> tuple
     Positions in `names` of the training and of the test views come back, both in the order of the sorted names.
     """
     order = sorted(range(len(names)), key=lambda i: names[i])
-    test = order[::TEST_EVERY]
     pool = [index for position, index in enumerate(order) if position % TEST_EVERY]
-    return [pool[i] for i in select_evenly(len(pool), train_views)], test
+    return [pool[i] for i in select_evenly(len(pool), train_views)], order[::TEST_EVERY]
 
 
 def select_evenly(count: int, train_views: int | None = None) -> list[int]:
@@ -29,7 +28,6 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
     if train_views is None:
         return list(range(count))
     if isinstance(train_views, bool) or not isinstance(train_views, int | np.integer) or not 1 <= train_views <= count:
-        raise ValueError(
-            f"train_views (--views): expected None or a whole number from 1 to {count}, got {train_views!r}"
-        )
+        wanted = f"None or a whole number from 1 to {count}"
+        raise ValueError(f"train_views (--views): expected {wanted}, got {train_views!r}")
     return [int(i) for i in np.round(np.linspace(0, count - 1, train_views))]

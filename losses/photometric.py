@@ -166,20 +166,17 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        if torch.is_grad_enabled():
-            # once_differentiable would stay silent: the incoming gradient of a loss is a constant
+        if torch.is_grad_enabled():  # once_differentiable is silent where the incoming gradient is a constant
             raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
         padded, target, by_mean, by_square, by_product = ctx.saved_tensors
-        by_pixel = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
-        by_pixel.addcmul_(target, _blur_adjoint(by_product))
-        return _fold(by_pixel).mul_(grad / ctx.count), None, None, None, None
+        pixels = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
+        return _fold(pixels.addcmul_(target, _blur_adjoint(by_product))).mul_(grad / ctx.count), None, None, None, None
 
 
 register("loss", "torch", _MeanSsim.apply)
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
-    """The mean over what is not outside."""
     if outside is None:
         return values.mean()
     outside = outside.expand_as(values)

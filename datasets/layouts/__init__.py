@@ -56,8 +56,8 @@ def _about_folder(root: Path) -> str:
     if count := len(list_images(photos)):
         return f"has {count} photos but no camera poses: {_NO_POSES}"
     endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
-    unreadable = "photos that cannot be read: convert them to JPEG or PNG"
-    for suffixes, advice in ((_UNREADABLE, unreadable), (_VIDEOS, f"videos: {_NO_PHOTOS}")):
+    advices = {_UNREADABLE: "photos that cannot be read: convert them to JPEG or PNG", _VIDEOS: f"videos: {_NO_PHOTOS}"}
+    for suffixes, advice in advices.items():
         if found := [ending[1:].upper() for ending in endings if ending in suffixes]:
             return f"is no scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
     return (

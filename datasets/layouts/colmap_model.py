@@ -19,10 +19,8 @@ from kgs.errors import DataError
 T = TypeVar("T")
 _LONGEST_NAME = 4096
 # In the order of COLMAP's model ids: how many parameters each has, 0 for those that are not read.
-_MODELS = dict(
-    SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12, FOV=0
-)
-_MODELS |= dict(SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5, THIN_PRISM_FISHEYE=0, RAD_TAN_THIN_PRISM_FISHEYE=0)
+_MODELS = dict(SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12)
+_MODELS |= dict(FOV=0, SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5, THIN_PRISM_FISHEYE=0, RAD_TAN_THIN_PRISM_FISHEYE=0)
 
 
 class ColmapCamera(NamedTuple):
@@ -68,12 +66,11 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             params = data.take(f"<{_parameter_count(path, camera_id, model)}d", f"camera {camera_id}")
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
     else:
-        kinds = (int, str, int, int, partial(_numbers, float))
         for line in filter(None, _lines(path)):
-            camera_id, model, width, height, params = _fields(path, line, kinds)
+            camera_id, model, *size, params = _fields(path, line, (int, str, int, int, partial(_numbers, float)))
             if len(params) != _parameter_count(path, camera_id, model):
                 raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
-            _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
+            _add(path, "camera", cameras, camera_id, ColmapCamera(model, *size, params))
     return cameras
 
 
@@ -85,8 +82,7 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
         for _ in data.items("number of images", 73):
             image_id, *pose, camera_id = data.take("<I7dI", "image")
             name = data.string(f"image {image_id}")
-            count = data.count(f"observations of {name}", 24)
-            data.take(f"{24 * count}x", "observations")  # passed over
+            data.take(f"{24 * data.count(f'observations of {name}', 24)}x", "observations")  # passed over
             _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
     else:
         may_be_observations = False
@@ -131,7 +127,6 @@ class _Binary:
         self._path, self._data, self._at = path, read_bytes(path), 0
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
-        """The next values, of a format of `struct`."""
         at, size = self._at, struct.calcsize(form)
         self._need(size, what)
         self._at += size
@@ -150,9 +145,7 @@ class _Binary:
             raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
 
     def string(self, what: str) -> str:
-        """The next text, up to its zero byte."""
-        end = self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)
-        if end < 0:
+        if (end := self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)) < 0:
             raise DataError(self._path, what, "expected a name that ends with a zero byte")
         text, self._at = self._data[self._at : end], end + 1
         try:
@@ -161,8 +154,7 @@ class _Binary:
             raise DataError(self._path, what, f"expected a name in UTF-8, got {text!r}") from error
 
     def _need(self, size: int, what: str) -> None:
-        left = len(self._data) - self._at
-        if size > left:
+        if size > (left := len(self._data) - self._at):
             raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
 
 

@@ -46,10 +46,9 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
         got = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else type(rows).__name__
         raise DataError(path, "", f"expected floating point numbers of shape (N, 17), got {got}")
     rows = np.array(rows, dtype=np.float64)
-    for name, wrong in (
-        ("finite numbers", ~np.isfinite(rows[:, :15]).all(axis=1)),
-        ("a height and width of whole pixels", (rows[:, [4, 9]] < 1).any(axis=1) | (rows[:, [4, 9]] % 1).any(axis=1)),
-    ):
+    infinite = ~np.isfinite(rows[:, :15]).all(axis=1)
+    no_size = (rows[:, [4, 9]] < 1).any(axis=1) | (rows[:, [4, 9]] % 1).any(axis=1)
+    for name, wrong in (("finite numbers", infinite), ("a height and width of whole pixels", no_size)):
         if wrong.any():
             raise DataError(path, f"row {int(wrong.argmax())}", f"expected {name}")
     return rows

@@ -1,7 +1,5 @@
 """Scenes with one `transforms.json`, as nerfstudio and instant-ngp write them, and the reader of such files.
 
-What a file says of a lens or a pose is used or refused; other keys that are not known are named in a note.
-
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
 """
 

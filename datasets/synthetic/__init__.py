@@ -2,9 +2,7 @@
 
 Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing
 of kgs takes part in making the images. Four rays per pixel are averaged.
-
-The world's axes are OpenCV's: x right, y down, z away from the forward-facing cameras. The floor is at y = 1.2 and
-the objects stand around (0, 0.5, 4.4). The world depends on `kind` and `seed` only, never on the cameras.
+The world, with the axes and the places of `make_world`, depends on `kind` and `seed` only, never on the cameras.
 """
 
 from pathlib import Path
@@ -50,9 +48,8 @@ def synthetic_scene(
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}")
     world = make_world(kind, seed)
-    rng = np.random.default_rng([seed, 1])
     place = _patch_eyes if kind == "forward" else _orbit_eyes
-    train_eyes, test_eyes = place(train_views, test_views, rng)
+    train_eyes, test_eyes = place(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
         train, test = (_views(world, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
         none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
@@ -102,8 +99,7 @@ def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> View
 
 def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
-    s = SUPERSAMPLING
-    fine = intrinsics[:3, :3].copy()
+    s, fine = SUPERSAMPLING, intrinsics[:3, :3].copy()
     fine[:2] *= s
     fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
     depths, faces = raycast(world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
@@ -118,10 +114,9 @@ def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int,
 def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Training cameras in a zigzag from left to right, test cameras spread over a patch 1.15 times as large."""
     x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
-    y = np.where(np.arange(train) % 2, 0.5, -0.5)
     # M. Roberts' R2 sequence: evenly spread, however many there are
     spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
-    flat = np.concatenate([np.stack([x, y], axis=-1), 1.15 * (2.0 * spread - 1.0)])
+    flat = np.concatenate([np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], -1), 1.15 * (2.0 * spread - 1.0)])
     eyes = PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
     return eyes[:train], eyes[train:]
 
@@ -130,9 +125,8 @@ def _orbit_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array,
     """Training cameras all around at equal angles, test cameras in the middle half of the gaps between them."""
     gaps = np.arange(test) * train // max(test, 1) + rng.uniform(0.25, 0.75, size=test)
     angles = 2 * np.pi / train * np.concatenate([np.arange(train), gaps])
-    radius, height = ORBIT
-    heights = height + rng.uniform(-0.5, 0.5, size=train + test)
-    eyes = CENTER + np.stack([radius * np.sin(angles), -heights, -radius * np.cos(angles)], axis=-1)
+    heights = ORBIT[1] + rng.uniform(-0.5, 0.5, size=train + test)
+    eyes = CENTER + np.stack([ORBIT[0] * np.sin(angles), -heights, -ORBIT[0] * np.cos(angles)], axis=-1)
     return eyes[:train], eyes[train:]
 
 

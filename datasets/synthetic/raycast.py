@@ -27,20 +27,17 @@ def raycast(triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
         raise ValueError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")
     (height, width), intrinsics = size, intrinsics[:3, :3]
-    corners = triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-    a, b, c = corners
+    a, b, c = corners = triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
     normals = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
     det = np.einsum("fi,fi->f", a, normals[0])
     # (3, 3, F): w_i = edges[i] . (u, v, 1), not yet divided by |det|
     edges = np.ascontiguousarray((normals @ np.linalg.inv(intrinsics)).transpose(0, 2, 1)) * np.sign(det)
-
     face, u, v = _candidates(corners @ intrinsics.T, det != 0.0, size)
     w0, w1, w2 = (x[face] * u + y[face] * v + z[face] for x, y, z in edges)
     total = w0 + w1 + w2
     hit = np.flatnonzero((w0 >= 0) & (w1 >= 0) & (w2 >= 0) & (total > 0))
     face, pixel = face[hit], v[hit] * width + u[hit]
     distance = np.abs(det[face]) / total[hit]
-
     depths = np.full(height * width, np.inf)
     np.minimum.at(depths, pixel, distance)
     nearest = distance == depths[pixel]

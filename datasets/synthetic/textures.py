@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 Texture = Callable[[Array], Array]
-
 NUM_WAVES = 40
 BRICK_TABLE = 64  # the shades of bricks repeat after so many
 
@@ -59,13 +58,11 @@ def _bricks(
 ) -> Texture:
     """Boxes of the given sides, each of its own shade, odd rows shifted by half a side, with joints between them."""
     shades = rng.normal(size=(BRICK_TABLE,) * 3).astype(np.float32)
-    ramp, filling = _ramp(rng, hue), _ramp(rng)
-    lengths = np.array(sides, dtype=np.float32)
+    ramp, filling, lengths = _ramp(rng, hue), _ramp(rng), np.array(sides, dtype=np.float32)
 
     def texture(points: Array) -> Array:
         cells = points / lengths + np.float32(0.5)
-        rows = np.floor(cells[:, 1] if np.isinf(sides[2]) else cells[:, 2])
-        cells[:, 0] += 0.5 * (rows % 2)
+        cells[:, 0] += 0.5 * (np.floor(cells[:, 1] if np.isinf(sides[2]) else cells[:, 2]) % 2)
         i, j, k = (np.floor(cells).astype(np.int64) % BRICK_TABLE).T
         inside = (0.5 - np.abs(cells % 1.0 - 0.5)) * np.where(np.isinf(lengths), 1.0, lengths)
         mask = _step((inside.min(axis=1) - joint) / np.float32(0.5 * joint))
@@ -77,8 +74,7 @@ def _bricks(
 
 def _ramp(rng: np.random.Generator, hue: float | None = None) -> Texture:
     """Colours from dark (below -1) to light (above 1) of about one hue: a Bezier curve through three of them."""
-    hue = rng.uniform() if hue is None else hue
-    hues = (hue + rng.uniform(-0.08, 0.08, size=3)) % 1.0
+    hues = ((rng.uniform() if hue is None else hue) + rng.uniform(-0.08, 0.08, size=3)) % 1.0
     saturations = rng.uniform([0.2, 0.2, 0.05], [0.7, 0.6, 0.3])
     values = rng.uniform([0.12, 0.5, 0.85], [0.3, 0.7, 1.0])
     colors = (hsv_to_rgb(*hsv) for hsv in zip(hues, saturations, values, strict=True))
@@ -92,7 +88,6 @@ def _ramp(rng: np.random.Generator, hue: float | None = None) -> Texture:
 
 
 def _step(value: Array) -> Array:
-    """From 0 to 1, smoothly."""
     return 0.5 + 0.5 * np.tanh(value)
 
 

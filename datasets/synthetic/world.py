@@ -1,7 +1,4 @@
-"""The world of the synthetic scene: trimesh's meshes, where they stand, and the colour of every point of them.
-
-Surfaces are matt: a point has one colour from wherever it is seen.
-"""
+"""The world of the synthetic scene: trimesh's meshes, where they stand, and the colour of every point of them."""
 
 from typing import NamedTuple
 
@@ -58,8 +55,7 @@ def shade(world: World, points: Array, faces: Index) -> Array:
     owners, normals = world.owners[faces], world.normals[faces]
     albedo = np.empty((len(points), 3))
     for owner in np.unique(owners):
-        rows = np.flatnonzero(owners == owner)
-        frame = world.frames[owner]
+        rows, frame = np.flatnonzero(owners == owner), world.frames[owner]
         albedo[rows] = world.textures[owner](((points[rows] - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32))
     light = 0.65 - 0.1 * normals[:, 1] + 0.45 * (normals @ LIGHT).clip(0.0)
     light *= _openness(world.balls, points, normals, owners)
@@ -93,8 +89,7 @@ def _objects(rng: np.random.Generator) -> list[_Part]:
         frame = euler_matrix(about_x, about_y, 0.0)
         frame[:3, 3] = x + shift[0], FLOOR - height, z + shift[1]
         parts.append((mesh.apply_transform(frame), frame, random_texture(texture, rng)))
-    pot = parts[-1][1][:3, 3]
-    return parts + _leaves(pot - [0.0, 0.2, 0.0], rng)
+    return parts + _leaves(parts[-1][1][:3, 3] - [0.0, 0.2, 0.0], rng)  # the last thing is their pot
 
 
 def _leaves(root: Array, rng: np.random.Generator) -> list[_Part]:
