@@ -180,6 +180,12 @@ def test_no_file_is_longer_than_300_lines():
     assert not long
 
 
+def test_the_source_stays_small():
+    sizes = {name: lines(path) for name, path in SOURCES.items()}
+    assert sum(sizes.values()) <= 10_500
+    assert sum(size for name, size in sizes.items() if within(name, "kgs.bench")) <= 2_000
+
+
 # -- words ---------------------------------------------------------------------------------------------------------
 
 

@@ -1,8 +1,7 @@
-"""Stiff and extreme cases on this machine: errors of images and gradients, and their bounds.
+"""Stiff and extreme cases on this machine: scenes rounded to the dtype under test, their errors and their bounds.
 
-A case is a scene in float64, rounded once to the dtype under test; the dense reference gets the same numbers, in
-float64. extremes.csv has its bounds: absolute for the image, relative to the largest value for gradients; five times
-what the formula reaches in an error analysis. In float64 those of needles are the reference's own error.
+extremes.csv has the bounds: absolute for the image, relative to the largest value for gradients; five times what the
+formula reaches in an error analysis. In float64 those of needles are the reference's own error.
 """
 
 import csv

@@ -25,10 +25,8 @@ def markdown_table(title: str, columns: Iterable[object], rows: Iterable[Iterabl
 def mean_sd(values: Iterable[float], decimals: int) -> str:
     """As "24.31 (0.12)", mean and sample standard deviation; "24.31" of one number, "-" of none. NaN does not count."""
     numbers = [value for value in values if not math.isnan(value)]
-    if not numbers:
-        return "-"
     spread = f" ({statistics.stdev(numbers):.{decimals}f})" if len(numbers) > 1 else ""
-    return f"{statistics.fmean(numbers):.{decimals}f}{spread}"
+    return f"{statistics.fmean(numbers):.{decimals}f}{spread}" if numbers else "-"
 
 
 def write_results(path: Path, rows: list[Row], tables: str, **more: Any) -> None:
@@ -37,8 +35,8 @@ def write_results(path: Path, rows: list[Row], tables: str, **more: Any) -> None
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    machine = {"threads": torch.get_num_threads(), "versions": versions()}
-    write_json(path.with_suffix(".json"), {"rows": rows, **more, **machine})
+    more |= {"threads": torch.get_num_threads(), "versions": versions()}
+    write_json(path.with_suffix(".json"), {"rows": rows, **more})
     path.with_suffix(".md").write_text(tables, encoding="utf-8")
     print(tables)
 
