@@ -67,10 +67,11 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
     else:
         for line in filter(None, _lines(path)):
-            camera_id, model, *size, params = _fields(path, line, (int, str, int, int, partial(_numbers, float)))
+            kinds = (int, str, int, int, partial(_numbers, float))
+            camera_id, model, width, height, params = _fields(path, line, kinds)
             if len(params) != _parameter_count(path, camera_id, model):
                 raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
-            _add(path, "camera", cameras, camera_id, ColmapCamera(model, *size, params))
+            _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
     return cameras
 
 
