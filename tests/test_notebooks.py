@@ -88,7 +88,7 @@ CLAIMS = {
             (start, drop): len(SEEDS) for start in ("sift", "dense") for drop in (0.0, 0.2)
         }
         assert len(starts["dense"].points) == POINTS and starts["dense"].kind == "dense"
-        assert all(low < mean < high for _, mean, low, high in intervals)
+        assert all(low < mean < high for _, mean, low, high, *_ in intervals)
         assert "llff/fern, 3 views" in differences("off")
         """,
         """
