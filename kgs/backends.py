@@ -3,6 +3,9 @@
 Each stage has one contract. Torch covers every call and defines what is right; another implementation may cover fewer,
 gives the same within the rounding of its dtype and differentiates the same. Arguments are checked before.
 
+    "torch"   every call
+    "numba"   float32 on a CPU (`kgs.compiled`, extra "fast"); what a stage leaves to torch, its `covers` says
+
     "projection"   (gaussians, cameras, image size, RasterOptions, with colours) -> ProjectedGaussians
     "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
     "loss"         (image (1, K, H, W), its TargetMoments one by one, windows left out or None) -> mean SSIM, 0-d
@@ -10,23 +13,31 @@ gives the same within the rounding of its dtype and differentiates the same. Arg
 The lists of tiles are no stage: each "compositing" makes its own, laid out for its kernels.
 """
 
+import functools
+import importlib.util
+import pkgutil
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["available", "check_backend", "choose", "register"]
+import torch
+from torch import Tensor
+
+__all__ = ["available", "check_backend", "choose", "compiled_covers", "register"]
 
 STAGES = ("projection", "compositing", "loss")
-Pair = tuple[Callable[..., Any], Callable[..., bool]]  # run, covers
+Pair = tuple[Callable[..., Any] | str, Callable[..., bool]]  # run, covers
 _registry: dict[str, dict[str, Pair]] = {stage: {} for stage in STAGES}
 
 
-def register(stage: str, backend: str, run: Callable[..., Any], covers: Callable[..., bool] = lambda *_: True) -> None:
+def register(
+    stage: str, backend: str, run: Callable[..., Any] | str, covers: Callable[..., bool] = lambda *_: True
+) -> None:
     """Add an implementation of a stage.
 
     Args:
         stage: one of `STAGES`.
         backend: its name; what is registered later comes first for "auto".
-        run: with the contract of the stage.
+        run: with the contract of the stage, or where it is found, "package.module:function", loaded at first use.
         covers: with the arguments of `run`, whether it can do this call; cheap, reads no values of tensors.
 
     Raises:
@@ -43,9 +54,22 @@ def available() -> tuple[str, ...]:
 
 
 def check_backend(backend: str) -> None:
-    """Raise a ValueError that names what there is, for a backend that there is not."""
+    """Raise a ValueError for a backend that there is not, a ModuleNotFoundError for numba where it is not installed."""
     if backend not in available():
         raise ValueError(f"backend: expected one of {available()}, got {backend!r}")
+    if backend == "numba" and not _has_numba():
+        raise ModuleNotFoundError('backend: "numba" needs numba, run pip install "kgs-splat[fast]"', name="numba")
+
+
+def compiled_covers(like: Tensor) -> bool:
+    """Whether the kernels can be used for such a tensor: numba is installed, float32, on a CPU, no graph is traced."""
+    fits = like.dtype == torch.float32 and like.device.type == "cpu" and not torch.compiler.is_compiling()
+    return fits and _has_numba()
+
+
+@functools.cache
+def _has_numba() -> bool:
+    return importlib.util.find_spec("numba") is not None
 
 
 def choose(stage: str, backend: str, *arguments: Any) -> Callable[..., Any]:
@@ -55,11 +79,13 @@ def choose(stage: str, backend: str, *arguments: Any) -> Callable[..., Any]:
 
     Raises:
         ValueError: there is no such backend, or it is named and does not cover the call.
+        ModuleNotFoundError: numba is named and not installed.
     """
     check_backend(backend)
     there = _registry[stage]
     names = list(there) if backend == "auto" else [backend if backend in there else "torch"]
     for run, covers in (there[name] for name in names):
         if covers(*arguments):
-            return run
+            found: Callable[..., Any] = pkgutil.resolve_name(run) if isinstance(run, str) else run
+            return found
     raise ValueError(f'backend: {backend!r} does not cover this call of {stage}, expected "auto" or "torch"')

@@ -30,7 +30,14 @@ _BENCHES = {
     "study": "DropGaussian on and off, its schedules and rivals, over scenes and seeds",
     "training": "test PSNR against time, one setting of a fit at a time",
 }
-_EXTRAS = {"viser": "view", "pycolmap": "sfm", "distributed": "study", "pandas": "study", "scipy": "study"}
+_EXTRAS = {
+    "numba": "fast",
+    "viser": "view",
+    "pycolmap": "sfm",
+    "distributed": "study",
+    "pandas": "study",
+    "scipy": "study",
+}
 _USERS = {errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EROFS}
 
 

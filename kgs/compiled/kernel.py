@@ -1,0 +1,55 @@
+"""What all kernels share: how they are compiled, constants, scratch memory, 2^x."""
+
+import sys
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numba.core import event
+
+f32 = np.float32
+ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
+
+_FAST = {"reassoc", "contract", "nsz", "arcp"}  # without nnan and ninf: `isfinite` works
+jit: Any = nb.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+inline: Any = nb.njit(inline="always", fastmath=_FAST, error_model="numpy")
+
+# exp2 on [-1/2, 1/2] as in Cephes' exp2f: relative error 1.2e-7 with its roundings
+_E1, _E2, _E3 = f32(6.931472028550421e-1), f32(2.402264791363012e-1), f32(5.550332471162809e-2)
+_E4, _E5, _E6 = f32(9.618437357674640e-3), f32(1.339887440266574e-3), f32(1.535336188319500e-4)
+
+
+@inline
+def exp2(x):
+    """2^x for -126 <= x <= 126: a polynomial times a number made of its exponent bits."""
+    n = np.floor(x + HALF)
+    f = x - n
+    y = (((((_E6 * f + _E5) * f + _E4) * f + _E3) * f + _E2) * f + _E1) * f + ONE
+    return y * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@inline
+def scratch(size):
+    """Float32 memory that begins at a cache line: numba's own arrays begin at 32 bytes, and AVX-512 wants 64."""
+    memory = np.empty(size + 16, np.float32)
+    skip = (64 - memory.ctypes.data % 64) % 64 // 4
+    return memory[skip : skip + size]
+
+
+class _Notice(event.Listener):
+    """Says on a terminal that the first use takes longer; later ones load what was compiled."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        """A function is being compiled: of kgs or of anybody."""
+        ours = event.data["dispatcher"].py_func.__module__.startswith(__package__ + ".")
+        if ours and not self.said and sys.stderr.isatty():
+            print("kgs: compiling, once, about 20 s", file=sys.stderr, flush=True)
+            self.said = True
+
+    def on_end(self, event: Any) -> None:
+        """Nothing to say."""
+
+
+event.register("numba:compile", _Notice())
