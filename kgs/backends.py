@@ -8,7 +8,7 @@ gives the same within the rounding of its dtype and differentiates the same. Arg
 
     "projection"   (gaussians, cameras, image size, RasterOptions, with colours) -> ProjectedGaussians
     "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
-    "loss"         (image (1, K, H, W), its TargetMoments one by one, windows left out or None) -> mean SSIM, 0-d
+    "loss"         (image (B, C, H, W), target, TargetMoments or None, weight, pixels left out or None, fast) -> loss
 
 The lists of tiles are no stage: each "compositing" makes its own, laid out for its kernels.
 """

@@ -11,6 +11,7 @@ with m and s the mean, variance and covariance under the window around a pixel. 
 except that Kornia clamps (1 - SSIM) / 2 to [0, 1], which acts only where rounding leaves that range.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,7 @@ from kornia.filters import get_gaussian_kernel1d
 from kornia.losses import ssim_loss
 from torch import Tensor
 
-from kgs.backends import choose, register
+from kgs.backends import check_backend, choose, compiled_covers, register
 
 WINDOW, SIGMA = 11, 1.5
 RADIUS = WINDOW // 2
@@ -52,6 +53,7 @@ def photometric_loss(
     mask: Tensor | None = None,
     fast: bool = True,
     moments: TargetMoments | None = None,
+    backend: str = "auto",
 ) -> Tensor:
     """Mean absolute difference plus `dssim_weight` times 1 - SSIM.
 
@@ -67,13 +69,15 @@ def photometric_loss(
             whole, 0 without such a window. What is outside has no gradient and may be NaN.
         fast: False keeps to Kornia's own operations, as second derivatives need.
         moments: `target_moments(target)` of this very target, to save that work. Used by the fast path only.
+        backend: one of :func:`kgs.backends.available`. Compiled: the fast path without a mask; torch does the rest.
 
     Returns:
         The loss, 0-d.
 
     Raises:
         TypeError: an image is no float32 or float64 tensor, or the two differ in dtype or device.
-        ValueError: shapes or the weight do not fit, or the mask is empty or has other values than 0 and 1.
+        ValueError: shapes or the weight do not fit, the mask is empty or has other values than 0 and 1, or the backend
+            is not there or does not cover the call.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
     Examples:
@@ -81,6 +85,7 @@ def photometric_loss(
         >>> float(photometric_loss(target, target)) < 1e-4
         True
     """
+    check_backend(backend)
     _check_images(image, image)
     shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
     moments = target if isinstance(target, TargetMoments) else moments
@@ -93,25 +98,11 @@ def photometric_loss(
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
         raise ValueError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
     outside = None if mask is None else _outside(mask, image)
-    if outside is not None:
-        image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
-    loss = _mean((image - target).abs(), outside)
-    if dssim_weight == 0.0:
-        return loss
-    if min(shape[-2:]) <= RADIUS:
+    if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
         raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}")
-    if outside is not None:  # from here on, of windows: those that touch a pixel outside
-        padded = F.pad(outside.float(), BORDER, mode="reflect")
-        outside = F.max_pool2d(F.max_pool2d(padded, (WINDOW, 1), 1), (1, WINDOW), 1) > 0
-        if bool(outside.all()):
-            return loss
-    if not fast or target.requires_grad or image.dtype != torch.float32 or min(shape[-2:]) < WINDOW:
-        return loss + 2.0 * dssim_weight * _mean(ssim_loss(image, target, WINDOW, reduction="none"), outside)
-    moments = target_moments(target) if moments is None else moments
-    outside = None if outside is None else outside.expand_as(image).reshape(shape)
-    arguments = (image.reshape(shape), moments.padded, moments.mean, moments.variance, outside)
-    mean_ssim: Tensor = choose("loss", "auto", *arguments)(*arguments)
-    return loss + dssim_weight * (1.0 - mean_ssim)
+    arguments = (image, target, moments, dssim_weight, outside, fast and not target.requires_grad)
+    loss: Tensor = choose("loss", backend, *arguments)(*arguments)
+    return loss
 
 
 @torch.inference_mode(False)  # else a training step could not save what is made in inference mode
@@ -128,6 +119,40 @@ def target_moments(target: Tensor) -> TargetMoments:
     padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
     mean = _blur(padded)
     return TargetMoments(padded, mean, _blur(padded * padded).sub_(mean * mean))
+
+
+def torch_loss(
+    image: Tensor,
+    target: Tensor,
+    moments: TargetMoments | None,
+    dssim_weight: float,
+    outside: Tensor | None,
+    fast: bool,
+) -> Tensor:
+    """The stage "loss"."""
+    if outside is not None:
+        image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
+    loss = _mean((image - target).abs(), outside)
+    if dssim_weight == 0.0:
+        return loss
+    if outside is not None:  # from here on, of windows: those that touch a pixel outside
+        padded = F.pad(outside.float(), BORDER, mode="reflect")
+        outside = F.max_pool2d(F.max_pool2d(padded, (WINDOW, 1), 1), (1, WINDOW), 1) > 0
+        if bool(outside.all()):
+            return loss
+    if not fast or image.dtype != torch.float32 or min(image.shape[-2:]) < WINDOW:
+        return loss + 2.0 * dssim_weight * _mean(ssim_loss(image, target, WINDOW, reduction="none"), outside)
+    moments = target_moments(target) if moments is None else moments
+    outside = None if outside is None else outside.expand_as(image).reshape(moments.mean.shape)
+    image = image.reshape(moments.mean.shape)
+    mean_ssim: Tensor = _MeanSsim.apply(image, moments.padded, moments.mean, moments.variance, outside)
+    return loss + dssim_weight * (1.0 - mean_ssim)
+
+
+def refuse_second_derivative() -> None:
+    """Raise a RuntimeError in a backward pass that is to be differentiated."""
+    if torch.is_grad_enabled():  # once_differentiable is silent where the incoming gradient is a constant
+        raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
 
 
 class _MeanSsim(torch.autograd.Function):
@@ -166,14 +191,14 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        if torch.is_grad_enabled():  # once_differentiable is silent where the incoming gradient is a constant
-            raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
+        refuse_second_derivative()
         padded, target, by_mean, by_square, by_product = ctx.saved_tensors
         pixels = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
         return _fold(pixels.addcmul_(target, _blur_adjoint(by_product))).mul_(grad / ctx.count), None, None, None, None
 
 
-register("loss", "torch", _MeanSsim.apply)
+register("loss", "torch", torch_loss)
+register("loss", "numba", "kgs.losses.photometric_compiled:compiled_loss", lambda image, *_: compiled_covers(image))
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
@@ -210,7 +235,7 @@ def _fold(grad: Tensor) -> Tensor:
 
 def _blur(maps: Tensor) -> Tensor:
     """Window each map, `(..., H + 10, W + 10)` to `(..., H, W)`, by shifted sums: no TF32, no autocast."""
-    weights = get_gaussian_kernel1d(WINDOW, SIGMA, device=torch.device("cpu"), dtype=maps.dtype).flatten().tolist()
+    weights = window_taps(maps.dtype)
     for dim in (-1, -2):
         size = maps.shape[dim] - 2 * RADIUS
         blurred = maps.narrow(dim, 0, size) * weights[0]
@@ -218,6 +243,13 @@ def _blur(maps: Tensor) -> Tensor:
             blurred.add_(maps.narrow(dim, shift, size), alpha=weights[shift])
         maps = blurred
     return maps
+
+
+@functools.cache
+def window_taps(dtype: torch.dtype) -> list[float]:
+    """Kornia's window along one axis."""
+    taps: list[float] = get_gaussian_kernel1d(WINDOW, SIGMA, device=torch.device("cpu"), dtype=dtype).flatten().tolist()
+    return taps
 
 
 def _blur_adjoint(maps: Tensor) -> Tensor:

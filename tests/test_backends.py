@@ -26,12 +26,12 @@ def render(rows, backend):
 
 
 def test_auto_is_torch_while_there_is_nothing_else():
-    assert backends.available() == ("auto", "torch")
+    assert backends.available() == ("auto", "numba", "torch")
     assert torch.equal(render(8, "auto"), render(8, "torch"))
 
 
 def test_auto_takes_what_covers_the_call_and_torch_takes_the_rest(half):
-    assert backends.available() == ("auto", "half", "torch")
+    assert backends.available() == ("auto", "half", "numba", "torch")
     assert torch.allclose(render(8, "auto"), render(8, "torch") / 2)
     assert torch.equal(render(8, "auto"), render(8, "half"))
     assert torch.equal(render(9, "auto"), render(9, "torch"))
@@ -44,7 +44,7 @@ def test_a_backend_by_name_is_refused_where_it_does_not_cover_the_call(half):
 
 @pytest.mark.parametrize("make", [kgs.GaussianRenderer, lambda backend: render(8, backend)])
 def test_an_unknown_backend_is_told_what_there_is(make):
-    with pytest.raises(ValueError, match=r"backend: expected one of \('auto', 'torch'\), got 'cuda'"):
+    with pytest.raises(ValueError, match=r"backend: expected one of \('auto', 'numba', 'torch'\), got 'cuda'"):
         make(backend="cuda")
 
 
