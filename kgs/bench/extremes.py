@@ -18,11 +18,13 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
+from kgs.camera import move_camera
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
 from .output import Row, markdown_table, write_results
 from .scenes import DTYPES, Scene, cast, centred_camera, exact, gradients, relative_errors
+from .timing import CPU
 
 SIZE, FOCAL, COUNT = (48, 48), 60.0, 200
 SHAPE = torch.tensor([1.0, 0.6, 0.3], dtype=torch.float64)  # of Gaussians that are not round: round ones cannot turn
@@ -61,11 +63,12 @@ def render(scene: Scene, dtype: torch.dtype, **options: Any) -> tuple[Tensor, di
     return image.detach(), gradients(image, inputs)
 
 
-def errors(case: Row, dtype: str) -> Row:
-    """One row: errors against the dense reference, which gets the rounded numbers."""
-    scene, near_plane = SCENES[case["case"]](), case["near_plane"]
-    expected, expected_gradients = exact(cast(scene, DTYPES[dtype]), near_plane)
-    image, got = render(scene, DTYPES[dtype], near_plane=near_plane)
+def errors(case: Row, dtype: str, device: torch.device = CPU) -> Row:
+    """One row: errors on a device against the dense reference on the CPU, which gets the rounded numbers."""
+    (cloud, view), near_plane = SCENES[case["case"]](), case["near_plane"]
+    expected, expected_gradients = exact(cast((cloud, view), DTYPES[dtype]), near_plane)
+    image, got = render((cloud.to(device), move_camera(view, device)), DTYPES[dtype], near_plane=near_plane)
+    image, got = image.cpu(), {name: gradient.cpu() for name, gradient in got.items()}
     worst = relative_errors(got, expected_gradients).max().item()
     found = {"forward": float((image - expected).abs().max()), "gradient": worst}
     row = {name: case[name] for name in ("case", "stiff", "treatment")} | {"dtype": dtype}
