@@ -225,13 +225,3 @@ def test_another_implementation_runs_where_it_covers_the_call(monkeypatch):
         image, target = make_pair((1, channels, 16, 19))
         expected = share * photometric_loss(image, target, backend="torch")
         torch.testing.assert_close(photometric_loss(image, target), expected)
-
-
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_agrees_with_float64_on_the_cpu():
-    image, target = make_pair((1, 3, 45, 67))
-    value, gradient = value_and_gradient(lambda x: photometric_loss(x, target.cuda()), image.cuda())
-    expected, expected_gradient = value_and_gradient(lambda x: kornia_loss(x, target.double(), 0.2), image.double())
-    assert abs(value.cpu() - expected) <= 1e-6
-    assert (gradient.cpu() - expected_gradient).abs().max() <= 1e-5 * expected_gradient.abs().max()

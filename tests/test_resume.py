@@ -96,18 +96,6 @@ def test_a_fit_may_go_on_on_another_device(scene, saved):
     assert {stream.device.type for stream in streams} == {"cpu"}
 
 
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_a_fit_goes_from_the_cpu_to_cuda_and_back(scene, saved, tmp_path):
-    there = Trainer.resume(scene, replace(CONFIG, device="cuda"), saved)
-    there.train_step()
-    there.save(tmp_path / "checkpoint.safetensors")
-    back = Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")
-    back.fit()
-    assert back.step == CONFIG.steps
-    assert all(bool(value.isfinite().all()) for value in back.model.parameters())
-
-
 def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     done = Trainer(scene, CONFIG, points)
