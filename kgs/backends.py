@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["available", "check_backend", "choose", "compiled_covers", "register"]
+__all__ = ["available", "check_backend", "choose", "compiled_covers", "register", "resolve"]
 
 STAGES = ("projection", "compositing", "loss")
 Pair = tuple[Callable[..., Any] | str, Callable[..., bool]]  # run, covers
@@ -65,6 +65,20 @@ def compiled_covers(like: Tensor) -> bool:
     """Whether the kernels can be used for such a tensor: numba is installed, float32, on a CPU, no graph is traced."""
     fits = like.dtype == torch.float32 and like.device.type == "cpu" and not torch.compiler.is_compiling()
     return fits and _has_numba()
+
+
+def resolve(backend: str, device: torch.device) -> str:
+    """The name of what "auto" takes for float32 on a device; another name as it is.
+
+    Raises:
+        ValueError: there is no such backend, or it does not run on the device.
+        ModuleNotFoundError: numba is named and not installed.
+    """
+    check_backend(backend)
+    if backend == "numba" and device.type != "cpu":
+        raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "numba", which runs on a CPU alone')
+    compiled = "numba" in available() and device.type == "cpu" and _has_numba()
+    return ("numba" if compiled else "torch") if backend == "auto" else backend
 
 
 @functools.cache

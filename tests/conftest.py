@@ -11,11 +11,38 @@ import pytest
 import torch
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
+import kgs.losses  # noqa: F401  # has a stage to register
+from kgs import backends
 from kgs.datasets import synthetic_scene
 from kgs.fit.starts import FirstPoints
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+    """What is of float64 or of a GPU by its parameters or marks no kernel covers: it is not run a second time."""
+    items[:] = [item for item in items if not _runs_on_torch_again(item)]
+
+
+def _runs_on_torch_again(item: pytest.Function) -> bool:
+    values = getattr(getattr(item, "callspec", None), "params", {})
+    if values.get("each_backend") != "numba":
+        return False
+    double = any(value is torch.float64 or (isinstance(value, str) and value == "float64") for value in values.values())
+    return double or item.get_closest_marker("cuda") is not None
+
+
+@pytest.fixture(scope="module", params=sorted({"torch", backends.resolve("auto", torch.device("cpu"))}))
+def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Makes "auto" mean one backend, then the other: what the test says holds for both. Bits differ between them."""
+    kept = ("torch", request.param)
+    stages = {
+        stage: {name: there[name] for name in there if name in kept} for stage, there in backends._registry.items()
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(backends, "_registry", stages)
+        yield request.param
 
 
 @pytest.fixture(autouse=True)

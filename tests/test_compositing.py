@@ -13,6 +13,8 @@ import kgs
 import kgs.reference
 from kgs import GaussianRenderer, composite
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 

@@ -12,6 +12,8 @@ import kgs
 import kgs.reference
 from kgs import GaussianRenderer, composite, project
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 # -- thresholds ----------------------------------------------------------------------------------------------------
 
 

@@ -13,6 +13,8 @@ from kgs import composite, project
 from kgs.raster.tasks import Slice
 from kgs.raster.tiles import bin_to_tiles
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 
 def loss_and_gradients(projected, features, weights, **options):
     projected, inputs = leaves(projected, features)

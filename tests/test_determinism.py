@@ -10,6 +10,8 @@ from kornia.geometry.camera import PinholeCamera
 from kgs import DropGaussian, GaussianRenderer, Gaussians
 from kgs.raster.threads import run_all
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
 LARGE = (200, 400)  # enough tiles for several pieces of work

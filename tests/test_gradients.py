@@ -143,6 +143,7 @@ def test_scaling_the_world_changes_nothing(seed, options):
     assert abs(sum(terms)) <= 1e-10 * sum(abs(term) for term in terms)
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-14)])
 def test_gradient_of_a_quaternion_is_tangential(dtype, bound):
     inputs = make_inputs(0, n=30, size=(24, 24), dtype=dtype)

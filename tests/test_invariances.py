@@ -10,6 +10,8 @@ from oracles import quaternion_product
 
 from kgs import GaussianRenderer, Gaussians
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
 # dtype, and the bound for images that are computed along different roads

@@ -9,6 +9,8 @@ from kornia.losses import ssim_loss
 from kgs import backends
 from kgs.losses import photometric_loss, target_moments
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 SIZES = [(1, 3, 45, 67), (1, 3, 11, 11), (2, 3, 12, 31), (1, 1, 64, 11), (3, 4, 20, 20)]
 
 

@@ -50,6 +50,7 @@ def gradient(loss, image):
     return value.detach(), image.grad
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("one_per_image", [False, True])
 @pytest.mark.parametrize(("dtype", "fast"), [(torch.float64, True), (torch.float32, True), (torch.float32, False)])
 def test_value_and_gradient_are_those_of_the_definition(dtype, fast, one_per_image):
@@ -68,6 +69,7 @@ def test_value_and_gradient_are_those_of_the_definition(dtype, fast, one_per_ima
     assert not found[~mask.expand(2, 1, 16, 19).expand_as(found)].any()
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_mask_of_every_pixel_is_no_mask(dtype):
     image, target = make(dtype=dtype)
@@ -85,6 +87,7 @@ def test_masks_of_any_dtype_are_the_same(dtype):
     assert torch.equal(photometric_loss(image, target, mask=mask.to(dtype)), photometric_loss(image, target, mask=mask))
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
 def test_what_is_outside_does_not_matter_whatever_it_is(dtype, value):
@@ -113,6 +116,7 @@ def test_where_no_window_is_whole_the_first_term_is_left():
         torch.testing.assert_close(photometric_loss(image, target, dssim_weight, mask=mask), expected)
 
 
+@pytest.mark.usefixtures("each_backend")
 def test_moments_stand_for_the_target():
     image, target = make(dtype=torch.float32)
     mask = round_mask()

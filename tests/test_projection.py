@@ -14,6 +14,8 @@ from projection_checks import HEIGHT, LENGTHS, PACKED, WIDTH, covariances, posed
 import kgs
 from kgs import Gaussians, project
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 
 def symmetric(abc):
     return abc[:, [0, 1, 1, 2]].reshape(-1, 2, 2)

@@ -12,6 +12,7 @@ from kgs import Gaussians, project
 # -- batches -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_batch_of_cameras_is_its_cameras_one_by_one(dtype):
     gaussians, cameras = scene(cameras=3, dtype=dtype)
@@ -33,6 +34,7 @@ def test_opacities_of_each_camera():
             project(replace(gaussians, opacities=wrong), cameras)
 
 
+@pytest.mark.usefixtures("each_backend")
 def test_memory_layout_of_the_inputs_does_not_matter():
     gaussians, cameras = scene(dtype=torch.float32)
     strided = Gaussians(*(torch.stack([x, x], -1)[..., 0] for x in (getattr(gaussians, name) for name in FIELDS)))

@@ -9,6 +9,8 @@ from projection_checks import HEIGHT, PACKED, WIDTH, assert_same, scene, sigma_r
 
 from kgs import DropGaussian, Gaussians, project
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 
 def select(gaussians, ids):
     return Gaussians(

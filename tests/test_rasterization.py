@@ -10,6 +10,8 @@ import kgs
 import kgs.reference
 from kgs import GaussianRenderer, rasterization
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 SIZE = (24, 32)
 POSITIONAL = [  # gsplat's, in its order
     *("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"),

@@ -11,6 +11,8 @@ from kornia.sensors.camera import CameraModelType
 import kgs.reference
 from kgs import DropGaussian, GaussianRenderer, Gaussians
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 DTYPES = [torch.float32, torch.float64]
 
 

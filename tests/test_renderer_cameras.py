@@ -12,6 +12,8 @@ from kornia.sensors.camera import CameraModelType
 import kgs.reference
 from kgs import GaussianRenderer, Gaussians
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 DTYPES = [torch.float32, torch.float64]
 
 

@@ -11,6 +11,8 @@ from kornia.sensors.camera import CameraModelType
 import kgs.reference
 from kgs import GaussianRenderer
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 SIZE = (24, 32)
 

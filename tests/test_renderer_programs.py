@@ -20,6 +20,7 @@ def replicas(module, count):
     return made
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("seed", [None, 3])
 def test_replicas_of_data_parallel_render_with_masks_of_their_own(seed):
     gaussians, camera = random_gaussians(200, 0, torch.float32), random_camera(*SIZE, 0, torch.float32)
@@ -32,6 +33,7 @@ def test_replicas_of_data_parallel_render_with_masks_of_their_own(seed):
     assert torch.equal(first, second)
 
 
+@pytest.mark.usefixtures("each_backend")
 def test_results_do_not_depend_on_the_default_dtype():
     gaussians, camera = random_gaussians(60, 0, torch.float32, 3), random_camera(*SIZE, 0, torch.float32)
     results = []
@@ -48,6 +50,7 @@ def test_results_do_not_depend_on_the_default_dtype():
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("kind", ["pinhole", "fisheye"])
 def test_tensors_decide_the_device_whatever_the_default_is(kind):
     from factories import posed

@@ -11,11 +11,13 @@ from kgs.fit import FirstPoints, FitConfig, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.config import Recipe
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
 
 
 @pytest.fixture(scope="module")
-def saved(scene, points, tmp_path_factory):
+def saved(each_backend, scene, points, tmp_path_factory):
     path = tmp_path_factory.mktemp("fit") / "checkpoint.safetensors"
     trainer = Trainer(scene, CONFIG, points)
     trainer.fit(lambda trainer, _: trainer.step == 2)

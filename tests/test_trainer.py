@@ -14,6 +14,8 @@ from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 CONFIG = FitConfig(steps=30, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
 
 
@@ -33,7 +35,7 @@ def fitted(scene, points, config=CONFIG):
 
 
 @pytest.fixture(scope="module")
-def whole(scene, points):
+def whole(each_backend, scene, points):
     return fitted(scene, points)
 
 

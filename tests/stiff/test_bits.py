@@ -14,6 +14,8 @@ from kgs import Gaussians
 from kgs.bench.extremes import camera, gaussians, ordinary, render
 from kgs.bench.scenes import PARAMETERS, Scene
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 Result = tuple[Tensor, dict[str, Tensor]]  # an image and the gradients of all parameters
 
 
@@ -107,10 +109,10 @@ CASES: dict[str, tuple[str, str, Callable[[torch.dtype], Iterator[Result]]]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_same_bits(name: str, record_property: Callable[[str, object], None]) -> None:
+def test_the_same_bits(name: str, each_backend: str, record_property: Callable[[str, object], None]) -> None:
     stiff, treatment, variants = CASES[name]
     found = {str(dtype)[6:]: largest_difference(list(variants(dtype))) for dtype in (torch.float32, torch.float64)}
-    record_property("bits", {"case": name, "stiff": stiff, **found, "treatment": treatment})
+    record_property("bits", {"case": f"{name}, {each_backend}", "stiff": stiff, **found, "treatment": treatment})
     assert set(found.values()) == {0.0}
 
 

@@ -12,6 +12,8 @@ import pytest
 from kgs.bench import extremes as module
 from kgs.bench.extremes import SCENES, cases, errors, extremes
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 
 def test_every_scene_has_its_line() -> None:
     assert [case["case"] for case in cases()] == list(SCENES)

@@ -11,6 +11,8 @@ from stiff_checks import one
 
 from kgs import GaussianRenderer, Gaussians
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 # -- degenerate footprints (A4) ------------------------------------------------------------------------------------
 
 

@@ -10,6 +10,8 @@ from stiff_checks import one
 
 from kgs import GaussianModel, GaussianRenderer, Gaussians
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
 
 

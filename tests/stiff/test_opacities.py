@@ -11,6 +11,8 @@ from stiff_checks import one
 import kgs.reference
 from kgs import GaussianRenderer, Gaussians
 
+pytestmark = pytest.mark.usefixtures("each_backend")
+
 # -- opacities above 1 (A8) ----------------------------------------------------------------------------------------
 
 
