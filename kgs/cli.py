@@ -102,7 +102,9 @@ def _find(words: list[str]) -> tuple[Callable[..., Any], str, list[str]]:
     if words[:1] == ["--version"]:
         from .fit.machine import versions
 
-        say("\n".join(f"{name} {version}" for name, version in versions().items()))
+        found = versions()
+        found.setdefault("numba", "is not installed: the extra fast brings it")
+        say("\n".join(f"{name} {version}" for name, version in found.items()))
         raise SystemExit(0)
     prog, (name, *rest) = "kgs", words or ["--help"]
     summaries = {name: str(function.__doc__).partition("\n")[0] for name, function in _COMMANDS.items()}

@@ -42,8 +42,8 @@ def test_fit_writes_everything(fitted):
 def test_metrics_have_the_agreed_keys(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
-        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "steps", "seed", "drop", "init", "protocol",
-        "versions",
+        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "steps", "seed", "drop", "init", "backend",
+        "protocol", "versions",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None

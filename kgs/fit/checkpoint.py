@@ -132,6 +132,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
             raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
+    asked |= {"backend": state["backend"]} if config.backend == "auto" else {}
     if steps == done < config.steps:
         asked["steps"] = steps
         notes.append(
@@ -142,7 +143,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
     elif steps != config.steps or done > steps:
         wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
         raise ValueError(f"--steps: expected {wanted} got {config.steps}")
-    _compare_settings(state["config"], asked)
+    _compare_settings(state["config"] | {"backend": state["backend"]}, asked)
     for part in ("training", "test"):
         for what, values in scene[part].items():
             before = state["scene"][part][what]
@@ -233,6 +234,7 @@ def _is_point(value: Any) -> bool:
 
 # The plain values of a fit's state, what is expected of each, and whether it is so.
 PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "backend": ("one of ['torch', 'numba']", lambda v: v in ("torch", "numba")),
     "init": ("kind and number of first points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),
     "step": ("a number of steps", _is_count),
     "seconds": ("a number, not negative", lambda v: is_number(v, 0)),

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from kgs.errors import DataError
 
-from .config import DEMO, FitConfig, Recipe
+from .config import DEMO, Backend, FitConfig, Recipe
 from .progress import each, say
 
 _VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
@@ -24,6 +24,7 @@ def demo(
     size: tuple[int, int] = (54, 72),
     seed: int = 0,
     device: str = "cpu",
+    backend: Backend = "auto",
 ) -> None:
     """Fit three views of a built-in scene without and with DropGaussian, and compare views that were not used.
 
@@ -37,16 +38,17 @@ def demo(
         size: height and width of the pictures.
         seed: the scene, the first points and both fits derive from it.
         device: cpu, cuda, ...
+        backend: as of kgs fit.
     """
     from kgs.datasets import synthetic_scene
 
     from .demo import run_demo
     from .outputs import check_folder
 
-    config = replace(DEMO, seed=seed, steps=steps, device=device)
+    config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     if min(size) < 12:  # the window of SSIM
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
-    _prepare(device, "matplotlib")
+    _prepare(device, backend, "matplotlib")
     check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
     runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), config, out)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
@@ -96,7 +98,7 @@ def fit(
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
-    lpips = _prepare(config.device, "matplotlib", "safetensors", lpips=lpips_weights)
+    lpips = _prepare(config.device, config.backend, "matplotlib", "safetensors", lpips=lpips_weights)
     check_folder(out, RESULTS, scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["points"] = config.init if config.init == "model-points" else "none"
@@ -130,6 +132,7 @@ def render(
     downscale: float | None = None,
     background: _Background = "black",
     device: str = "cpu",
+    backend: Backend = "auto",
 ) -> None:
     """Render a splat from every camera of a scene into PNGs.
 
@@ -144,6 +147,7 @@ def render(
         downscale: shrink the pictures by this factor.
         background: behind the splat.
         device: cpu, cuda, ...
+        backend: as of kgs fit.
     """
     import torch
 
@@ -155,7 +159,7 @@ def render(
     from .outputs import check_folder, png_names, write_png
     from .starts import typical_depths
 
-    _prepare(device)
+    _prepare(device, backend)
     check_folder(out, (), cameras, make=False)
     scene = load_scene(cameras, None, downscale, background=background, photos=False)
     model = load_ply(ply, origin=scene.offset)
@@ -163,7 +167,7 @@ def render(
     posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
     names = png_names(name for name, _ in posed)
     check_folder(out, names.values(), scene.root)
-    renderer = GaussianRenderer(near_plane=near_plane).eval()
+    renderer = GaussianRenderer(near_plane=near_plane, backend=backend).eval()
     model, background_color = model.to(device), scene.background.to(device)
     for name, camera in each(posed, "pictures", "view"):
         with torch.no_grad():
@@ -173,7 +177,9 @@ def render(
     _next(_VIEWER.format(_line(ply)))
 
 
-def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "cpu") -> None:
+def evaluate(
+    out: Path, /, *, lpips_weights: Path | None = None, device: str = "cpu", backend: Backend = "auto"
+) -> None:
     """Measure a fit again and bring its metrics.json up to date; what is not measured stays as it is.
 
     For example:
@@ -184,6 +190,7 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
         out: the output folder of `kgs fit`.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is not measured.
         device: cpu, cuda, ...
+        backend: auto: that of the fit.
     """
     from kgs.json_files import read_json
 
@@ -191,8 +198,9 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     from .metrics import measure_again
     from .outputs import write_json
 
-    lpips = _prepare(device, lpips=lpips_weights)
+    lpips = _prepare(device, backend, lpips=lpips_weights)
     saved, path = load_fit(out, device), out / "metrics.json"
+    saved = saved if backend == "auto" else saved._replace(backend=backend)
     scene = _load(saved.request)
     metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
     write_json(path, metrics)
@@ -202,11 +210,13 @@ def evaluate(out: Path, /, *, lpips_weights: Path | None = None, device: str = "
     _next(f"{without}  # to compare: without DropGaussian")
 
 
-def _prepare(device: str, *packages: str, lpips: Path | None = None) -> Any:
-    """Make sure before any work that device and packages are there; the perceptual metric, where it is asked for."""
+def _prepare(device: str, backend: str, *packages: str, lpips: Path | None = None) -> Any:
+    """Make sure before any work that all this is there; the perceptual metric, where it is asked for."""
+    from kgs.backends import resolve
+
     from .machine import check_device
 
-    check_device(device)
+    resolve(backend, check_device(device))
     for package in packages:
         import_module(package)
     if lpips is None:

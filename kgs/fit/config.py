@@ -34,6 +34,7 @@ _Count = Annotated[int, _Range(0, 10_000_000)]
 _Positive = Annotated[float, _Range(0, ends="(]")]
 _Weight = Annotated[float, _Range(0)]
 _Share = Annotated[float, _Range(0, 1)]
+Backend = Literal["auto", "torch", "numba"]
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,7 @@ class FitConfig:
         max_bytes: bound for the working memory of a render in bytes; it changes rounding alone.
         evaluations: how often the curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
+        backend: numba: compiled, several times faster, on a CPU alone. auto: that where it is installed, else torch.
         recipe: all the other numbers.
 
     Raises:
@@ -139,6 +141,7 @@ class FitConfig:
     max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30
     evaluations: _Steps = 8
     device: str = "cpu"
+    backend: Backend = "auto"
     recipe: Recipe = field(default_factory=Recipe)
 
     def __post_init__(self) -> None:

@@ -124,12 +124,13 @@ class SavedFit(NamedTuple):
     model: GaussianModel  # in the frame of the scene: world coordinates less `Scene.offset`
     near_plane: float  # in world units
     step: int  # steps that are done
+    backend: str  # of the fit; on a GPU "auto"
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
         """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
-        renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=self.config.max_bytes).eval()
-        device = self.model.means.device
+        rules: dict[str, Any] = {"max_bytes": self.config.max_bytes, "backend": self.backend}
+        renderer, device = GaussianRenderer(near_plane=self.near_plane, **rules).eval(), self.model.means.device
         image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
         return image
 
@@ -144,6 +145,7 @@ def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
     state, _ = newest_checkpoint(path)
     try:
         model = GaussianModel(**state["model"]).to(device)
-        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]))
+        backend = str(state.get("backend", "torch")) if model.means.device.type == "cpu" else "auto"
+        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error

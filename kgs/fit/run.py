@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from kgs.backends import resolve
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.ply import save_ply
@@ -71,9 +72,10 @@ def fit_scene(
             `out`, or `out` cannot be written to or holds files that kgs did not write and would overwrite.
         TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
         OSError: a result cannot be written.
-        ValueError: the device cannot be used.
+        ValueError: the device cannot be used, or the backend not on it.
+        ModuleNotFoundError: the backend is numba, and it is not installed.
     """
-    check_device(config.device)
+    resolve(config.backend, check_device(config.device))
     smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
     for views in (scene.train, scene.test):
         height, width = views.images.shape[-2:]
@@ -162,6 +164,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
         "seed": config.seed,
         "drop": config.drop,
         "init": trainer.init,
+        "backend": trainer.backend,
         "protocol": {
             "train": list(scene.train.names),
             "test": list(scene.test.names),

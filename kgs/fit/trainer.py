@@ -15,6 +15,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.metrics import psnr
 from torch import Tensor
 
+from kgs.backends import resolve
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
@@ -49,6 +50,7 @@ class Trainer:
         renderer: with the drop layer inside; `eval()` mode renders all Gaussians.
         step, seconds: the steps that are done and the time they took, evaluations not counted.
         curve: dicts of step, seconds, test_psnr and train_psnr.
+        backend: "numba" or "torch", which a resumed fit goes on with.
         notes: lines that a user should read (a capped count, for instance).
         saved: the last checkpoint that was written or read, in words; "" before the first.
         init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
@@ -69,6 +71,7 @@ class Trainer:
     def _prepare(self, scene: Scene, config: FitConfig) -> None:
         """All that follows from the scene and the configuration alone."""
         self.scene, self.config, self.device = scene, config, check_device(config.device)
+        self.backend = resolve(config.backend, self.device)
         self.times = timetable(config)
         self.step, self.seconds, self.saved = 0, 0.0, ""
         self.curve: list[dict[str, float | None]] = []
@@ -89,7 +92,8 @@ class Trainer:
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
         self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=seed + 1) if config.drop else None
-        self.renderer = GaussianRenderer(self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes).train()
+        rules: dict[str, Any] = {"max_bytes": config.max_bytes, "backend": self.backend}
+        self.renderer = GaussianRenderer(self.drop, near_plane=self.near_plane, **rules).train()
         limits = {name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")}
         limits |= {"max_gaussians": self.max_gaussians, "generator": torch.Generator().manual_seed(seed + 2)}
         self.densifier = Densifier(self.model, self.optimizer, self.extent, **limits)
@@ -180,15 +184,18 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from where :meth:`state_dict` was taken, bit for bit, with its scene and configuration.
 
-        The device may be another. Where all steps were done `steps` may be larger; `notes` says what that means.
+        The device may be another; the backend is that of the state, on a GPU torch. Where all steps were done `steps`
+        may be larger; `notes` says what that means.
 
         Raises:
             ValueError: they are others, or an entry is missing or wrong; the message begins with its name. The trainer
                 cannot be used any more.
         """
         try:
+            state = {"backend": "torch"} | state  # as before there was another
             longer = check_state(state, self._fingerprint, self.config)
             vars(self).update(copy.deepcopy({name: state[name] for name in PLAIN}))
+            self.backend = resolve(self.backend if self.device.type == "cpu" else "auto", self.device)
             self.notes += longer
             model = GaussianModel(**state["model"])
             if model.max_sh_degree != self.config.sh_degree or model.means.dtype != torch.float32:
@@ -246,7 +253,7 @@ class Trainer:
         gaussians = self.model()
         out = self.renderer(gaussians, camera, self._background)
         image = out.image.masked_fill(out.image > 1, 1.0)  # it is never below 0
-        loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments)
+        loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
         if config.opacity_l1:
             low = config.opacity_l1_by == "gradient"
             scores = gaussian_scores("low-gradient" if low else "far", self.densifier, camera)

@@ -1,0 +1,89 @@
+"""`backend` of fits and commands: what "auto" became is kept, and a fit goes on with what it was begun with."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_cli import one_line, run
+
+from kgs import DataError, backends
+from kgs.fit import FitConfig, Trainer
+from kgs.fit.checkpoint import save_checkpoint
+from kgs.fit.folder import CHECKPOINT, load_fit
+from kgs.fit.run import fit_scene
+from kgs.json_files import read_json
+
+CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """A "numba" that is torch under another name; sets whether it is installed."""
+    stages = {stage: {"numba": there["torch"], "torch": there["torch"]} for stage, there in backends._registry.items()}
+    monkeypatch.setattr(backends, "_registry", stages)
+
+    def set_installed(there):
+        monkeypatch.setattr(backends, "_has_numba", lambda: there)
+
+    set_installed(True)
+    return set_installed
+
+
+def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert [backends.resolve("auto", device) for device in (cpu, gpu)] == ["numba", "torch"]
+    assert [backends.resolve(name, cpu) for name in ("torch", "numba")] == ["torch", "numba"]
+    with pytest.raises(ValueError, match='backend: expected "auto" or "torch" on cuda, got "numba"'):
+        backends.resolve("numba", gpu)
+    installed(False)
+    assert backends.resolve("auto", cpu) == "torch"
+    with pytest.raises(ModuleNotFoundError, match="numba"):
+        backends.resolve("numba", cpu)
+
+
+@pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch"), ("numba", "numba")])
+def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, asked, made):
+    request = {"scene": "somewhere", "train_views": None, "downscale": None, "background": "black"}
+    metrics, _ = fit_scene(scene, replace(CONFIG, backend=asked), tmp_path, request=request)
+    assert metrics["backend"] == made
+    assert read_json(tmp_path / "config.json")["fit"]["backend"] == asked
+    saved = load_fit(tmp_path)
+    assert saved.backend == made
+    assert torch.equal(
+        saved.render(scene.test.camera(0), scene.background),
+        Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT).render(scene.test.camera(0)),
+    )
+
+
+@pytest.mark.parametrize(("begun", "other"), [("torch", "numba"), ("numba", "torch")])
+def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, points, tmp_path, begun, other):
+    trainer = Trainer(scene, replace(CONFIG, backend=begun), points)
+    trainer.train_step()
+    trainer.save(tmp_path / CHECKPOINT)
+    for asked in ("auto", begun):
+        resumed = Trainer.resume(scene, replace(CONFIG, backend=asked), tmp_path / CHECKPOINT)
+        assert (resumed.backend, resumed.renderer.backend) == (begun, begun)
+    with pytest.raises(DataError, match=f"--backend: expected '{begun}', as the fit was begun with, got '{other}'"):
+        Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
+
+
+def test_a_fit_of_before_there_was_a_choice_goes_on_with_torch(installed, scene, points, tmp_path):
+    state = Trainer(scene, replace(CONFIG, backend="torch"), points).state_dict()
+    del state["backend"], state["config"]["backend"]
+    save_checkpoint(tmp_path / CHECKPOINT, state)
+    assert Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT).backend == "torch"
+
+
+@pytest.mark.parametrize("words", [["fit", "{scene}"], ["demo"], ["render", "x.ply", "--cameras", "{scene}"]])
+def test_numba_that_is_not_installed_is_one_line_before_any_work(installed, folder, tmp_path, capsys, words):
+    installed(False)
+    words = [word.format(scene=folder) for word in words]
+    assert run(*words, "-o", tmp_path / "out", "--backend", "numba") == 2
+    assert 'numba is missing: run pip install -e ".[fast]"' in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_versions_say_where_numba_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr("kgs.fit.machine.versions", lambda: {"kgs": "1"})
+    assert run("--version") == 0
+    assert "numba is not installed" in capsys.readouterr().out
