@@ -160,7 +160,7 @@ def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
     matrix, pose, *size = (
         x[c : c + 1] for x in (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
     )
-    limits = _tangent_limits(matrix[0].diagonal()[:2], matrix[0, :2, 2], *map(int, size))
+    limits = tangent_limits(matrix[0].diagonal()[:2], matrix[0, :2, 2], *map(int, size))
 
     def pixels(matrix: Tensor, pose: Tensor, world: Tensor) -> Tensor:
         found: Tensor = PinholeCamera(matrix, pose, *size).project(world[None])[0]
@@ -181,7 +181,7 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
     height, width = int(model.height), int(model.width)
     one = CameraModelBase(model.distortion, model.projection, ImageSize(height, width), params)
     k = torch.diag(params[:2])
-    limits = _tangent_limits(params[:2], params[2:4], height, width)
+    limits = tangent_limits(params[:2], params[2:4], height, width)
     parallel = isinstance(model.projection, OrthographicProjection)
     plain = parallel or isinstance(model.distortion, AffineTransform)
     brown_conrady = isinstance(model.distortion, BrownConradyTransform)
@@ -226,7 +226,7 @@ def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor],
     return None if angle >= math.pi / 2 else lambda points: points[:, :2].norm(dim=1) < math.tan(angle) * points[:, 2]
 
 
-def _tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Tensor:
+def tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Tensor:
     """Limits of x/z and y/z in rows (lower, upper), `(2, 2)`, no gradient; also where a focal length is negative."""
     focal, centre, size = focal.detach(), centre.detach(), focal.new_tensor([width, height])
     first, last = -(centre + 0.5 + _MARGIN * size) / focal, (size - 0.5 - centre + _MARGIN * size) / focal

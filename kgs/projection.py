@@ -11,7 +11,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from .backends import choose, register
+from .backends import choose, compiled_covers, register
 from .camera import Cameras, Lens, image_size, intrinsics, lenses
 from .covariance import footprint_factors, rotation_matrices, variances
 from .full_precision import full_precision, in_full_precision
@@ -72,8 +72,8 @@ def project_torch(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`project` in torch, for every camera, device and dtype; trusts its arguments."""
-    device, views, finite = gaussians.means.device, lenses(cameras), _finite(gaussians)
-    reach = _reach(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
+    device, views, finite = gaussians.means.device, lenses(cameras), finite_gaussians(gaussians)
+    reach = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
     touches, near = partial(_touches_image, size, options.eps2d, reach), options.near_plane
     with full_precision(device):
         parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]
@@ -86,6 +86,9 @@ def project_torch(
 
 
 register("projection", "torch", project_torch)
+register(
+    "projection", "numba", "kgs.projection_compiled:project_compiled", lambda scene, *_: compiled_covers(scene.means)
+)
 
 
 def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:
@@ -151,7 +154,7 @@ def _project_one(
     return ids, *projected, radii, _rows(opacities, ids), rgb
 
 
-def _reach(opacities: Tensor, alpha_threshold: float) -> Tensor:
+def seen_within(opacities: Tensor, alpha_threshold: float) -> Tensor:
     """How many standard deviations wide a footprint counts as seen: one number for all, 0-d."""
     largest = torch.cat([opacities.flatten(), opacities.new_tensor([2.0])]).amax()
     return cut_squared(largest, alpha_threshold).clamp_min(9.0).sqrt()
@@ -171,19 +174,24 @@ def _touches_image(
 
 def _directions(means: Tensor, lens: Lens) -> Tensor:
     """Unit vectors from the camera to the Gaussians, world axes; the pose may be scaled or sheared."""
-    rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
-    product = rotation.detach() @ rotation.detach().T
-    turned = bool(((product - torch.diag_embed(product.new_ones(3))).abs() <= 1e-3).all())
-    inverse = rotation.T if turned else torch.linalg.inv(rotation)
+    inverse, turned = inverse_turn(lens.extrinsics)
     if lens.parallel and turned:
         return inverse[:, 2].expand_as(means)
-    camera = in_full_precision(torch.mv, inverse, translation)
+    camera = in_full_precision(torch.mv, inverse, lens.extrinsics[:3, 3])
     offsets = inverse[:, 2].expand_as(means) if lens.parallel else means + camera
     unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return unit
 
 
-def _finite(gaussians: Gaussians) -> Tensor:
+def inverse_turn(extrinsics: Tensor) -> tuple[Tensor, bool]:
+    """The inverse of a pose's 3x3 block, and whether that is a rotation, whose inverse is its transpose."""
+    rotation = extrinsics[:3, :3]
+    product = rotation.detach() @ rotation.detach().T
+    turned = bool(((product - torch.diag_embed(product.new_ones(3))).abs() <= 1e-3).all())
+    return rotation.T if turned else torch.linalg.inv(rotation), turned
+
+
+def finite_gaussians(gaussians: Gaussians) -> Tensor:
     """Which Gaussians have only finite parameters, `(N,)`."""
     opacities = gaussians.opacities.detach()
     values = [opacities.T if opacities.ndim == 2 else opacities[:, None]]

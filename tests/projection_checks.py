@@ -1,7 +1,7 @@
 """What tests of projection have in common."""
 
 import torch
-from factories import FIELDS, batch, random_camera, random_gaussians
+from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 
@@ -73,3 +73,56 @@ def values_and_gradients(gaussians, cameras):
         got.means2d.sum() + got.factors.square().sum() + got.depths.sum() + (got.opacities[:, None] * got.colors).sum()
     ).backward()
     return got, {name: leaf.grad for name, leaf in leaves.items()}
+
+
+# -- one backend against another -----------------------------------------------------------------------------------
+
+DIFFERENTIABLE = ("means2d", "factors", "depths", "opacities", "colors")
+
+
+def wide_scene(degree=2, n=400, cameras=1):
+    """Gaussians in and beside the image, before and behind the camera."""
+    gaussians = random_gaussians(n, 3, torch.float32, degree, WIDTH)
+    means = gaussians.means * torch.tensor([1.8, 1.8, 1.0])
+    means[::5, 2] *= -1
+    cameras = batch(*(random_camera(HEIGHT, WIDTH, seed, torch.float32) for seed in range(cameras)))
+    return replace(gaussians, means=means), cameras
+
+
+def list_and_gradients(gaussians, cameras, backend, dtype=torch.float32, **options):
+    """The list, and the gradients of a sum of its values with random weights."""
+    gaussians, inputs = leaves(gaussians.to(dtype))
+    cameras = type(cameras)(
+        *(x.to(dtype) for x in (cameras.intrinsics, cameras.extrinsics)), cameras.height, cameras.width
+    )
+    got = project(gaussians, cameras, backend=backend, **options)
+    fields = [getattr(got, name) for name in DIFFERENTIABLE]
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
+    used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
+    torch.autograd.backward(*zip(*used, strict=True))
+    return got, dict(zip(FIELDS, (x.grad for x in inputs), strict=True))
+
+
+def assert_alike(gaussians, cameras, accuracy=3e-6, **options):
+    """The list of torch in float32, and what torch says in float64."""
+    got, grads = list_and_gradients(gaussians, cameras, "numba", **options)
+    listed, same = list_and_gradients(gaussians, cameras, "torch", **options)
+    exact, exact_grads = list_and_gradients(gaussians, cameras, "torch", torch.float64, **options)
+    for name in ("camera_ids", "gaussian_ids", "num_nonfinite", "radii"):
+        assert torch.equal(getattr(got, name), getattr(listed, name)), name
+        assert getattr(got, name).dtype == getattr(listed, name).dtype
+    assert (got.image_size, got.num_cameras, got.num_gaussians) == (exact.image_size, exact.num_cameras, len(gaussians))
+    pairs = [(name, getattr(got, name), getattr(exact, name)) for name in DIFFERENTIABLE]
+    for name, x, y in pairs + [(name, grads[name], exact_grads[name]) for name in FIELDS]:
+        if y is None:
+            assert x is None, name
+            continue
+        assert x.shape == y.shape, name
+        assert x.dtype == torch.float32
+        assert x.numel() == 0 or (x - y).abs().max() <= accuracy * y.abs().max(), name
+    assert [getattr(got, n).requires_grad for n in DIFFERENTIABLE] == [
+        getattr(listed, n).requires_grad for n in DIFFERENTIABLE
+    ]
+    assert [grads[name] is None for name in FIELDS] == [same[name] is None for name in FIELDS]
+    return got, grads

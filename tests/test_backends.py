@@ -21,11 +21,11 @@ def half(monkeypatch):
 
 
 def render(rows, backend):
-    gaussians = random_gaussians(30, 0, torch.float32, None)
-    return kgs.GaussianRenderer(backend=backend)(gaussians, random_camera(rows, 12, 0, torch.float32)).image
+    gaussians = random_gaussians(30, 0, sh_degree=None)  # float64: torch
+    return kgs.GaussianRenderer(backend=backend)(gaussians, random_camera(rows, 12, 0)).image
 
 
-def test_auto_is_torch_while_there_is_nothing_else():
+def test_auto_is_torch_where_nothing_else_covers_the_call():
     assert backends.available() == ("auto", "numba", "torch")
     assert torch.equal(render(8, "auto"), render(8, "torch"))
 

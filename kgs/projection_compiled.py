@@ -1,0 +1,131 @@
+"""`project` on compiled kernels: float32 on a CPU, pinhole cameras that want no gradient."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeGuard
+
+import numpy as np
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from .camera import Cameras, tangent_limits
+from .compiled.projection import BLOCK, footprint_gradients, footprints
+from .compiled.threads import over
+from .full_precision import full_precision
+from .projection import finite_gaussians, inverse_turn, project_torch, seen_within
+from .types import Gaussians, ProjectedGaussians, RasterOptions
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+def project_compiled(
+    gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
+) -> ProjectedGaussians:
+    """`kgs.projection.project_torch` on the kernels, where they can do the call."""
+    if not _is_plain(cameras) or options.near_plane < 1e-8:  # Kornia does not divide by less
+        return project_torch(gaussians, cameras, size, options, colors)
+    opacities = gaussians.opacities.detach()
+    wide = bool((opacities > 2.0).any())  # only these matter for the reach
+    opacities = opacities.masked_fill(~finite_gaussians(gaussians), 0.0) if wide else opacities[..., :0]
+    reach = float(seen_within(opacities, options.alpha_threshold))
+    rules = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, reach))
+    harmonics = colors and gaussians.colors.ndim == 3
+    fields = _Projection.apply(*vars(gaussians).values(), _views(cameras, size), rules, harmonics)
+    means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, broken = fields
+    if colors and not harmonics:
+        rgb = gaussians.colors.index_select(0, ids)
+    tensors = (camera_ids, ids, means2d, factors, depths, radii, alphas, rgb)
+    return ProjectedGaussians(*tensors, size, len(cameras.extrinsics), len(gaussians), broken, options.eps2d)
+
+
+class _Projection(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *inputs, views, rules, harmonics = arguments
+        ctx.save_for_backward(*inputs)
+        arrays, n, parts = _fields(inputs), len(inputs[0]), []
+        shapes = ((n, 2), (n, 6), (n,), (n,), (n, 3 if harmonics else 0), (n,))
+        counts = np.zeros((-(-n // BLOCK), 2), np.int64)
+        for c, view in enumerate(views):
+            lists = [*(inputs[0].new_empty(shape) for shape in shapes), inputs[0].new_empty(n, dtype=torch.int64)]
+            out = tuple(x.numpy() for x in lists)
+            threads = torch.get_num_threads()
+            over(threads, len(counts), footprints, *arrays, c, view, rules, out, counts, pieces=16)
+            seen = _close_up(out, counts[:, 0])
+            parts.append([x[:seen] for x in lists])
+        joined = [x[0] if len(parts) == 1 else torch.cat(x) for x in zip(*parts, strict=True)]
+        means2d, factors, depths, alphas, rgb, radii, ids = joined
+        ctx.views, ctx.ids = views, [part[-1].numpy() for part in parts]
+        camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(x) for x in ctx.ids]))
+        broken, factors = ids.new_tensor(int(counts[:, 1].sum())), factors.view(-1, 2, 3)
+        by_mean, by_turn, by_scale, by_opacity, by_color = ctx.needs_input_grad[:5]
+        moved = by_color or (by_mean and inputs[4].shape[1] > 1)
+        wants = (by_mean, by_mean or by_turn or by_scale, by_mean, by_opacity, harmonics and moved)
+        outputs = means2d, factors, depths, alphas, rgb
+        constant = [x for x, wanted in zip(outputs, wants, strict=True) if not wanted]
+        ctx.mark_non_differentiable(*constant, ids, camera_ids, radii, broken)
+        return *outputs, ids, camera_ids, radii, broken
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
+        inputs, begin = ctx.saved_tensors, 0
+        means, quats, scales, _, colors = _fields(inputs)
+        found = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in inputs]
+        outs, colored = _fields(found), ctx.needs_input_grad[4] and gradients[4].shape[1] > 0
+        if not colored:  # the largest by far
+            outs = *outs[:4], outs[4][:, :0]
+        gradients = _arrays(gradients[0], gradients[1].flatten(1), *gradients[2:5])
+        for c, (view, ids) in enumerate(zip(ctx.views, ctx.ids, strict=True)):
+            part = tuple(x[begin : begin + len(ids)] for x in gradients)
+            arguments = means, quats, scales, colors, c, view, ids, part, outs
+            over(torch.get_num_threads(), len(means), footprint_gradients, *arguments)
+            begin += len(ids)
+        wanted = *ctx.needs_input_grad[:4], colored
+        return *(x if w else None for x, w in zip(found, wanted, strict=True)), None, None, None
+
+
+def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
+    """Whether they are pinhole cameras, without gradient, whose matrices are an affine map and a pose."""
+    if not isinstance(cameras, PinholeCamera):
+        return False
+    matrices = cameras.intrinsics, cameras.extrinsics
+    if torch.is_grad_enabled() and any(x.requires_grad for x in matrices):
+        return False
+    (k, pose), unit = (x.detach().numpy() for x in matrices), np.eye(4)
+    last = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
+    return bool(last and k[:, 0, 0].all() and k[:, 1, 1].all() and np.isfinite(k).all() and np.isfinite(pose).all())
+
+
+def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, ...]]:
+    """What the kernels know of each camera."""
+    views = []
+    with full_precision(cameras.extrinsics.device):
+        for k, pose in zip(cameras.intrinsics.detach(), cameras.extrinsics.detach(), strict=True):
+            limits, centre = tangent_limits(k.diagonal()[:2], k[:2, 2], *size), -(inverse_turn(pose)[0] @ pose[:3, 3])
+            views.append(_arrays(pose[:3], k[:2, :3], limits, centre))
+    return views
+
+
+def _arrays(*tensors: Tensor) -> tuple[Array, ...]:
+    return tuple(x.detach().contiguous().numpy() for x in tensors)
+
+
+def _fields(tensors: Sequence[Tensor]) -> tuple[Array, ...]:
+    """The memory of the fields of Gaussians, opacities as `(1, N)` or `(C, N)`, colours as `(N, F)`."""
+    *first, opacities, colors = _arrays(*tensors)
+    return *first, np.atleast_2d(opacities), colors.reshape(len(colors), math.prod(colors.shape[1:]))
+
+
+def _close_up(lists: tuple[Array, ...], counts: Array) -> int:
+    """Move the rows of each block to the end of those before it; returns how many there are in all."""
+    end = 0
+    for block, count in enumerate(counts.tolist()):
+        begin = block * BLOCK
+        if begin != end:
+            for x in lists:
+                x[end : end + count] = x[begin : begin + count]
+        end += count
+    return end

@@ -1,0 +1,199 @@
+"""The compiled projection against that of torch: the same list, values and gradients within float32."""
+
+import dataclasses
+
+import pytest
+import torch
+from factories import FIELDS, leaves, pinhole, random_gaussians, replace, with_camera
+from projection_checks import DIFFERENTIABLE, assert_alike, list_and_gradients, wide_scene
+
+pytest.importorskip("numba")
+
+import kgs.projection_compiled
+from kgs import GaussianRenderer, project
+from kgs.backends import choose
+from kgs.compiled.projection import BLOCK
+
+
+@pytest.fixture
+def handed_over(monkeypatch):
+    """How often the compiled projection asks that of torch."""
+    calls = []
+    real = kgs.projection_compiled.project_torch
+    monkeypatch.setattr(kgs.projection_compiled, "project_torch", lambda *a: calls.append(1) or real(*a))
+    return calls
+
+
+# -- the same values and gradients ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_harmonics_of_every_degree_and_features(degree, cameras, handed_over):
+    got, _ = assert_alike(*wide_scene(degree, cameras=cameras))
+    assert 100 < len(got) < 300 * cameras
+    assert not handed_over
+
+
+@pytest.mark.parametrize("width", [0, 1, 7])
+def test_features_of_any_width_and_no_colors_at_all(width):
+    gaussians, cameras = wide_scene(None, cameras=2)
+    assert_alike(replace(gaussians, colors=torch.rand(400, width)), cameras)
+    for degree in (None, 3):
+        got, grads = assert_alike(*wide_scene(degree), colors=False)
+        assert got.colors.shape == (len(got), 0)
+        assert grads["colors"] is None
+
+
+def test_opacities_of_each_camera():
+    gaussians, cameras = wide_scene(cameras=3)
+    assert_alike(replace(gaussians, opacities=torch.rand(3, 400)), cameras)
+
+
+@pytest.mark.parametrize("largest", [0.0, 1.9, 2.1, 50.0])
+@pytest.mark.parametrize("threshold", [1 / 255, 0.3, 0.0])
+def test_large_opacities_widen_what_is_seen_unless_they_belong_to_one_that_is_not_finite(largest, threshold):
+    gaussians, cameras = wide_scene()
+    opacities = gaussians.opacities.clone()
+    opacities[3] = largest
+    got, _ = assert_alike(replace(gaussians, opacities=opacities), cameras, alpha_threshold=threshold)
+    means = gaussians.means.clone()
+    means[3, 0] = torch.inf
+    broken = replace(gaussians, opacities=opacities, means=means)
+    plain, count = project(gaussians, cameras, alpha_threshold=threshold), len(project(broken, cameras))
+    assert len(got) >= len(plain) - 1
+    assert count == len(project(broken, cameras, backend="torch"))
+
+
+def test_cameras_with_skew_negative_focal_lengths_and_an_anisotropic_block():
+    gaussians, cameras = wide_scene()
+    for block in ([[50.0, 4.0], [0.0, 60.0]], [[-50.0, 0.0], [0.0, 60.0]], [[50.0, 4.0], [-3.0, -60.0]]):
+        k = cameras.intrinsics[0].clone()
+        k[:2, :2] = torch.tensor(block)
+        assert_alike(gaussians, with_camera(cameras, intrinsics=k))
+
+
+def test_poses_that_are_scaled_or_sheared():
+    gaussians, cameras = wide_scene(3)
+    for change in (torch.eye(3) * 1.7, torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.9, -0.1], [0.1, 0.0, 1.2]])):
+        pose = cameras.extrinsics[0].clone()
+        pose[:3, :3] = change @ pose[:3, :3]
+        assert_alike(gaussians, with_camera(cameras, extrinsics=pose))
+
+
+@pytest.mark.parametrize("options", [{"near_plane": 4.0}, {"eps2d": 0.0}, {"eps2d": 2.5, "near_plane": 1e-6}])
+def test_options(options):
+    assert_alike(*wide_scene(), **options)
+
+
+def test_the_limits_of_the_tangents_belong_to_what_has_a_gradient():
+    # x / z, y / z at, within and beyond the limits (8.5 + 2.4) / 8 and (4.5 + 1.2) / 8, both exact in binary
+    camera = pinhole(8, 16, 8.0, (8.0, 4.0), dtype=torch.float32)
+    limits = kgs.camera.tangent_limits(torch.tensor([8.0, 8.0]), torch.tensor([8.0, 4.0]), 8, 16)
+    x = torch.stack([limits[0, 0], limits[0, 1], limits[0, 1] * 1.5, limits[0, 0] * 0.5])
+    y = torch.stack([limits[1, 1], limits[1, 0] * 2, limits[1, 0], limits[1, 1] * 0.5])
+    base = random_gaussians(4, 0, torch.float32, 1)
+    gaussians = replace(base, means=torch.stack([x, y, torch.ones(4)], 1), scales=torch.full((4, 3), 0.5))
+    values = [list_and_gradients(gaussians, camera, backend, alpha_threshold=0.0) for backend in ("numba", "torch")]
+    assert values[0][0].gaussian_ids.tolist() == [0, 1, 2, 3]
+    assert torch.allclose(values[0][1]["means"], values[1][1]["means"], rtol=1e-5, atol=1e-5)
+
+
+# -- autograd ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wanted", FIELDS)
+def test_only_what_is_asked_for_has_a_gradient(wanted):
+    gaussians, cameras = wide_scene(1)
+    found = []
+    for backend in ("numba", "torch"):
+        leaf = getattr(gaussians, wanted).clone().requires_grad_()
+        got = project(replace(gaussians, **{wanted: leaf}), cameras, backend=backend)
+        fields = [getattr(got, name) for name in DIFFERENTIABLE]
+        sum(x.square().sum() for x in fields if x.requires_grad).backward()
+        found.append(([x.requires_grad for x in fields], leaf.grad))
+    assert found[0][0] == found[1][0]
+    assert torch.allclose(found[0][1], found[1][1], rtol=1e-4, atol=1e-5 * float(found[1][1].abs().max()))
+
+
+def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused():
+    gaussians, inputs = leaves(wide_scene()[0])
+    loss = project(gaussians, wide_scene()[1], backend="numba").factors.square().sum()
+    first = torch.autograd.grad(loss, inputs[:3], retain_graph=True)
+    with pytest.raises(RuntimeError, match="expected backward without create_graph"):
+        torch.autograd.grad(loss, inputs[:3], create_graph=True)
+    second = torch.autograd.grad(loss, inputs[:3])
+    assert all(torch.equal(x, y) for x, y in zip(first, second, strict=True))
+    with pytest.raises(RuntimeError, match="second time"):
+        torch.autograd.grad(loss, inputs[:3])
+
+
+def test_gradients_of_the_centres_in_the_image_are_kept():
+    gaussians, _ = leaves(wide_scene()[0])
+    out = GaussianRenderer(backend="numba")(gaussians, wide_scene()[1])
+    out.image.square().sum().backward()
+    assert out.projected.means2d.grad.abs().sum() > 0
+
+
+def test_without_gradients_and_in_inference_mode():
+    gaussians, cameras = wide_scene()
+    expected = project(gaussians, cameras, backend="numba")
+    assert not expected.means2d.requires_grad
+    for mode in (torch.no_grad, torch.inference_mode):
+        with mode():
+            got = project(leaves(gaussians)[0], cameras, backend="numba")
+        assert not got.means2d.requires_grad
+        assert torch.equal(got.means2d, expected.means2d)
+
+
+def test_tensors_that_are_not_contiguous():
+    gaussians, cameras = wide_scene()
+    strided = dataclasses.replace(gaussians, colors=gaussians.colors.transpose(0, 1).contiguous().transpose(0, 1))
+    assert torch.equal(project(strided, cameras).colors, project(gaussians, cameras).colors)
+
+
+# -- what is left to torch -----------------------------------------------------------------------------------------
+
+
+def test_cameras_with_a_gradient_or_another_form_go_to_torch(handed_over):
+    gaussians, cameras = wide_scene()
+    bent = cameras.intrinsics.clone()
+    bent[0, 2, 0] = 1e-3
+    pose = cameras.extrinsics.clone().requires_grad_()
+    wanting = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
+    project(gaussians, with_camera(cameras, intrinsics=bent), backend="numba")
+    project(gaussians, wanting, backend="numba").means2d.sum().backward()
+    project(gaussians, cameras, near_plane=0.0, backend="numba")
+    assert len(handed_over) == 3
+    assert pose.grad.any()
+    with torch.no_grad():
+        project(gaussians, wanting, backend="numba")
+    assert len(handed_over) == 3
+
+
+def test_float64_is_refused_by_name_and_left_to_torch_by_auto():
+    gaussians, cameras = wide_scene()
+    list_and_gradients(gaussians, cameras, "auto", torch.float64)
+    with pytest.raises(ValueError, match="backend: 'numba' does not cover this call of projection"):
+        list_and_gradients(gaussians, cameras, "numba", torch.float64)
+    assert choose("projection", "auto", gaussians).__name__ == "project_compiled"
+
+
+# -- threads -------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_bits_on_any_number_of_threads():
+    gaussians, cameras = wide_scene(3, 5 * BLOCK + 100, cameras=2)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3, 4):
+            torch.set_num_threads(threads)
+            found.append(list_and_gradients(gaussians, cameras, "numba"))
+    finally:
+        torch.set_num_threads(before)
+    (first, first_grads), *others = found
+    for got, grads in others:
+        assert all(
+            torch.equal(getattr(got, name), getattr(first, name)) for name in (*DIFFERENTIABLE, "radii", "gaussian_ids")
+        )
+        assert all(torch.equal(grads[name], first_grads[name]) for name in FIELDS)
