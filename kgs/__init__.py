@@ -1,5 +1,11 @@
 """Differentiable 3D Gaussian splatting for sparse views, in PyTorch and Kornia, with DropGaussian as a layer."""
 
+import os
+import sys
+
+if "torch" not in sys.modules and "GOMP_SPINCOUNT" not in os.environ:
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is loaded: threads that wait yield their core
+
 from .camera import PosedCamera, cameras
 from .densify import Densifier, DensifyReport, camera_extent
 from .drop import DropGaussian, drop_gaussian
