@@ -13,7 +13,7 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.starts import _sweep_range, first_points
 from kgs.fit.starts.dense import dense_points
-from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, _warp, sweep_depths
+from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, sweep_depths, warp
 from kgs.fit.starts.triangulate import project_all
 
 
@@ -119,7 +119,7 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
     assert _neighbours(line, 7, 3.0)[0] == 6
 
 
-def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
+def test_awarp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
     image = torch.rand(20, 30, generator=generator())
     homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], [0.002, -0.003, 1.0]], dtype=torch.float64)
     rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
@@ -127,10 +127,10 @@ def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
     grid = torch.stack([2 * x / z / 29 - 1, 2 * y / z / 19 - 1], -1).reshape(1, 20, 30, 2)
     inner = (grid.abs() < 1).all(-1)[0]
     expected = torch.nn.functional.grid_sample(image[None, None], grid, align_corners=True)[0, 0]
-    assert float((_warp(image, homography) - expected)[inner].abs().max()) < 0.05  # OpenCV may round to 1/32 pixel
+    assert float((warp(image, homography) - expected)[inner].abs().max()) < 0.05  # OpenCV may round to 1/32 pixel
     homography[2] = torch.tensor([-0.1, 0.0, 1.0])
-    assert not _warp(torch.ones(20, 30), homography)[:, 10:].any()
-    assert _warp(torch.ones(20, 30), homography)[:, :5].any()
+    assert not warp(torch.ones(20, 30), homography)[:, 10:].any()
+    assert warp(torch.ones(20, 30), homography)[:, :5].any()
 
 
 def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:

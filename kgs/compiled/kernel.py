@@ -13,6 +13,7 @@ _LARGEST = np.finfo(np.float32).max
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # without nnan and ninf: see `is_finite`
 jit: Any = nb.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+exact: Any = nb.njit(nogil=True, cache=True, error_model="numpy")  # rounds as written
 inline: Any = nb.njit(inline="always", fastmath=_FAST, error_model="numpy")
 
 # exp2 on [-1/2, 1/2] as in Cephes' exp2f: relative error 1.2e-7 with its roundings

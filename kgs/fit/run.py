@@ -186,7 +186,10 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     count, file = config.init_points, config.init_file  # in the world's coordinates, as the files that kgs writes
-    return first_points(views, kind, seed=config.seed, count=count, file=file, origin=scene.offset, stage=stage)
+    origin, backend = scene.offset, config.backend
+    return first_points(
+        views, kind, seed=config.seed, count=count, file=file, origin=origin, stage=stage, backend=backend
+    )
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:

@@ -52,6 +52,7 @@ def first_points(
     file: str | PathLike[str] | None = None,
     origin: Tensor | None = None,
     stage: Stage = silent,
+    backend: str = "auto",
 ) -> FirstPoints:
     """Find the points a fit starts from.
 
@@ -67,6 +68,7 @@ def first_points(
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
         stage: shows how far the work is: :func:`kgs.fit.progress.each`, or nothing.
+        backend: one of :func:`kgs.backends.available`, for "dense".
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.
@@ -93,7 +95,7 @@ def first_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
-        dense, colors = dense_points(views, near, far, count, generator, stage)
+        dense, colors = dense_points(views, near, far, count, generator, stage, backend)
         if len(dense) >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind)
         message = f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead"

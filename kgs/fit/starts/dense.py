@@ -15,7 +15,13 @@ AGREEMENT = 0.01  # relative difference of the depths that two views have of a p
 
 
 def dense_points(
-    views: Views, near: float, far: float, count: int, generator: torch.Generator, stage: Stage = silent
+    views: Views,
+    near: float,
+    far: float,
+    count: int,
+    generator: torch.Generator,
+    stage: Stage = silent,
+    backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """At most `count` points between two depths that two views agree on, drawn at random, and RGB, both `(P, 3)`.
 
@@ -24,7 +30,7 @@ def dense_points(
     """
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
         views = views.halved()
-    maps = sweep_depths(views, near, far, stage=stage)
+    maps = sweep_depths(views, near, far, stage, backend)
     certain = [there.is_inner & (there.scores > SCORE) for there in maps]
     if views.masks is not None:
         certain = [pixels & (mask[0] > 0.5).cpu() for pixels, mask in zip(certain, views.masks, strict=True)]

@@ -14,6 +14,7 @@ from kornia.color import rgb_to_grayscale
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.backends import choose, compiled_covers, register
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
@@ -25,7 +26,8 @@ NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
 # Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
 STEP, JUMP, EDGE = 0.06, 0.5, 0.04
-_VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
+LEAST_JUMP = 1.5 * STEP
+VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class DepthMap:
     is_inner: Tensor  # where the depth is not on the nearest or farthest plane
 
 
-def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent) -> list[DepthMap]:
+def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, backend: str = "auto") -> list[DepthMap]:
     """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
 
     A view from whose place no other differs has no depths, and scores of -1.
@@ -49,8 +51,10 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent) -
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
         if others := _neighbours(views, view, 1 / float(inverse.mean())):
-            scores = _combine(_scores(grey, views.cameras, view, other, inverse) for other in others)
-            maps.append(_refine(_semi_global(1.0 - scores, grey[view]), scores, inverse))
+            homographies = torch.stack([_homographies(views.cameras, view, other, inverse) for other in others])
+            arguments = (grey[view], grey[others], homographies)
+            costs, scores = choose("sweep", backend, *arguments)(*arguments)
+            maps.append(_refine(costs, scores, inverse))
         else:
             unknown = torch.full_like(grey[view], -1.0)
             maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
@@ -65,29 +69,42 @@ def _neighbours(views: Views, view: int, depth: float) -> list[int]:
     return [other for other in order if baselines[other] > 0][:NEIGHBOURS]
 
 
-def _scores(grey: Tensor, cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
-    """Normalised cross-correlation of patches, `(D, H, W)`; 0 where the patch leaves the other image.
-
-    A plane at depth d of the view has the homography K' (R + t n^T / d) K^-1 to the other view.
-    """
+def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
+    """From pixels of a view to those of another one, by planes, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
     intrinsics, extrinsics = matrices(cameras)
     rotation = extrinsics[other, :3, :3] @ extrinsics[view, :3, :3].mT
     shift = extrinsics[other, :3, 3] - rotation @ extrinsics[view, :3, 3]
-    back = torch.linalg.inv(intrinsics[view])
-    image, target = grey[view], grey[other]
-    mean, variance = _moments(image)
-    found, turn = torch.empty(len(inverse), *image.shape), rotation.clone()
-    for plane, value in enumerate(inverse.tolist()):
-        turn[:, 2] = rotation[:, 2] + value * shift
-        homography = intrinsics[other] @ turn @ back
-        warped, inside = (_warp(layer, homography) for layer in (target, torch.ones_like(target)))
-        there, spread = _moments(warped)
-        score = (_box(image * warped) - mean * there) * ((variance + _VARIANCE) * (spread + _VARIANCE)).rsqrt()
+    turns = rotation.repeat(len(inverse), 1, 1)
+    turns[:, :, 2] += inverse[:, None] * shift
+    homographies: Tensor = intrinsics[other] @ turns @ torch.linalg.inv(intrinsics[view])
+    return homographies
+
+
+def torch_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
+    """The stage "sweep"."""
+    scores = _combine(_scores(image, other, turns) for other, turns in zip(others, homographies, strict=True))
+    return _semi_global(1.0 - scores, image), scores
+
+
+register("sweep", "torch", torch_costs)
+register(
+    "sweep", "numba", "kgs.fit.starts.plane_sweep_compiled:compiled_costs", lambda image, *_: compiled_covers(image)
+)
+
+
+def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
+    """Normalised cross-correlation of patches, `(D, H, W)`; 0 where the patch leaves the other image."""
+    mean, variance = moments(image)
+    found = torch.empty(len(homographies), *image.shape)
+    for plane, homography in enumerate(homographies):
+        warped, inside = (warp(layer, homography) for layer in (target, torch.ones_like(target)))
+        there, spread = moments(warped)
+        score = (_box(image * warped) - mean * there) * ((variance + VARIANCE) * (spread + VARIANCE)).rsqrt()
         found[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
     return found
 
 
-def _warp(image: Tensor, homography: Tensor) -> Tensor:
+def warp(image: Tensor, homography: Tensor) -> Tensor:
     """The image at the places that pixels are mapped to, `(H, W)`; 0 outside and behind the camera."""
     height, width = image.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -102,7 +119,8 @@ def _box(image: Tensor) -> Tensor:  # mean over the window
     return torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
 
 
-def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
+def moments(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance over the window around each pixel."""
     mean = _box(image)
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 
@@ -135,7 +153,7 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
         if last >= 0:
             came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
             least = came.amin(0)
-            cheapest = torch.minimum(came, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(1.5 * STEP))
+            cheapest = torch.minimum(came, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(LEAST_JUMP))
             cheapest[1:] = torch.minimum(cheapest[1:], came[:-1] + STEP)
             cheapest[:-1] = torch.minimum(cheapest[:-1], came[1:] + STEP)
             more = cheapest - least

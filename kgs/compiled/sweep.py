@@ -1,0 +1,129 @@
+"""Costs of a plane sweep, by the formulas of `kgs.fit.starts.plane_sweep`; planes are the lanes, so they come last.
+
+    image, mean, variance   (H, W), the latter two over the window around a pixel
+    warped                  (P, 2, H, W), another view's image by P planes of the sweep, and ones warped alike
+    prices                  float32: for a step by one plane; of a jump, where the image has no edge times the next;
+                            the difference of grey values that halves it; the least price of a jump
+    best, second            (H, W, D), the two highest scores of a pixel at a plane, of those added so far
+    cost, total             (H, W, D), what paths are added from, and to
+
+Sums over windows are in float64, and all else rounds as written: the results are torch's but for a few last bits.
+"""
+
+import numpy as np
+
+from .kernel import ONE, ZERO, exact, f32, inline
+from .threads import over
+
+HALO, BAND = 3, 16  # of the window; rows of a band
+PATHS = 8  # side by side
+LANES = 16  # numbers of planes are made up to a multiple
+INFINITY = f32(np.inf)
+DIRECTIONS = [(dy, dx) for dy in (1, -1) for dx in (-1, 0, 1)] + [(0, 1), (0, -1)]  # rows and columns of a step
+
+
+def add_scores(threads, image, mean, variance, flat, warped, plane, best, second):
+    """Enter the scores of planes `plane`, `plane + 1`, ...; `flat`: added to variances."""
+    bands = -(-image.shape[0] // BAND)
+    over(threads, bands, enter_scores, image, mean, variance, flat, warped, plane, best, second, pieces=bands)
+
+
+def semi_global(threads, cost, grey, prices):
+    """Costs with those of smooth surfaces along eight directions added, `total`."""
+    total = np.zeros_like(cost)
+    for dy, dx in DIRECTIONS:
+        groups = -(-(cost.shape[1] if dy else cost.shape[0]) // PATHS)
+        over(threads, groups, add_paths, cost, grey, dy, dx, prices, total, pieces=groups)
+    return total
+
+
+@inline
+def row_sum(a, x):
+    """a[x] + ... + a[x + 6]."""
+    return a[x] + a[x + 1] + a[x + 2] + a[x + 3] + a[x + 4] + a[x + 5] + a[x + 6]
+
+
+@exact
+def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, second):
+    """Normalised cross-correlation of windows, in bands of rows; 0 where a window leaves the other image."""
+    (height, width), planes = image.shape, warped.shape[0]
+    sums = np.empty((planes, 4, width + 2 * HALO))  # of columns: warped, its square, its product with the image, inside
+    scores = np.empty((planes, width), np.float32)
+    share = 1.0 / (2 * HALO + 1) ** 2
+    for band in range(begin, end):
+        sums[:] = 0.0
+        for y in range(band * BAND - 2 * HALO - 1, min((band + 1) * BAND, height)):
+            # What comes in at the lower end of the window, and from the first row of the band, what goes out.
+            below, above = min(max(y + HALO, 0), height - 1), min(max(y - HALO - 1, 0), height - 1)
+            kept = 1.0 if y >= band * BAND else 0.0
+            for p in range(planes):
+                s0, s1, s2, s3 = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3]
+                for x in range(width):
+                    new, old = warped[p, 0, below, x], warped[p, 0, above, x]
+                    s0[HALO + x] += np.float64(new) - kept * np.float64(old)
+                    s1[HALO + x] += np.float64(new * new) - kept * np.float64(old * old)
+                    s2[HALO + x] += np.float64(image[below, x] * new) - kept * np.float64(image[above, x] * old)
+                    s3[HALO + x] += np.float64(warped[p, 1, below, x]) - kept * np.float64(warped[p, 1, above, x])
+                if y < band * BAND:
+                    continue
+                for x in range(HALO):
+                    for s in range(4):
+                        sums[p, s, x], sums[p, s, HALO + width + x] = sums[p, s, HALO], sums[p, s, HALO + width - 1]
+                for x in range(width):
+                    there, product = f32(row_sum(s0, x) * share), f32(row_sum(s2, x) * share)
+                    spread = f32(row_sum(s1, x) * share) - there * there
+                    spread = spread if spread > ZERO else ZERO
+                    score = (product - mean[y, x] * there) * (ONE / np.sqrt((variance[y, x] + flat) * (spread + flat)))
+                    scores[p, x] = score if f32(row_sum(s3, x) * share) > f32(0.99) else ZERO
+            if y >= band * BAND:
+                for x in range(width):
+                    for p in range(planes):
+                        score, first = scores[p, x], best[y, x, plane + p]
+                        lower = score if score < first else first
+                        best[y, x, plane + p] = first if score < first else score
+                        if lower > second[y, x, plane + p]:
+                            second[y, x, plane + p] = lower
+
+
+@exact
+def add_paths(begin, end, cost, grey, dy, dx, prices, total):
+    """Add the costs of the cheapest paths in one direction, `PATHS` of them at a time; they wrap around at the sides.
+
+    A path continues that of the same plane, of one beside it for a price, or of any for another, lower at edges.
+    """
+    (height, width, planes), (step, jump, edge, least_jump) = cost.shape, prices
+    size = (planes + LANES - 1) // LANES * LANES
+    # Costs of the paths so far, between infinite ones; the lowest of each path.
+    memory, lowest = np.full((2, PATHS, size + 2), INFINITY), np.empty(PATHS, np.float32)
+    lanes = np.empty(LANES, np.float32)
+    length, across = (height, width) if dy else (width, height)
+    for group in range(begin, end):
+        for i in range(length):
+            before, after = memory[i % 2], memory[(i + 1) % 2]
+            for k in range(min(PATHS, across - group * PATHS)):
+                if dy:
+                    y, x = (i if dy > 0 else height - 1 - i), (group * PATHS + k + dx * i) % width
+                else:
+                    y, x = group * PATHS + k, (i if dx > 0 else width - 1 - i)
+                came, path, here, out = before[k], after[k], cost[y, x], total[y, x]
+                if i == 0 or not 0 <= x - dx < width:
+                    for d in range(planes):
+                        path[1 + d] = here[d]
+                else:
+                    slope = abs(grey[y, x] - grey[y - dy, x - dx])
+                    least, price = lowest[k], ONE / (edge + slope) * jump
+                    anywhere = least + (price if price > least_jump else least_jump)
+                    for d in range(planes):
+                        cheapest = came[1 + d] if came[1 + d] < anywhere else anywhere
+                        left, right = came[d] + step, came[2 + d] + step
+                        cheapest = left if left < cheapest else cheapest
+                        cheapest = right if right < cheapest else cheapest
+                        path[1 + d] = here[d] + (cheapest - least)
+                lanes[:] = INFINITY
+                for d in range(0, size, LANES):
+                    for lane in range(LANES):
+                        value = path[1 + d + lane]
+                        lanes[lane] = value if value < lanes[lane] else lanes[lane]
+                lowest[k] = lanes.min()
+                for d in range(planes):
+                    out[d] += path[1 + d]
