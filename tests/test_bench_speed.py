@@ -2,6 +2,7 @@
 
 import json
 import math
+import subprocess
 import time
 
 import numpy as np
@@ -12,8 +13,8 @@ from kornia.geometry.camera import PinholeCamera
 import kgs
 from kgs.bench import speed
 from kgs.bench.scenes import layered_scene
-from kgs.bench.speed import Cases, _exponent
-from kgs.bench.timing import take_turns, time_parts
+from kgs.bench.speed import Cases, _exponent, _held
+from kgs.bench.timing import busy_processes, take_turns, time_parts
 
 
 def test_the_scene_keeps_its_footprints_and_pairs_per_gaussian():
@@ -93,7 +94,7 @@ def test_the_exponent_of_a_power_law():
 
 def test_the_files_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "SIZE", (36, 48))
-    monkeypatch.setattr(speed, "_memory_of_its_own", lambda _: 1.0)
+    monkeypatch.setattr(speed, "_memory_of_its_own", lambda *_: 1.0)
     speed.speed(out=tmp_path / "new", quick=True)
     result = json.loads((tmp_path / "new" / "speed.json").read_text())
     assert {path.name for path in (tmp_path / "new").iterdir()} == {
@@ -102,14 +103,36 @@ def test_the_files_are_written(tmp_path, monkeypatch):
         "speed.md",
         "scaling.png",
     }
-    assert {row["table"] for row in result["rows"]} == {"main", "stages", "left out", "scaling"}
-    assert {row["case"] for row in result["rows"] if row["table"] == "main"} == set(speed.TARGETS) - {"peak memory"}
+    assert {row["table"] for row in result["rows"]} == {"main", "busy", "stages", "left out", "scaling"}
+    main = [row for row in result["rows"] if row["table"] == "main"]
+    assert {row["case"] for row in main} > set(speed.TARGETS) - {"peak memory", "busy"}
+    assert {row["backend"] for row in main} == set(speed.backends(torch.device("cpu")))
     assert all(math.isfinite(value) for value in result["exponents"].values())
-    assert "| forward + backward |" in (tmp_path / "new" / "speed.md").read_text()
+    page = (tmp_path / "new" / "speed.md").read_text()
+    assert "| forward + backward, torch |" in page
+    assert "| forward + backward, torch, wall beside two busy processes over that |" in page
 
 
 def test_memory_is_measured_in_a_process_of_its_own():
-    assert 5 < speed._memory_of_its_own(300) < 500
+    assert 5 < speed._memory_of_its_own(300, "torch") < 500
+
+
+def test_busy_processes_end_with_the_block(monkeypatch):
+    started, plain = [], subprocess.Popen
+
+    def start(*args, **options):
+        started.append(plain(*args, **options))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with busy_processes(2):
+        assert [process.poll() for process in started] == [None, None]
+    assert None not in [process.poll() for process in started]
+
+
+def test_ratios_stand_with_what_they_are_held_to():
+    assert _held(4.26, "training step", 10_000, ".1f") == "4.3; 4"
+    assert _held(4.26, "training step", 300, ".1f") == "4.3"
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_made(tmp_path):

@@ -31,6 +31,7 @@ class Setting:
     dtype: str = "float32"
     tile_size: int = RasterOptions.tile_size
     chunk_size: int | None = None
+    backend: str = "auto"
 
 
 DEFAULT, EXACT = Setting(), Setting(alpha_threshold=0.0, transmittance_stop=0.0)
@@ -41,12 +42,17 @@ KNOBS = {
     "alpha threshold 0 to 1/128, stop 0": [replace(EXACT, alpha_threshold=a) for a in _ALPHAS],
     "alpha threshold 0 to 1/128, stop 1e-4": [replace(DEFAULT, alpha_threshold=a) for a in _ALPHAS],
     "stop 0 to 1e-2, alpha threshold 0": [replace(EXACT, transmittance_stop=t) for t in (0.0, 1e-6, 1e-4, 1e-3, 1e-2)],
+    "torch: exact, default": [replace(EXACT, backend="torch"), replace(DEFAULT, backend="torch")],
     "float64: exact, default": [EXACT64, replace(DEFAULT, dtype="float64")],
     "tiles 4 to 64": [replace(DEFAULT, tile_size=t) for t in (4, 8, 16, 32, 64)],
     "chunks 4 to 256": [replace(DEFAULT, chunk_size=k) for k in (4, 16, 64, 256)],
 }
-_LOOKS = ("o-", "s-", "^-", "D-", "v-", "x-", "k*")  # of the knobs and the default in the plots
-_COLUMNS = {"default": DEFAULT, "alpha 1/1024": replace(DEFAULT, alpha_threshold=1 / 1024)}
+_LOOKS = ("o-", "s-", "^-", "p-", "D-", "v-", "x-", "k*")  # of the knobs and the default in the plots
+_COLUMNS = {
+    "default": DEFAULT,
+    "default, torch": replace(DEFAULT, backend="torch"),
+    "alpha 1/1024": replace(DEFAULT, alpha_threshold=1 / 1024),
+}
 _COLUMNS |= {"exact, float32": EXACT, "exact, float64": EXACT64}
 
 
@@ -83,7 +89,8 @@ class Measured:
         """The image alone, with or without its graph."""
         options = {name: value for name, value in asdict(s).items() if name != "dtype"}
         with torch.set_grad_enabled(grad):
-            projected = project(*self.inputs[s.dtype], near_plane=self.near_plane, alpha_threshold=s.alpha_threshold)
+            rules: dict[str, Any] = {"alpha_threshold": s.alpha_threshold, "backend": s.backend}
+            projected = project(*self.inputs[s.dtype], near_plane=self.near_plane, **rules)
             return composite(projected, projected.colors, **options).features
 
     def backward(self, s: Setting) -> dict[str, Tensor]:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs.backends import resolve
 from kgs.camera import move_camera
 from kgs.fit.machine import check_device, peak_rss_mb
 from kgs.losses import photometric_loss, target_moments
@@ -23,20 +24,21 @@ from kgs.renderer import GaussianRenderer
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene
-from .timing import CPU, Case, seconds_of_exp, take_turns, time_parts
+from .timing import CPU, Case, busy_processes, seconds_of_exp, take_turns, time_parts
 
 SIZE = (378, 504)
-# What kgs is held to on two cores, by count of Gaussians: seconds, and MiB over what importing takes.
+# What kgs is held to on two cores, by count of Gaussians: numba's time in torch's, the most MiB over what importing
+# takes, and the most wall time beside two busy processes in that of a quiet machine.
 TARGETS = {
-    "forward, no gradient": {10_000: 0.030, 50_000: 0.110, 200_000: 0.250},
-    "forward + backward": {10_000: 0.080, 50_000: 0.280, 200_000: 0.480},
-    "training step": {10_000: 0.125, 50_000: 0.330, 200_000: 0.540},
-    "peak memory": {10_000: 250.0, 50_000: 450.0, 200_000: 900.0},
+    "forward + backward": {10_000: 4.0, 50_000: 4.0, 200_000: 3.5},
+    "training step": {10_000: 4.0, 50_000: 4.0, 200_000: 3.3},
+    "peak memory": {10_000: 60.0, 50_000: 140.0, 200_000: 400.0},
+    "busy": {10_000: 3.0, 50_000: 3.0, 200_000: 3.0},
 }
 
 
 def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
-    """Time and memory of renders and training steps on this machine, by stage and by what is asked for.
+    """Time and memory of renders and training steps on this machine: of torch and numba, by stage, by what is asked.
 
     For example:
       kgs bench speed -o speed
@@ -54,19 +56,22 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     repeats, counts = (3, (2_000, 10_000)) if quick else (7, (10_000, 50_000, 200_000))
     sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
-    plan = [(table, count, SIZE) for count in counts for table in ("main", "stages")]
+    plan = [(table, count, SIZE) for count in counts for table in ("main", "busy", "stages")]
     plan += [("left out", counts[1], SIZE), *(("scaling", *scene) for scene in dict.fromkeys(scaled))]
     unit, rows, how = seconds_of_exp(where), [], (repeats, where)
     for table, count, (height, width) in plan:
         print(f"{table}: {count} Gaussians at {width}x{height} ...")
         cases = Cases(count, (height, width), where)
-        found = time_parts(cases.stages, *how) if table == "stages" else take_turns(cases.of(table), *how)
+        with busy_processes(2 * (table == "busy")):
+            found = time_parts(cases.stages, *how) if table == "stages" else take_turns(cases.of(table), *how)
         for name, times in found.items():
-            row = {"table": table, "case": name, "gaussians": count, "height": height, "width": width}
-            row |= {"pairs_millions": cases.pairs} | {f"{key}_s": value for key, value in times._asdict().items()}
-            row |= {"repeats": repeats, "target_s": TARGETS[name].get(count) if table == "main" else None}
+            case, _, backend = name.partition(", by ")
+            row = {"table": table, "case": case, "backend": backend or "auto", "gaussians": count}
+            row |= {"height": height, "width": width, "pairs_millions": cases.pairs, "repeats": repeats}
+            row |= {f"{key}_s": value for key, value in times._asdict().items()}
             rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / unit})
-    memory = {count: _memory_of_its_own(count) for count in counts if where.type == "cpu"}
+    alone = backends(where) if where.type == "cpu" else []
+    memory = {backend: {count: _memory_of_its_own(count, backend) for count in counts} for backend in alone}
     points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
     exponents = {name: _exponent(of) for name, of in points.items()}
     more = {"peak_memory_mb": memory, "exp_s": unit, "exponents": exponents, "device": device}
@@ -75,12 +80,17 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     write_results(out / "speed", rows, _markdown(rows, memory, unit, exponents), **more)
 
 
+def backends(device: torch.device) -> list[str]:
+    """Those that can be compared."""
+    return list(dict.fromkeys(["torch", resolve("auto", device)]))
+
+
 class Cases:
     """One scene and what there is to time on it; `pairs`: of pixel and Gaussian in its tiles' lists, in millions."""
 
-    def __init__(self, count: int, size: tuple[int, int], device: torch.device) -> None:
+    def __init__(self, count: int, size: tuple[int, int], device: torch.device, backend: str = "auto") -> None:
         model, camera = layered_scene(count, size)
-        self.count, self.device, self.renderer = count, device, GaussianRenderer()
+        self.count, self.device, self.renderer = count, device, GaussianRenderer(backend=backend)
         self.model, self.camera = model.to(device), move_camera(camera, device)
         generator = torch.Generator().manual_seed(0)
         self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
@@ -93,9 +103,22 @@ class Cases:
 
     def of(self, table: str) -> dict[str, Case]:
         """What a table compares."""
-        scaling: dict[str, Case] = {"forward + backward": self.both}
-        main = {"forward, no gradient": self.forward, **scaling, "training step": self.train}
-        return {"main": main, "scaling": scaling, "left out": self.savings()}[table]
+        main = {"forward, no gradient": self.forward, "forward + backward": self.both, "training step": self.train}
+        if table == "left out":
+            return self.savings()
+        if table == "scaling":
+            return {"forward + backward": self.both}
+        chosen = {name: case for name, case in main.items() if table == "main" or case == self.both}
+        return {
+            f"{name}, by {backend}": partial(self.by, backend, case)
+            for name, case in chosen.items()
+            for backend in backends(self.device)
+        }
+
+    def by(self, backend: str, case: Case) -> None:
+        """Run a case on a backend."""
+        self.renderer.backend = backend
+        case()
 
     @torch.no_grad()
     def forward(self) -> Any:
@@ -114,8 +137,8 @@ class Cases:
 
     def train(self) -> None:
         """One step of training, densification left aside."""
-        image = self.renderer(self.model(), self.camera).image
-        photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments).backward()
+        image, backend = self.renderer(self.model(), self.camera).image, self.renderer.backend
+        photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments, backend=backend).backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
@@ -156,14 +179,15 @@ class Cases:
         }
 
 
-def _memory_of_its_own(count: int) -> float:
+def _memory_of_its_own(count: int, backend: str) -> float:
     """MiB that rendering forward and backward takes over importing, in a process that does nothing else."""
-    program = f"from kgs.bench.speed import _memory; print(_memory({count}))"
+    program = f"from kgs.bench.speed import _memory; print(_memory({count}, {backend!r}))"
     return float(subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout)
 
 
-def _memory(count: int) -> float:
-    before, cases = peak_rss_mb(), Cases(count, SIZE, CPU)
+def _memory(count: int, backend: str) -> float:
+    Cases(10, (16, 16), CPU, backend).both()  # imports what it needs
+    before, cases = peak_rss_mb(), Cases(count, SIZE, CPU, backend)
     for _ in range(3):
         cases.both()
     return peak_rss_mb() - before
@@ -187,23 +211,35 @@ def _exponent(points: np.ndarray) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def _markdown(rows: list[Row], memory: dict[int, float], unit: float, exponents: dict[str, float]) -> str:
+def _markdown(rows: list[Row], memory: dict[str, dict[int, float]], unit: float, exponents: dict[str, float]) -> str:
     tables: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
-        tables.setdefault(row["table"], {}).setdefault(row["case"], []).append(row)
-    counts = [f"{row['gaussians'] // 1000}k" for row in next(iter(tables["main"].values()))]
-    main = [[name, *map(_cell, found)] for name, found in tables["main"].items()]
-    if memory:
-        most = TARGETS["peak memory"]
-        cells = (f"{mb:.0f} MiB" + (f"; {most[count]:.0f}" if count in most else "") for count, mb in memory.items())
-        main.append(["peak memory over importing", *cells])
+        name = row["case"] if row["backend"] == "auto" else f"{row['case']}, {row['backend']}"
+        tables.setdefault(row["table"], {}).setdefault(name, []).append(row)
+    quiet, busy, main = tables["main"], tables["busy"], []
+    counts = [f"{row['gaussians'] // 1000}k" for row in next(iter(quiet.values()))]
+    for name, found in quiet.items():
+        main.append([name, *map(_cell, found)])
+        case, _, backend = name.rpartition(", ")
+        if backend == "numba":
+            pairs = zip(quiet[f"{case}, torch"], found, strict=True)
+            ratios = [(other["wall_s"] / row["wall_s"], row) for other, row in pairs]
+            main.append([f"{case}, times faster", *(_held(x, case, row["gaussians"], ".1f") for x, row in ratios)])
+    for name, found in busy.items():
+        ratios = [(row["wall_s"] / before["wall_s"], row) for before, row in zip(quiet[name], found, strict=True)]
+        cells = (_held(ratio, "busy", row["gaussians"], ".1f") for ratio, row in ratios)
+        main.append([f"{name}, wall beside two busy processes over that", *cells])
+    for backend, peaks in memory.items():
+        name = "peak memory" if backend == "numba" else ""  # torch is held to nothing
+        cells = (_held(mb, name, count, ".0f") for count, mb in peaks.items())
+        main.append([f"peak memory over importing, {backend}, MiB", *cells])
     stages = [[name, *(f"{row['wall_s'] * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
     savings = [row for found in tables["left out"].values() for row in found]
     whole = savings[0]["wall_s"]
     left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", f"{row['wall_s'] / whole:.2f}"] for row in savings]
     grows = ", ".join(f"{name}^{power:.2f}" for name, power in exponents.items())
     return (
-        markdown_table(f"Wall clock, median (least to largest); target; {SIZE[1]}x{SIZE[0]}", counts, main)
+        markdown_table(f"Wall clock, median (least to largest), and ratios; target; {SIZE[1]}x{SIZE[0]}", counts, main)
         + markdown_table("Parts of a training step, ms", counts, stages)
         + markdown_table(f"Left out, {savings[0]['gaussians']} Gaussians", ["ms", "of everything"], left_out)
         + f"Time grows as {grows} (pixels: at one count). Calibration: exp {unit * 1e9:.2f} ns per element.\n"
@@ -211,6 +247,10 @@ def _markdown(rows: list[Row], memory: dict[int, float], unit: float, exponents:
 
 
 def _cell(row: Row) -> str:
-    wall, best, worst = (1e3 * row[f"{name}_s"] for name in ("wall", "best", "worst"))
-    held = "" if row["target_s"] is None else f"; {row['target_s'] * 1e3:.0f}"
-    return f"{wall:.0f} ({best:.0f} to {worst:.0f}) ms{held}"
+    return "{:.0f} ({:.0f} to {:.0f}) ms".format(*(1e3 * row[f"{name}_s"] for name in ("wall", "best", "worst")))
+
+
+def _held(value: float, name: str, count: int, digits: str) -> str:
+    """A number, and what it is held to."""
+    target = TARGETS.get(name, {}).get(count)
+    return f"{value:{digits}}" + ("" if target is None else f"; {target:g}")

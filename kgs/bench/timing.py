@@ -1,8 +1,11 @@
 """Measuring time on a machine that others use too: cases take turns, medians are reported with their spread."""
 
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -44,6 +47,18 @@ def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch
             wall, cpu = time.perf_counter(), time.process_time()
     times = {name: tuple(zip(*pairs, strict=True)) for name, pairs in found.items()}
     return {n: Times(statistics.median(w), min(w), max(w), statistics.median(c)) for n, (w, c) in times.items()}
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Processes that do nothing but keep cores busy, while the block runs."""
+    busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def seconds_of_exp(device: torch.device) -> float:
