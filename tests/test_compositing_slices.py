@@ -9,7 +9,7 @@ from factories import random_camera, random_gaussians
 from oracles import near_threshold
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kgs import composite, project
+from kgs import backends, composite, project
 from kgs.raster.tasks import Slice
 from kgs.raster.tiles import bin_to_tiles
 
@@ -104,7 +104,14 @@ def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
 
 
 @pytest.fixture
-def made(monkeypatch):
+def torch_alone(monkeypatch):
+    """For what looks inside the torch implementation."""
+    stages = {stage: {"torch": there["torch"]} for stage, there in backends._registry.items()}
+    monkeypatch.setattr(backends, "_registry", stages)
+
+
+@pytest.fixture
+def made(monkeypatch, torch_alone):
     """The slices that are made from here on."""
     found, init = [], Slice.__init__
 
@@ -189,7 +196,7 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, made, monk
 
 
 @pytest.fixture
-def as_on_a_gpu(monkeypatch):
+def as_on_a_gpu(monkeypatch, torch_alone):
     """Scans and sizes of steps as a GPU gets them."""
     made = Slice.__init__
 

@@ -26,12 +26,21 @@ slices, nearest first, with lists for the tiles that still have light alone: wha
 
 from torch import Tensor
 
-from kgs.backends import choose, register
+from kgs.backends import choose, compiled_covers, register
 from kgs.types import Composited, ProjectedGaussians, RasterOptions, check_tensor
 
 from .torch_passes import composite_torch
 
+
+def _compiled_covers(
+    projected: ProjectedGaussians, features: Tensor, options: RasterOptions, _: bool, chunk_size: int | None
+) -> bool:
+    narrow = projected.image_size[1] < 2**18  # columns of tiles are numbers of 15 bits there
+    return compiled_covers(features) and options.tile_size == 8 and chunk_size is None and narrow
+
+
 register("compositing", "torch", composite_torch)
+register("compositing", "numba", "kgs.raster.compiled_passes:composite_compiled", _compiled_covers)
 
 
 def composite(  # noqa: D417 - options are described in one place

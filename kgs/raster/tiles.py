@@ -124,17 +124,8 @@ class Reach:
 
     def row_slices(self, max_bytes: int, per_span: int, per_entry: int) -> list[tuple[int, int]]:
         """Consecutive rows whose spans and entries take at most `max_bytes` together; an error where one takes more."""
-        slices, begin, total = [], 0, 0
-        for row, need in enumerate((self.spans_per_row * per_span + self.entries_per_row * per_entry).tolist()):
-            if need > max_bytes:
-                got = f"expected at least that, got {max_bytes} for it"
-                ways = "raise max_bytes, or render fewer or smaller Gaussians"
-                raise ValueError(f"max_bytes: one row of tiles needs {need} bytes, {got}; {ways}")
-            if total + need > max_bytes:
-                slices.append((begin, row))
-                begin, total = row, 0
-            total += need
-        return [*slices, (begin, self.total_rows)]
+        needs = self.spans_per_row * per_span + self.entries_per_row * per_entry
+        return row_slices(needs.tolist(), max_bytes)
 
     def depth_slices(self, layers: int) -> list[tuple[int, int]]:
         """Consecutive ranges of `ids`, nearest first, of about `layers` entries per tile each."""
@@ -204,6 +195,21 @@ class Reach:
         offsets = F.pad(torch.cumsum(torch.bincount(keys, minlength=num_tiles), 0), (1, 0))
         entries, ids = entries.index_select(0, order), self.ids[low:high]
         return TileLists(self.tile_size, self.grid, begin * columns, offsets, entries, ids, order)
+
+
+def row_slices(needs: list[int], max_bytes: int) -> list[tuple[int, int]]:
+    """Consecutive rows of tiles that need at most `max_bytes` together; an error where one needs more."""
+    slices, begin, total = [], 0, 0
+    for row, need in enumerate(needs):
+        if need > max_bytes:
+            got = f"expected at least that, got {max_bytes} for it"
+            ways = "raise max_bytes, or render fewer or smaller Gaussians"
+            raise ValueError(f"max_bytes: one row of tiles needs {need} bytes, {got}; {ways}")
+        if total + need > max_bytes:
+            slices.append((begin, row))
+            begin, total = row, 0
+        total += need
+    return [*slices, (begin, len(needs))]
 
 
 def bin_to_tiles(

@@ -1,0 +1,140 @@
+"""Lists of tiles, laid out for the kernels: what each Gaussian reaches, row slices, and in these bands.
+
+The lists of a band, some rows of tiles, are made and used by one thread. A Gaussian has a number of its own in each
+band that it reaches, its member in depth order: what a band reads of its Gaussians and adds up for them lies close
+together, however many there are in the picture. Members are few more than Gaussians, which are small.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .binning import (
+    SIZE,
+    begin_spans,
+    count_entries,
+    count_rows,
+    fill_entries,
+    fill_tables,
+    find_members,
+    find_rows,
+    find_spans,
+    sort_by_depth,
+)
+from .threads import over
+
+BANDS = 16
+
+
+@dataclass(frozen=True)
+class Band:
+    """The lists of the tiles in some rows, front to back."""
+
+    first_tile: int
+    members: slice  # of the members of its slice
+    table: NDArray[np.float32]  # of its members
+    offsets: NDArray[np.int64]  # (T + 1,); the entries of its tile t are offsets[t]:offsets[t + 1]
+    entries: NDArray[np.int32]  # numbers of members
+
+
+@dataclass(frozen=True)
+class RowSlice:
+    """Some rows of tiles: the spans in them, and how they are divided into bands."""
+
+    first_row: int
+    starts: NDArray[np.int64]  # (n + 1,)
+    spans: NDArray[np.int32]
+    bounds: NDArray[np.int64]  # (B + 1,), rows
+    offsets: NDArray[np.int64]  # (B + 1,); the members of band b are members[offsets[b]:offsets[b + 1]]
+    members: NDArray[np.int32]  # positions in depth order
+
+
+class Reach:
+    """The rows of tiles that each Gaussian reaches; lists are made from it, a row slice and a band at a time.
+
+    Attributes:
+        grid: (rows, columns) of tiles in one image.
+        total_rows: rows of tiles of all cameras.
+        ids: `(n,)`, the Gaussians that reach a row of tiles, in depth order.
+        ranks: `(M,)`, position in `ids`, or -1.
+        spans_per_row, entries_per_row: `(total_rows,)`.
+    """
+
+    def __init__(
+        self,
+        arrays: Sequence[NDArray[Any]],
+        image_size: tuple[int, int],
+        cameras: int,
+        rules: tuple[np.float32, np.float32],
+        channels: int,
+        median_depth: bool,
+        max_spans: int,
+        threads: int,
+    ) -> None:
+        height, self._width = image_size
+        self.grid = -(-height // SIZE), -(-self._width // SIZE)
+        self.total_rows, self._over = cameras * self.grid[0], partial(over, threads)
+        means2d, factors, opacities, features, depths, camera_ids = arrays
+        m = len(depths)
+        rows, ids, self.ranks = np.empty((m, 2), np.int32), *np.empty((2, m), np.int32)
+        self._over(m, find_rows, means2d, factors, opacities, *rules, height, rows)
+        self.ids = ids = ids[: sort_by_depth(depths.view(np.uint32), rows, ids, self.ranks)]
+        n, width = len(ids), 7 + channels + median_depth
+        self.heads, self.geometry = np.empty((n, 2), np.int32), np.empty((n, 8), np.float32)
+        self.table = np.empty((n, width), np.float32)
+        inputs = (means2d, factors, opacities, features, depths, camera_ids, *rules, self.grid[0], rows, channels)
+        self._over(n, fill_tables, ids, *inputs, self.heads, self.geometry, self.table)
+        self._count(max_spans)
+
+    def _count(self, max_spans: int) -> None:
+        """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
+        ends, n = np.cumsum(self.heads[:, 1]), len(self.ids)
+        total = int(ends[-1]) if n else 0
+        bounds = [0, *np.unique(np.searchsorted(ends, range(max_spans, total, max_spans))).tolist(), n]
+        self.spans_per_row, self.entries_per_row = np.zeros((2, self.total_rows), np.int64)
+        self._all = None
+        for low, high in pairwise(bounds):
+            spans = self._spans(0, self.total_rows, low, high)
+            count_rows(self.heads[low:high], *spans, self.spans_per_row, self.entries_per_row)
+            self._all = spans if len(bounds) == 2 else None
+
+    def _spans(self, begin, end, low, high):
+        """Where the spans of each Gaussian start, and the spans of the Gaussians `low` to `high` in some rows."""
+        heads, starts = self.heads[low:high], np.empty(high - low + 1, np.int64)
+        begin_spans(heads, begin, end, starts)
+        spans = np.empty(starts[-1], np.int32)
+        rest = (begin, end, self.grid[0], self._width, heads, self.geometry[low:high], starts, spans)
+        self._over(high - low, find_spans, *rest)
+        return starts, spans
+
+    def row_slice(self, begin: int, end: int) -> RowSlice:
+        """The rows `begin` to `end` (exclusive), in bands of about equal work."""
+        if self._all is None or (begin, end) != (0, self.total_rows):
+            self._all = None
+            starts, spans = self._spans(begin, end, 0, len(self.ids))
+        else:
+            starts, spans = self._all
+        work = np.cumsum(self.entries_per_row + self.grid[1])
+        before = work[begin - 1] if begin else 0
+        count = max(1, round(BANDS * (work[end - 1] - before) / work[-1]))
+        targets = before + np.arange(1, count) * (work[end - 1] - before) / count
+        bounds = np.unique([begin, *(np.searchsorted(work, targets) + 1), end])
+        offsets, members = np.zeros(len(bounds), np.int64), np.empty(len(spans), np.int32)
+        band_of_row = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+        find_members(self.heads, begin, end, band_of_row, offsets, members)
+        return RowSlice(begin, starts, spans, bounds, offsets, members[: offsets[-1]])
+
+    def band(self, part: RowSlice, b: int) -> Band:
+        """The lists of a band."""
+        (begin, end), own, columns = part.bounds[b : b + 2], slice(*part.offsets[b : b + 2]), self.grid[1]
+        members, offsets = part.members[own], np.zeros((end - begin) * columns + 1, np.int64)
+        spans = (part.first_row, columns, self.heads, part.starts, part.spans, members)
+        count_entries(begin, end, *spans, offsets)
+        entries, rows = np.empty(offsets[-1], np.int32), np.empty((len(members), self.table.shape[1]), np.float32)
+        fill_entries(begin, end, *spans, self.table, offsets, entries, rows)
+        return Band(begin * columns, own, rows, offsets, entries)

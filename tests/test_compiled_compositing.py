@@ -1,0 +1,300 @@
+"""Compositing by numba kernels: what torch gives in float64, the same lists, the same bits on any number of threads."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+from compositing_checks import STOP, TH, footprints, leaves
+from factories import random_camera, random_gaussians
+from oracles import near_threshold
+from tile_checks import scene
+
+import kgs
+import kgs.reference
+from kgs import GaussianRenderer, composite, project
+from kgs.raster.tiles import bin_to_tiles
+
+pytest.importorskip("numba")
+
+from kgs.compiled import compositing as kernels
+from kgs.compiled.bands import Reach
+from kgs.raster.compiled_passes import _arrays
+
+THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
+
+
+def sample(n=300, seed=1, size=(40, 56), thresholds=THRESHOLDS[0], opacities=(0.05, 1.3)):
+    """Projected Gaussians, and where float32 cannot change a decision."""
+    gaussians = random_gaussians(n, seed, torch.float32, None, max(size), opacities)
+    camera = random_camera(*size, seed, torch.float32)
+    with torch.no_grad():
+        projected = project(gaussians, camera, alpha_threshold=0.0)
+    return projected, ~near_threshold(gaussians, camera, *thresholds)
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def outcome(projected, features, certain, dtype=torch.float32, wanted=(True,) * 4, **options):
+    """Sums, light, median depth and the gradients of a loss over the pixels that are certain."""
+    options = {"backend": "numba" if dtype == torch.float32 else "torch", "median_depth": True} | options
+    values = {k: getattr(projected, k).to(dtype) for k in ("means2d", "factors", "opacities", "depths")}
+    projected, inputs = leaves(dataclasses.replace(projected, **values), features.to(dtype))
+    for x, needed in zip(inputs, wanted, strict=True):
+        x.requires_grad_(needed)
+    out = composite(projected, inputs[-1], **options)
+    image = torch.cat([out.features, out.transmittance], 1)
+    loss = (image * (random(*image.shape) * certain).to(dtype)).sum()
+    gradients = torch.autograd.grad(loss, [x for x in inputs if x.requires_grad])
+    return [x.detach() for x in (out.features, out.transmittance, out.median_depth)], gradients
+
+
+def assert_close(got, expected, certain, bound=1e-5, image_bound=2e-6):
+    (*images, median), (*expected_images, expected_median) = got[0], expected[0]
+    for a, b in zip(images, expected_images, strict=True):
+        assert a.shape == b.shape
+        assert ((a - b).abs() * certain).max() <= image_bound if a.numel() else True
+    assert ((median - expected_median).abs() * certain > 1e-5).float().mean() <= 1e-3  # T may be near one half
+    for a, b in zip(got[1], expected[1], strict=True):
+        assert (a - b).abs().max() <= bound * b.abs().max() if a.numel() else True
+
+
+@pytest.mark.parametrize("thresholds", THRESHOLDS)
+@pytest.mark.parametrize("width", [0, 1, 3, 4, 5, 8, 9, 11, 20])
+def test_any_number_of_features_is_torch_in_float64(width, thresholds):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    projected, certain = sample(thresholds=thresholds)
+    features = random(len(projected), width)
+    expected = outcome(projected, features, certain, torch.float64, **options)
+    assert_close(outcome(projected, features, certain, **options), expected, certain)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (11, 5), (1, 1), (3, 100)])
+def test_image_sizes(size):
+    projected, certain = sample(60, size=size)
+    expected = outcome(projected, projected.colors, certain, torch.float64)
+    assert_close(outcome(projected, projected.colors, certain), expected, certain)
+
+
+def test_several_cameras_do_not_mix():
+    projected, certain = scene(0, cameras=3), torch.ones(())
+    features = random(len(projected), 3)
+    expected = outcome(projected, features, certain, torch.float64, alpha_threshold=0.0, transmittance_stop=0.0)
+    got = outcome(projected, features, certain, alpha_threshold=0.0, transmittance_stop=0.0)
+    assert_close(got, expected, certain)
+
+
+@pytest.mark.parametrize("width", [0, 3])
+def test_no_gaussians(width):
+    projected, certain = sample(0)
+    (sums, light, median), gradients = outcome(projected, torch.zeros(0, width), certain)
+    assert sums.shape == (1, width, 40, 56)
+    assert not sums.any()
+    assert not median.any()
+    assert (light == 1).all()
+    assert [len(x) for x in gradients] == [0] * 4
+
+
+def test_the_renderer_is_the_reference():
+    for seed in range(3):
+        gaussians, camera = random_gaussians(120, seed, torch.float32, 2), random_camera(40, 56, seed, torch.float32)
+        certain = ~near_threshold(gaussians, camera, TH, STOP)
+        image = GaussianRenderer(backend="numba")(gaussians, camera).image
+        assert ((image - kgs.reference.render(gaussians, camera)).abs() * certain).max() <= 5e-6
+
+
+# -- lists ---------------------------------------------------------------------------------------------------------
+
+
+def reach_of(projected, threshold=TH, max_spans=2**40):
+    inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
+    arrays = _arrays(*inputs, projected.depths, projected.camera_ids)
+    rules = np.float32(projected.eps2d), np.float32(threshold)
+    return Reach(arrays, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
+
+
+@pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])
+@pytest.mark.parametrize(("cameras", "threshold"), [(1, TH), (3, TH), (2, 0.0)])
+def test_lists_are_those_of_torch(cameras, threshold, rows):
+    for seed in range(4):
+        projected = scene(seed, cameras=cameras)
+        off = torch.rand(len(projected), generator=torch.Generator().manual_seed(seed)) < 0.2
+        depths = projected.depths.round(decimals=1) - 4  # ties, and both signs
+        depths[::7] = -0.0
+        opacities = projected.opacities.masked_fill(off, 0.0)
+        projected = dataclasses.replace(projected, depths=depths, opacities=opacities)
+        bins, reach = bin_to_tiles(projected, 8, threshold), reach_of(projected, threshold)
+        begin, end = rows or (0, reach.total_rows)
+        expected = torch.tensor_split(bins.ids[bins.entries.long()], bins.offsets[1:-1])
+        part, tile = reach.row_slice(begin, end), begin * bins.grid[1]
+        for b in range(len(part.bounds) - 1):
+            band = reach.band(part, b)
+            assert band.first_tile == tile
+            ids = reach.ids[part.members[band.members][band.entries]]
+            assert not off[torch.from_numpy(ids)].any()
+            for got in np.split(ids, band.offsets[1:-1]):
+                assert got.tolist() == expected[tile].tolist()
+                tile += 1
+        assert tile == end * bins.grid[1]
+
+
+@pytest.mark.parametrize("max_spans", [2**40, 200, 1])
+def test_rows_hold_what_was_counted(max_spans):
+    projected = scene(0, cameras=2)
+    reach, bins = reach_of(projected, max_spans=max_spans), bin_to_tiles(projected)
+    assert torch.equal(torch.from_numpy(reach.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
+    assert reach.spans_per_row.tolist() == [len(reach.row_slice(row, row + 1).spans) for row in range(12)]
+
+
+# -- bits ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def threads():
+    """Sets the number of torch's threads and puts it back."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def bits(projected, features, **options):
+    images, gradients = outcome(projected, features, torch.ones(()), **options)
+    return [*images, *gradients]
+
+
+@pytest.mark.parametrize("max_bytes", [2**30, 2**18])
+def test_the_same_bits_on_any_number_of_threads(threads, max_bytes):
+    projected, _ = sample(3000, size=(80, 112))
+    threads(1)
+    first = bits(projected, projected.colors, max_bytes=max_bytes)
+    for count in (1, 2, 3, 4):
+        threads(count)
+        got = bits(projected, projected.colors, max_bytes=max_bytes)
+        assert all(torch.equal(a, b) for a, b in zip(got, first, strict=True))
+
+
+def test_what_is_asked_for_beside_the_image_does_not_change_its_bits():
+    projected, _ = sample()
+    features = random(len(projected), 20)
+    first = composite(projected, features[:, :3], backend="numba")
+    for width in (3, 4, 6, 8, 9, 12, 20):
+        for median in (False, True):
+            out = composite(projected, features[:, :width], median_depth=median, backend="numba")
+            assert torch.equal(out.features[:, :3], first.features)
+            assert torch.equal(out.transmittance, first.transmittance)
+
+
+@pytest.mark.parametrize("width", [3, 11])
+def test_row_slices_change_nothing(width):
+    projected, certain = sample(800, size=(80, 112))
+    features = random(len(projected), width)
+    whole = outcome(projected, features, certain)
+    for max_bytes in (2**20, 2**18):
+        sliced = outcome(projected, features, certain, max_bytes=max_bytes)
+        assert all(torch.equal(a, b) for a, b in zip(sliced[0], whole[0], strict=True))
+        assert_close(sliced, whole, certain, 2e-6)
+    with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 3000 for it"):
+        composite(projected, features, max_bytes=3000, backend="numba")
+
+
+# -- differentiation -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wanted", [(0, 0, 0, 1), (0, 0, 1, 0), (1, 1, 0, 0), (1, 1, 1, 0)])
+def test_only_what_is_wanted_is_differentiated(wanted):
+    projected, certain = sample()
+    features = random(len(projected), 11)
+    _, all_of_them = outcome(projected, features, certain)
+    _, some = outcome(projected, features, certain, wanted=tuple(map(bool, wanted)))
+    expected = [x for x, needed in zip(all_of_them, wanted, strict=True) if needed]
+    assert all(torch.equal(a, b) for a, b in zip(some, expected, strict=True))
+
+
+def test_backward_again_without_graph_and_in_inference_mode():
+    projected, inputs = leaves(sample()[0], random(100000, 3)[: len(sample()[0])])
+    out = composite(projected, inputs[-1], backend="numba")
+    loss = out.features.square().sum() + out.transmittance.sum()
+    first = torch.autograd.grad(loss, inputs, retain_graph=True)
+    assert all(
+        torch.equal(a, b) for a, b in zip(torch.autograd.grad(loss, inputs, retain_graph=True), first, strict=True)
+    )
+    with pytest.raises(RuntimeError, match="expected backward without create_graph, there is no second derivative"):
+        torch.autograd.grad(loss, inputs, create_graph=True)
+    with torch.inference_mode():
+        assert torch.equal(composite(projected, inputs[-1], backend="numba").features, out.features)
+
+
+def test_gradients_that_are_views_and_inputs_that_are_not_contiguous():
+    projected, _ = sample()
+    features = random(6, len(projected)).t()[:, ::2]
+    factors = projected.factors.permute(2, 1, 0).contiguous().permute(2, 1, 0)
+    strided, inputs = leaves(dataclasses.replace(projected, factors=factors), features)
+    plain, plain_inputs = leaves(projected, features.contiguous())
+    for p, x in ((strided, inputs), (plain, plain_inputs)):
+        out = composite(p, x[-1], backend="numba")
+        (out.features.mean() + out.transmittance.sum()).backward()
+    assert all(torch.equal(a.grad, b.grad) for a, b in zip(inputs, plain_inputs, strict=True))
+
+
+# -- numbers at the border -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("opacity", [1e-30, 0.5, 0.99, 1.0, 2.0, 1e6, 1e38, torch.inf])
+@pytest.mark.parametrize("threshold", [0.0, TH])
+def test_opacities_from_nothing_to_everything(opacity, threshold):
+    layers = footprints([opacity, 0.5], [[5.2, 4.1], [7.0, 3.0]], 2 * random(2, 2, 3), size=(24, 40), eps2d=0.3)
+    certain, features = torch.ones(()), random(2, 3)
+    expected = outcome(layers, features, certain, torch.float64, alpha_threshold=threshold)
+    got = outcome(layers, features, certain, alpha_threshold=threshold)
+    assert_close(got, expected, certain, 2e-5, 2e-6 + 1e-6 * max(0, math.log2(min(opacity, 1e38))))
+
+
+@pytest.mark.parametrize("field", ["means2d", "factors", "opacities"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e9, 1e12])
+def test_what_is_not_finite_or_overflows_is_as_in_torch(field, value):
+    layers = footprints([0.7, 0.5, 0.6], 20 * torch.rand(3, 2), 2 * random(3, 2, 3), size=(24, 40), eps2d=0.3)
+    changed = getattr(layers, field).clone()
+    changed[1] = value if field != "factors" else value * torch.eye(2, 3)
+    layers = dataclasses.replace(layers, **{field: changed})
+    features, single = random(3, 3), {"backend": "torch"}
+    expected = outcome(layers, features, torch.ones(()), torch.float32, **single)
+    assert all(x.isfinite().all() for x in expected[0])
+    got = outcome(layers, features, torch.ones(()))
+    assert_close((got[0], ()), (expected[0], ()), torch.ones(()), image_bound=5e-5)
+    assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(got[1], expected[1], strict=True) if b.isfinite().all())
+
+
+# -- speed ---------------------------------------------------------------------------------------------------------
+
+FLOATS = r"(?:fn?m(?:add|sub)\d*|mul|add|sub)"
+PACKED = rf"\tv?{FLOATS}ps\b.*[yz]mm|\tf(?:mla|mls|mul|add|sub)(?:\.4s|\tv\d+\.4s)"  # x86, arm
+SCALAR = rf"\tv?{FLOATS}ss\b|\tf(?:n?m(?:add|sub)|mul|add|sub)\ts\d"
+
+
+@pytest.mark.parametrize("kernel", [kernels.composite_forward, kernels.composite_backward], ids=["forward", "backward"])
+def test_pixels_are_the_lanes(kernel):
+    """LLVM leaves a loop scalar without a word: see the rules in `kgs.compiled`."""
+    import numba as nb
+
+    f, i8 = nb.float32, nb.int64
+    types = {"grid": nb.types.UniTuple(i8, 2), "offsets": i8[::1], "entries": nb.int32[::1], "table": f[:, ::1]}
+    types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3), "median": nb.types.Tuple(())}
+    types |= {
+        "starts": f[:, ::1],
+        "done": i8[::1],
+        "light": f[:, :, ::1],
+        "depths": f[:, :, ::1],
+        "grad_light": f[:, :, ::1],
+    }
+    types |= {"grads": f[:, :, :, ::1], "moments": nb.boolean, "colors": nb.boolean}
+    types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
+    names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
+    fresh = nb.njit(**{k: kernel.targetoptions[k] for k in ("nogil", "fastmath", "error_model")})(kernel.py_func)
+    fresh.compile(tuple(types.get(name, i8) for name in names))
+    (assembly,) = fresh.inspect_asm().values()
+    packed, scalar = (len(re.findall(pattern, assembly)) for pattern in (PACKED, SCALAR))
+    assert packed > max(60, 1.5 * scalar)
