@@ -28,13 +28,12 @@ def add_scores(threads, image, mean, variance, flat, warped, plane, best, second
     over(threads, bands, enter_scores, image, mean, variance, flat, warped, plane, best, second, pieces=bands)
 
 
-def semi_global(threads, cost, grey, prices):
-    """Costs with those of smooth surfaces along eight directions added, `total`."""
-    total = np.zeros_like(cost)
+def semi_global(threads, cost, grey, prices, total):
+    """Costs with those of smooth surfaces along eight directions added."""
+    total[:] = ZERO
     for dy, dx in DIRECTIONS:
         groups = -(-(cost.shape[1] if dy else cost.shape[0]) // PATHS)
         over(threads, groups, add_paths, cost, grey, dy, dx, prices, total, pieces=groups)
-    return total
 
 
 @inline
@@ -59,11 +58,12 @@ def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, s
             for p in range(planes):
                 s0, s1, s2, s3 = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3]
                 for x in range(width):
+                    s0[HALO + x] += np.float64(warped[p, 0, below, x]) - kept * np.float64(warped[p, 0, above, x])
+                    s3[HALO + x] += np.float64(warped[p, 1, below, x]) - kept * np.float64(warped[p, 1, above, x])
+                for x in range(width):
                     new, old = warped[p, 0, below, x], warped[p, 0, above, x]
-                    s0[HALO + x] += np.float64(new) - kept * np.float64(old)
                     s1[HALO + x] += np.float64(new * new) - kept * np.float64(old * old)
                     s2[HALO + x] += np.float64(image[below, x] * new) - kept * np.float64(image[above, x] * old)
-                    s3[HALO + x] += np.float64(warped[p, 1, below, x]) - kept * np.float64(warped[p, 1, above, x])
                 if y < band * BAND:
                     continue
                 for x in range(HALO):
@@ -78,11 +78,10 @@ def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, s
             if y >= band * BAND:
                 for x in range(width):
                     for p in range(planes):
-                        score, first = scores[p, x], best[y, x, plane + p]
+                        score, first, other = scores[p, x], best[y, x, plane + p], second[y, x, plane + p]
                         lower = score if score < first else first
                         best[y, x, plane + p] = first if score < first else score
-                        if lower > second[y, x, plane + p]:
-                            second[y, x, plane + p] = lower
+                        second[y, x, plane + p] = lower if lower > other else other
 
 
 @exact

@@ -8,7 +8,7 @@ from kgs.compiled.sweep import add_scores, semi_global
 
 from .plane_sweep import EDGE, JUMP, LEAST_JUMP, STEP, VARIANCE, moments, warp
 
-_AT_ONCE = 16  # planes
+_AT_ONCE = 8  # planes: with 16, rows of scores and of volumes drive each other out of the cache
 
 
 def compiled_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
@@ -19,13 +19,12 @@ def compiled_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tuple
     for other, turns in zip(others, homographies, strict=True):
         layers = (other, torch.ones_like(other))
         for first, some in enumerate(turns.split(_AT_ONCE)):
-            warped = torch.stack([warp(layer, turn) for turn in some for layer in layers]).unflatten(0, (-1, 2)).numpy()
+            warped = np.stack([[warp(layer, turn).numpy() for layer in layers] for turn in some])
             add_scores(threads, grey, mean, variance, np.float32(VARIANCE), warped, first * _AT_ONCE, best, second)
     if len(others) > 1:
         best *= 0.75
         second *= 0.25
         best += second
-    del second
     prices = tuple(np.float32(price) for price in (STEP, JUMP * EDGE, EDGE, LEAST_JUMP))
-    costs = semi_global(threads, 1.0 - best, grey, prices)
-    return torch.from_numpy(costs).permute(2, 0, 1), torch.from_numpy(best).permute(2, 0, 1)
+    semi_global(threads, 1.0 - best, grey, prices, second)
+    return torch.from_numpy(second).permute(2, 0, 1), torch.from_numpy(best).permute(2, 0, 1)
