@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from .harmonics import SH_C0
+from .memory import empty
 from .neighbours import log_spacing
 from .types import SH_SIZES, Gaussians, check_tensor
 
@@ -122,7 +123,7 @@ class GaussianModel(nn.Module):
         """The Gaussians with activated values and the active bands only."""
         colors: Tensor = self.sh_dc
         if self.sh_degree > 0:  # else sh_rest has no gradient at all, and an optimiser leaves it alone
-            colors = torch.cat([self.sh_dc, self.sh_rest[:, : SH_SIZES[self.sh_degree] - 1]], dim=1)
+            colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
         # where exp is infinite (that Gaussian is not drawn) its gradient would be 0 times infinity
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
@@ -157,6 +158,25 @@ class GaussianModel(nn.Module):
     def extra_repr(self) -> str:
         """What `print(model)` shows."""
         return f"{len(self)} Gaussians, sh_degree={self.sh_degree} of {self.max_sh_degree}, {self.means.dtype}"
+
+
+class _JoinedBands(torch.autograd.Function):
+    """The first bands of all harmonics: `torch.cat`, in memory of `kgs.memory`, the gradients too."""
+
+    @staticmethod
+    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:
+        ctx.rest, ctx.bands = sh_rest.shape, bands
+        joined = empty((len(sh_dc), bands, 3), sh_dc)
+        joined[:, :1], joined[:, 1:] = sh_dc, sh_rest[:, : bands - 1]
+        return joined
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        first, rest = grad[:, :1], None
+        if ctx.needs_input_grad[1]:
+            rest = empty(ctx.rest, grad)
+            rest[:, : ctx.bands - 1], rest[:, ctx.bands - 1 :] = grad[:, 1:], 0.0
+        return first, rest, None
 
 
 def _check_degree(value: int, most: int) -> int:

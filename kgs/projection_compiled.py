@@ -13,6 +13,7 @@ from .camera import Cameras, tangent_limits
 from .compiled.projection import BLOCK, footprint_gradients, footprints
 from .compiled.threads import over
 from .full_precision import full_precision
+from .memory import empty
 from .projection import finite_gaussians, inverse_turn, project_torch, seen_within
 from .types import Gaussians, ProjectedGaussians, RasterOptions
 
@@ -73,7 +74,7 @@ class _Projection(torch.autograd.Function):
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
         inputs, begin = ctx.saved_tensors, 0
         means, quats, scales, _, colors = _fields(inputs)
-        found = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in inputs]
+        found = [empty(x.shape, x) for x in inputs]
         outs, colored = _fields(found), ctx.needs_input_grad[4] and gradients[4].shape[1] > 0
         if not colored:  # the largest by far
             outs = *outs[:4], outs[4][:, :0]

@@ -249,7 +249,13 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
     m = np.searchsorted(ids, begin)
     for g in range(begin, end):
         if c == 0:
-            d_means[g], d_quats[g], d_scales[g], d_opacities[:, g], d_colors[g] = ZERO, ZERO, ZERO, ZERO, ZERO
+            for i in range(3):
+                d_means[g, i] = d_quats[g, i] = d_scales[g, i] = ZERO
+            d_quats[g, 3] = ZERO
+            for i in range(d_opacities.shape[0]):
+                d_opacities[i, g] = ZERO
+            for i in range(d_colors.shape[1]):
+                d_colors[g, i] = ZERO
         if m == len(ids) or ids[m] != g:
             continue
         d_opacities[row, g] += g_opacities[m]

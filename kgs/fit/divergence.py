@@ -22,7 +22,10 @@ def parameter_fault(model: GaussianModel) -> str:
 def gradient_fault(model: GaussianModel) -> str:
     """The first gradient whose square, which Adam keeps, is not finite (from 1e19 on); "" where there is none."""
     for name, parameter in model.named_parameters():
-        if parameter.grad is not None and not math.isfinite(float(parameter.grad.square().sum())):
+        if parameter.grad is None:
+            continue
+        flat = parameter.grad.flatten()
+        if not math.isfinite(float(torch.dot(flat, flat))):  # without a tensor of squares
             row = _first_row(~torch.isfinite(parameter.grad.square()))
             whose = "all Gaussians together" if row is None else f"Gaussian {row}"
             return f"expected gradients below 1e19, got others in {name} of {whose}"
