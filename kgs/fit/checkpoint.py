@@ -132,6 +132,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
             raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
+    asked["minutes"] = config.minutes or state["config"].get("minutes")  # unless given, the steps say it
     asked |= {"backend": state["backend"]} if config.backend == "auto" else {}
     if steps == done < config.steps:
         asked["steps"] = steps

@@ -105,7 +105,7 @@ def fit(
     loaded = _load(request)
     height, width = loaded.train.images.shape[-2:]
     say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
-    if width * height > 1e6 and config.device == "cpu":
+    if width * height > 1e6 and config.device == "cpu" and config.minutes is None:
         megapixels, minutes = width * height / 1e6, width * height * config.steps / 1.5e9
         say(f"{megapixels:.1f} Mpx on a CPU: expect about {minutes:.0f} minutes; see --downscale")
     metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)

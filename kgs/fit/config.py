@@ -95,6 +95,8 @@ class FitConfig:
 
     Args:
         steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
+        minutes: from first points to the last step, in the place of `steps`: :func:`kgs.fit.fit_scene` and the command
+            fix the steps once, after a warm-up, to within a tenth; a resumed fit keeps them. A Trainer goes by `steps`.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         drop_by: random is the method. The others drop by scores, for comparison: the Gaussians with the highest or
@@ -125,6 +127,7 @@ class FitConfig:
     """
 
     steps: _Steps = 2000
+    minutes: Annotated[float | None, _Range(0, 1e6, "(]")] = None
     drop: Annotated[float, _Range(0, 1, "[)")] = 0.2
     drop_schedule: Literal["linear", "constant"] = "linear"
     drop_by: Literal["random", "high-gradient", "low-gradient", "near", "far"] = "random"
@@ -213,8 +216,9 @@ def _plain(value: Any, hint: Any) -> tuple[Any, str]:
     if get_origin(hint) is not Annotated:
         return value if isinstance(value, hint) else None, "a name" if hint is str else f"a {hint.__name__}"
     kind, limits = get_args(hint)
-    word, python = ("finite", float) if kind is float else ("whole", int)
-    is_number = isinstance(value, Real if kind is float else Integral) and not isinstance(value, bool)
+    real = float in (kind, *get_args(kind))
+    word, python = ("finite", float) if real else ("whole", int)
+    is_number = isinstance(value, Real if real else Integral) and not isinstance(value, bool)
     return python(value) if is_number and limits.holds(value) else None, f"a {word} number {limits}"
 
 

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, lock
 from .lpips import Lpips
 from .machine import check_device, peak_rss_mb, versions
 from .metrics import evaluate
+from .minutes import steps_within
 from .outputs import check_folder, is_own, png_names, write_json, write_png
 from .progress import Stage, each, progress, say, silent
 from .starts import FirstPoints, first_points
@@ -96,8 +98,12 @@ def fit_scene(
         else:
             if is_own(out / "splat.ply"):
                 say(f"{out}: the fit there will be replaced when this one is done (--resume would go on with it)")
+            begun = time.perf_counter()
             points = choose_points(scene, config, each)
             say(f"first points: {len(points.points)} ({points.kind})")
+            if config.minutes is not None:
+                config = replace(config, steps=steps_within(scene, config, points, begun))
+                say(f"{config.minutes:g} minutes: {config.steps} steps")
             trainer = Trainer(scene, config, points)
             say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
@@ -109,7 +115,7 @@ def fit_scene(
                 new.mkdir()
                 trainer.save(new / CHECKPOINT)  # first points may have taken a minute
                 trainer.saved = saved
-            settings = {"request": request or {}, "fit": config.to_dict(), "timetable": trainer.times._asdict()}
+            settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
             write_json(new / "config.json", settings)
             stopped_by = train(trainer, new / CHECKPOINT)

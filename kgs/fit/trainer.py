@@ -7,6 +7,7 @@ import copy
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -225,9 +226,13 @@ class Trainer:
         """
         state, damage = newest_checkpoint(path)
         trainer = cls.__new__(cls)
-        trainer._prepare(scene, config)
         try:
+            if config.minutes is not None:
+                config = replace(config, steps=state["config"]["steps"])
+            trainer._prepare(scene, config)
             trainer.load_state_dict(state)
+        except (KeyError, TypeError) as error:
+            raise DataError(path, "config", "expected the configuration of a fit, got another") from error
         except ValueError as error:
             field, _, reason = str(error).partition(": ")
             raise DataError(path, field, reason) from error
