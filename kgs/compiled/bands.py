@@ -24,6 +24,7 @@ from .binning import (
     find_members,
     find_rows,
     find_spans,
+    gather_rows,
     sort_by_depth,
 )
 from .threads import over
@@ -52,6 +53,9 @@ class RowSlice:
     bounds: NDArray[np.int64]  # (B + 1,), rows
     offsets: NDArray[np.int64]  # (B + 1,); the members of band b are members[offsets[b]:offsets[b + 1]]
     members: NDArray[np.int32]  # positions in depth order
+    table: NDArray[np.float32]  # for `Band`, as the next: parts of large arrays are faster to get than small ones
+    entries: NDArray[np.int32]
+    entry_offsets: NDArray[np.int64]  # (B + 1,); of the bands
 
 
 class Reach:
@@ -127,7 +131,10 @@ class Reach:
         offsets, members = np.zeros(len(bounds), np.int64), np.empty(len(spans), np.int32)
         band_of_row = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
         find_members(self.heads, begin, end, band_of_row, offsets, members)
-        return RowSlice(begin, starts, spans, bounds, offsets, members[: offsets[-1]])
+        ends = np.concatenate([[0], np.cumsum(self.entries_per_row[begin:end])])[bounds - begin]
+        table = np.empty((offsets[-1], self.table.shape[1]), np.float32)
+        lists = (members[: offsets[-1]], table, np.empty(ends[-1], np.int32), ends)
+        return RowSlice(begin, starts, spans, bounds, offsets, *lists)
 
     def band(self, part: RowSlice, b: int) -> Band:
         """The lists of a band."""
@@ -135,6 +142,7 @@ class Reach:
         members, offsets = part.members[own], np.zeros((end - begin) * columns + 1, np.int64)
         spans = (part.first_row, columns, self.heads, part.starts, part.spans, members)
         count_entries(begin, end, *spans, offsets)
-        entries, rows = np.empty(offsets[-1], np.int32), np.empty((len(members), self.table.shape[1]), np.float32)
-        fill_entries(begin, end, *spans, self.table, offsets, entries, rows)
+        entries, rows = part.entries[slice(*part.entry_offsets[b : b + 2])], part.table[own]
+        gather_rows(members, self.table, rows)
+        fill_entries(begin, end, *spans, offsets, entries)
         return Band(begin * columns, own, rows, offsets, entries)

@@ -21,10 +21,8 @@ _INFINITY = f32(np.inf)
 
 
 @inline
-def variances(factors, g, eps2d):
-    """Entries xx, xy, yy and determinant of M M^T + e I, see `kgs.covariance`."""
-    a0, a1, a2 = factors[g, 0, 0], factors[g, 0, 1], factors[g, 0, 2]
-    b0, b1, b2 = factors[g, 1, 0], factors[g, 1, 1], factors[g, 1, 2]
+def variances(a0, a1, a2, b0, b1, b2, eps2d):
+    """Entries xx, xy, yy and determinant of M M^T + e I for the rows a, b of M, see `kgs.covariance`."""
     xx, xy, yy = a0 * a0 + a1 * a1 + a2 * a2, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2
     u, v, w = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
     return xx + eps2d, xy, yy + eps2d, u * u + v * v + w * w + eps2d * (xx + yy) + eps2d * eps2d
@@ -40,7 +38,8 @@ def find_rows(begin, end, means2d, factors, opacities, eps2d, threshold, height,
         cut = TWO * math.log(opacities[g] / threshold) + _WIDER  # infinite for a threshold of 0
         if not cut > ZERO:
             continue
-        _, _, yy, _ = variances(factors, g, eps2d)
+        yy = factors[g, 1, 0] * factors[g, 1, 0] + factors[g, 1, 1] * factors[g, 1, 1]
+        yy += factors[g, 1, 2] * factors[g, 1, 2] + eps2d
         reach = math.sqrt(cut * yy)
         top, bottom = np.ceil(means2d[g, 1] - reach), np.floor(means2d[g, 1] + reach)
         if bottom >= ZERO and top <= f32(height - 1) and bottom >= top:  # nothing that is not a number
@@ -97,13 +96,24 @@ def fill_tables(
     channels, heads, geometry, table,
 ):  # fmt: skip
     """What is known of each Gaussian, in depth order; features are padded with 0 up to `channels`."""
-    for i in range(begin, end):
+    width = features.shape[1]
+    for i in range(begin, end):  # reads that miss the caches, many under way at a time
         g = ids[i]
         heads[i, 0] = camera_ids[g] * image_rows + rows[g, 0]
         heads[i, 1] = rows[g, 1]
-        o, x, y = opacities[g], means2d[g, 0], means2d[g, 1]
+        table[i, 0], table[i, 1], table[i, 2] = opacities[g], means2d[g, 0], means2d[g, 1]
+        for c in range(3):
+            geometry[i, c], geometry[i, 3 + c] = factors[g, 0, c], factors[g, 1, c]
+        for f in range(channels):
+            table[i, 7 + f] = features[g, f] if f < width else ZERO
+        for j in range(7 + channels, table.shape[1]):
+            table[i, j] = depths[g]
+    for i in range(begin, end):
+        o, x, y = table[i, 0], table[i, 1], table[i, 2]
+        a0, a1, a2, b0, b1, b2 = (geometry[i, 0], geometry[i, 1], geometry[i, 2], geometry[i, 3], geometry[i, 4],
+                                  geometry[i, 5])  # fmt: skip
         cut = TWO * math.log(o / threshold) + _WIDER
-        xx, xy, yy, det = variances(factors, g, eps2d)
+        xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
         geometry[i, 0], geometry[i, 1], geometry[i, 2], geometry[i, 3] = x, y, math.sqrt(cut * yy), cut
         geometry[i, 4], geometry[i, 5], geometry[i, 6] = xy / yy, det / yy, ONE / yy
         geometry[i, 7] = xy * math.sqrt(cut / xx)
@@ -115,15 +125,9 @@ def fill_tables(
         if o == _INFINITY:  # opaque everywhere
             along, across = ZERO, ZERO
         table[i, 0] = min(math.log2(o), f32(128))  # 2^128 is infinite already
-        table[i, 1], table[i, 2] = x, y
         wide = xx >= yy
         table[i, 3], table[i, 4] = (slope * across, across) if wide else (across, slope * across)
         table[i, 5], table[i, 6] = (along, ZERO) if wide else (ZERO, along)
-        width = features.shape[1]
-        for f in range(channels):
-            table[i, 7 + f] = features[g, f] if f < width else ZERO
-        for j in range(7 + channels, table.shape[1]):
-            table[i, j] = depths[g]
 
 
 @jit
@@ -197,25 +201,35 @@ def count_entries(begin, end, first_row, columns, heads, starts, spans, members,
         top, first = max(heads[i, 0], first_row), max(heads[i, 0], begin)
         for row in range(first, min(heads[i, 0] + heads[i, 1], end)):
             span = spans[starts[i] + row - top]
-            tile = (row - begin) * columns + (span & 0xFFFF) + 1
-            for c in range(span >> 16):
-                offsets[tile + c] += 1
-    for tile in range(len(offsets) - 1):
-        offsets[tile + 1] += offsets[tile]
+            tile = (row - begin) * columns + (span & 0xFFFF)
+            offsets[tile] += 1  # by how much a tile has more than the one before
+            offsets[tile + (span >> 16)] -= 1
+    total = length = 0
+    for tile in range(len(offsets)):
+        length += offsets[tile]
+        offsets[tile] = total
+        total += length
 
 
 @jit
-def fill_entries(begin, end, first_row, columns, heads, starts, spans, members, table, offsets, entries, rows):
-    """The members of each tile, front to back, and the `rows` of the table of all members."""
+def gather_rows(members, table, rows):
+    """The rows of the table of all members. A loop of its own: with the next in one function both take longer."""
+    for m in range(len(members)):
+        for j in range(table.shape[1]):
+            rows[m, j] = table[members[m], j]
+
+
+@jit
+def fill_entries(begin, end, first_row, columns, heads, starts, spans, members, offsets, entries):
+    """The members of each tile, front to back."""
     cursors = offsets.copy()
     for m in range(len(members)):
         i = members[m]
-        for j in range(table.shape[1]):
-            rows[m, j] = table[i, j]
         top, first = max(heads[i, 0], first_row), max(heads[i, 0], begin)
         for row in range(first, min(heads[i, 0] + heads[i, 1], end)):
             span = spans[starts[i] + row - top]
-            tile = (row - begin) * columns + (span & 0xFFFF)
-            for c in range(span >> 16):
-                entries[cursors[tile + c]] = m
-                cursors[tile + c] += 1
+            tile = ((row - begin) * columns + (span & 0xFFFF)) & 0x7FFFFFFF  # not negative: indices wrap
+            for c in range(tile, tile + (span >> 16)):
+                at = cursors[c] & 0x7FFFFFFFFFFFFFFF
+                cursors[c] = at + 1
+                entries[at] = m

@@ -21,6 +21,7 @@ _ALPHA_MAX = f32(0.99)
 _FLOOR = f32(-126.0)  # of the exponent to base 2: below it floats are denormal
 _CENTRE = f32(0.5 * (SIZE - 1))
 _SLAB = 4 * P
+_BLOCK = 64
 
 
 @inline
@@ -258,32 +259,35 @@ def fill_gradients(
     """From moments to gradients, see `kgs.covariance.moment_gradients`; what is not wanted is empty."""
     F = d_features.shape[1] if len(d_features) else 0
     moments = len(d_opacities) > 0
-    total = np.empty(6 + F, np.float32)
-    for g in range(begin, end):
-        i = ranks[g]
-        for j in range(6 + F):
-            total[j] = totals[i, j] if i >= 0 else ZERO
-        for f in range(F):
-            d_features[g, f] = total[6 + f]
-        if not moments:
-            continue
-        xx, xy, yy, det = variances(factors, g, eps2d)
-        d_opacities[g] = total[0] / opacities[g] if i >= 0 else ZERO
-        if i < 0 or not math.isfinite(det):  # in no list, or wider than numbers reach: flat over the image
-            d_means2d[g, 0] = d_means2d[g, 1] = ZERO
-            d_factors[g] = ZERO
-            continue
-        r = ONE / det
-        d_means2d[g, 0] = (yy * total[1] - xy * total[2]) * r
-        d_means2d[g, 1] = (xx * total[2] - xy * total[1]) * r
-        a0, a1, a2 = factors[g, 0, 0], factors[g, 0, 1], factors[g, 0, 2]
-        b0, b1, b2 = factors[g, 1, 0], factors[g, 1, 1], factors[g, 1, 2]
-        u, v, w = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-        # det Q M without cancellation: rows e a + b x w and e b + w x a
-        p = eps2d * a0 + b1 * w - b2 * v, eps2d * a1 + b2 * u - b0 * w, eps2d * a2 + b0 * v - b1 * u
-        q = eps2d * b0 + v * a2 - w * a1, eps2d * b1 + w * a0 - u * a2, eps2d * b2 + u * a1 - v * a0
-        for c in range(3):
-            x, y = p[c] * r, q[c] * r
-            m, n = total[3] * x + total[4] * y, total[4] * x + total[5] * y
-            d_factors[g, 0, c] = (yy * m - xy * n) * r
-            d_factors[g, 1, c] = (xx * n - xy * m) * r
+    gathered = np.empty((_BLOCK, 6 + F), np.float32)
+    for block in range(begin, end, _BLOCK):
+        stop = min(block + _BLOCK, end)
+        for g in range(block, stop):  # reads that miss the caches, many under way at a time
+            for j in range(6 + F):
+                gathered[g - block, j] = totals[ranks[g], j] if ranks[g] >= 0 else ZERO
+        for g in range(block, stop):
+            total = gathered[g - block]
+            for f in range(F):
+                d_features[g, f] = total[6 + f]
+            if not moments:
+                continue
+            a0, a1, a2 = factors[g, 0, 0], factors[g, 0, 1], factors[g, 0, 2]
+            b0, b1, b2 = factors[g, 1, 0], factors[g, 1, 1], factors[g, 1, 2]
+            xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
+            d_opacities[g] = total[0] / opacities[g] if ranks[g] >= 0 else ZERO
+            if ranks[g] < 0 or not math.isfinite(det):  # in no list, or wider than numbers reach: flat over the image
+                d_means2d[g, 0] = d_means2d[g, 1] = ZERO
+                d_factors[g] = ZERO
+                continue
+            r = ONE / det
+            d_means2d[g, 0] = (yy * total[1] - xy * total[2]) * r
+            d_means2d[g, 1] = (xx * total[2] - xy * total[1]) * r
+            u, v, w = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+            # det Q M without cancellation: rows e a + b x w and e b + w x a
+            p = eps2d * a0 + b1 * w - b2 * v, eps2d * a1 + b2 * u - b0 * w, eps2d * a2 + b0 * v - b1 * u
+            q = eps2d * b0 + v * a2 - w * a1, eps2d * b1 + w * a0 - u * a2, eps2d * b2 + u * a1 - v * a0
+            for c in range(3):
+                x, y = p[c] * r, q[c] * r
+                m, n = total[3] * x + total[4] * y, total[4] * x + total[5] * y
+                d_factors[g, 0, c] = (yy * m - xy * n) * r
+                d_factors[g, 1, c] = (xx * n - xy * m) * r
