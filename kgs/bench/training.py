@@ -30,6 +30,7 @@ def training(*, out: Path, quick: bool = False, processes: int | None = None, sc
     """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
 
     For example:
+      kgs bench training -o training-quick --quick
       KGS_DATA=SCENES kgs bench training -o training --processes 2
 
     Writes training.jsonl, .csv, .md and .png. With KGS_DATA, a folder of scenes, also on fern.
