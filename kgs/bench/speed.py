@@ -183,7 +183,8 @@ def _scaling(rows: list[Row], fewest: int) -> dict[str, np.ndarray]:
 
 def _exponent(points: np.ndarray) -> float:
     """Slope of the line through the logarithms."""
-    return float(np.polyfit(*np.log(points).T, 1)[0])
+    x, y = np.log(points).T
+    return float(np.polyfit(x, y, 1)[0])
 
 
 def _markdown(rows: list[Row], memory: dict[int, float], unit: float, exponents: dict[str, float]) -> str:
