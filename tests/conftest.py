@@ -1,6 +1,5 @@
 """What every test may rely on."""
 
-import gc
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -18,13 +17,6 @@ from kgs.fit.starts import FirstPoints
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
-
-
-def pytest_collection_finish() -> None:
-    """What is imported by now stays: the collector need not look at its millions of objects again and again."""
-    gc.collect()
-    gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(autouse=True)
