@@ -68,10 +68,11 @@ class _InFullPrecision(torch.autograd.Function):
             inputs = [x.view_as(x) if again else x.detach().requires_grad_(n) for x, n in pairs]
             wanted = [x for x, n in zip(inputs, needed, strict=True) if n]
             result = ctx.function(*inputs)
-            found = iter([torch.zeros_like(x) for x in wanted])
-            if result.requires_grad:  # Kornia's project, for one, returns early where there are no points
+            if result.requires_grad:
                 options: Any = {"create_graph": again, "allow_unused": True, "materialize_grads": True}
                 found = iter(torch.autograd.grad(result, wanted, grad, **options))
+            else:  # Kornia's project, for one, returns early where there are no points
+                found = iter([torch.zeros_like(x) for x in wanted])
         return None, *(next(found) if n else None for n in needed)
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from start_scenes import painted_planes
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
 import kgs.losses  # noqa: F401  # has a stage to register
@@ -84,6 +85,12 @@ def points():
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
     return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
+
+
+@pytest.fixture(scope="module")
+def planes():
+    """Two painted planes of known depth in three views."""
+    return painted_planes()
 
 
 @pytest.fixture(scope="module")

@@ -187,43 +187,55 @@ def test_large_plain_images_in_small_files_are_refused_before_they_are_decoded(
 
 
 MEASURE = """
-import json, sys
+import json, os, sys
 from pathlib import Path
 from kgs.datasets.images import read_image
-def peak():
-    return int(next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]) * 1024
-def now():
-    return int(next(l for l in open("/proc/self/status") if l.startswith("VmRSS")).split()[1]) * 1024
-read_image(Path(sys.argv[2]))
-open("/proc/self/clear_refs", "w").write("5")
-before = now()
-image = read_image(Path(sys.argv[1]))
-print(json.dumps([peak() - before, image.size]))
+def status(name):
+    return int(next(l for l in open("/proc/self/status") if l.startswith(name)).split()[1]) * 1024
+for path in sys.argv[1:]:
+    child = os.fork()  # each image in a process of its own
+    if child == 0:
+        read_image(Path(path).with_name("small" + Path(path).suffix))
+        open("/proc/self/clear_refs", "w").write("5")
+        before = status("VmRSS")
+        image = read_image(Path(path))
+        print(json.dumps([Path(path).name, status("VmHWM") - before, image.size]), flush=True)
+        os._exit(0)
+    os.waitpid(child, 0)
 """
+IMAGES: dict[str, tuple[tuple[int, ...], type[np.uint8] | type[np.uint16]]] = {
+    "plain.png": ((1448, 1448), np.uint8),  # the largest that any file may be
+    "plain.jpg": ((1448, 1448, 3), np.uint8),
+    "noise.jpg": ((3000, 4000, 3), np.uint8),  # a photo of 12 megapixels
+    "deep.png": ((1448, 1448, 4), np.uint16),
+}
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, int, int]]:
+    """Of each image: the memory that reading it took, its numbers, and the bytes of its file."""
+    folder = tmp_path_factory.mktemp("images")
+    for suffix in ("png", "jpg"):
+        cv2.imwrite(str(folder / f"small.{suffix}"), np.zeros((8, 8, 3), np.uint8))
+    for name, (shape, kind) in IMAGES.items():
+        image = np.full(shape, 77, kind)
+        if name.startswith("noise"):
+            image = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
+        cv2.imwrite(str(folder / name), image)
+    command = [sys.executable, "-c", MEASURE, *(folder / name for name in IMAGES)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = map(json.loads, run.stdout.splitlines())
+    return {name: (used, values, (folder / name).stat().st_size) for name, used, values in rows}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is measured on Linux")
-@pytest.mark.parametrize(
-    ("name", "shape", "kind"),
-    [
-        ("plain.png", (1448, 1448), np.uint8),  # the largest that any file may be
-        ("plain.jpg", (1448, 1448, 3), np.uint8),
-        ("noise.jpg", (3000, 4000, 3), np.uint8),  # a photo of 12 megapixels
-        ("deep.png", (1448, 1448, 4), np.uint16),
-    ],
-)
+@pytest.mark.parametrize("name", IMAGES)
 def test_reading_an_image_takes_the_memory_that_is_foretold(
-    tmp_path: Path, name: str, shape: tuple[int, ...], kind: type[np.uint8]
+    name: str, measured: dict[str, tuple[int, int, int]]
 ) -> None:
     """At most 24 bytes per pixel, the file, and a few MiB for the decoder; docs/stiff-cases.md says so."""
-    path, small = tmp_path / name, tmp_path / f"small{Path(name).suffix}"
-    image = np.full(shape, 77, kind)
-    if name.startswith("noise"):
-        image = np.random.default_rng(0).integers(0, 255, shape, kind)
-    cv2.imwrite(str(path), image)
-    cv2.imwrite(str(small), np.zeros((8, 8, 3), np.uint8))
-    run = subprocess.run([sys.executable, "-c", MEASURE, path, small], capture_output=True, text=True, check=True)
-    used, values = json.loads(run.stdout)
+    used, values, file_bytes = measured[name]
+    shape, _ = IMAGES[name]
     pixel_count = shape[0] * shape[1]
     assert values >= 3 * pixel_count
-    assert 12 * pixel_count <= used <= 24 * pixel_count + path.stat().st_size + 8 * 2**20
+    assert 12 * pixel_count <= used <= 24 * pixel_count + file_bytes + 8 * 2**20

@@ -21,17 +21,11 @@ from start_scenes import (
     cameras,
     exact_tracks,
     flat,
-    painted_planes,
 )
 
 from kgs.datasets.scene import Views
 from kgs.fit.progress import each
 from kgs.fit.starts import FirstPoints, first_points, typical_depths
-
-
-@pytest.fixture(scope="module")
-def planes() -> Views:
-    return painted_planes()
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,12 @@ from start_scenes import (
     cameras,
     exact_tracks,
     focal_length,
-    painted_planes,
     texture,
 )
 
 from kgs.datasets.scene import Views
 from kgs.fit.starts.tracks import Tracks, find_tracks
 from kgs.fit.starts.triangulate import triangulate, triangulate_certain
-
-
-@pytest.fixture(scope="module")
-def planes() -> Views:
-    return painted_planes()
 
 
 def test_masks_leave_out_keypoints(planes: Views) -> None:

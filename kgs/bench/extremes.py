@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -36,6 +35,7 @@ def extremes(*, out: Path) -> int:
 
     For example:
       kgs bench extremes -o extremes
+      OMP_NUM_THREADS=1 kgs bench extremes -o extremes-1
 
     Writes extremes.csv, extremes.json and extremes.md in seconds; ends with exit code 1 where a bound is missed.
 
@@ -89,13 +89,8 @@ def _markdown(rows: list[Row]) -> str:
     return markdown_table("Errors (bounds), gradients relative", (*heads, "verdict", "treatment"), lines, first="case")
 
 
-def camera(size: tuple[int, int] = SIZE) -> PinholeCamera:
-    """At the origin."""
-    return centred_camera(size, FOCAL)
-
-
 def gaussians(count: int = COUNT, seed: int = 0, **changes: Any) -> Gaussians:
-    """An ordinary cloud before `camera`: two to six units deep, one to five pixels wide, harmonics of degree 1."""
+    """An ordinary cloud before the camera: two to six units deep, one to five pixels wide, harmonics of degree 1."""
     generator = torch.Generator().manual_seed(seed)
     depth = _uniform(2.0, 6.0, count, generator=generator)
     place = _uniform(-1.1, 1.1, count, 2, generator=generator) * (SIZE[1] / 2 / FOCAL)
@@ -113,7 +108,7 @@ def gaussians(count: int = COUNT, seed: int = 0, **changes: Any) -> Gaussians:
 
 def ordinary(count: int = COUNT, size: tuple[int, int] = SIZE, **changes: Any) -> Scene:
     """An ordinary cloud and its camera; `changes` make a case of it."""
-    return gaussians(count, **changes), camera(size)
+    return gaussians(count, **changes), centred_camera(size, FOCAL)
 
 
 def _uniform(low: float, high: float, *shape: int, generator: torch.Generator | None = None) -> Tensor:
@@ -138,11 +133,11 @@ def _beside_the_camera() -> Scene:
     means[:, 2] = means[:, 2].clamp_min(0.0101)
     colors = torch.randn(COUNT, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     cloud = gaussians(means=means, scales=1e-3 * SHAPE, opacities=_uniform(0.05, 0.3, COUNT))
-    return replace(cloud, colors=0.3 * colors), camera()
+    return replace(cloud, colors=0.3 * colors), centred_camera(SIZE, FOCAL)
 
 
 def _far_from_the_origin(distance: float) -> Scene:
-    shift, view = distance * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64), camera()
+    shift, view = distance * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64), centred_camera(SIZE, FOCAL)
     view.extrinsics[:, :3, 3] = -shift
     return gaussians(means=gaussians().means + shift), view
 

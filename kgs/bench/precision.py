@@ -61,6 +61,7 @@ def precision(*, out: Path, quick: bool = False) -> None:
 
     For example:
       kgs bench precision -o precision
+      kgs bench precision -o precision --quick
 
     Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
 

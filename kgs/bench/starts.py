@@ -40,6 +40,7 @@ def starts(*, out: Path, quick: bool = False) -> None:
     """Depth errors, completeness and times of the first points of a fit.
 
     For example:
+      kgs bench starts -o starts --quick
       KGS_DATA=SCENES kgs bench starts -o starts
 
     Writes starts.csv, starts.json and starts.md in 20 minutes, with --quick in 10 seconds. The synthetic scene has

@@ -16,7 +16,7 @@ from .scenes import SYNTHETIC, check_scenes
 from .study.cells import fit_and_measure
 from .study.grid import Cell, run_grid
 from .study.plots import panels
-from .study.tables import each
+from .study.tables import grouped
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
 KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
@@ -30,6 +30,7 @@ def training(*, out: Path, quick: bool = False, processes: int | None = None, sc
     """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
 
     For example:
+      kgs bench training -o training-quick --quick
       KGS_DATA=SCENES kgs bench training -o training --processes 2
 
     Writes training.jsonl, .csv, .md and .png. With KGS_DATA, a folder of scenes, also on fern.
@@ -84,7 +85,7 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     digits = dict(zip(HEADS, (2, 2, 3, 1, 0, 0), strict=True))
     lines = [
         [scene, f"{knob} {value}".strip(), len(cells), *(mean_sd(cells[key], d) for key, d in digits.items())]
-        for (scene, knob, value), cells in each(frame, *keys)
+        for (scene, knob, value), cells in grouped(frame, *keys)
     ]
     lines.sort(key=lambda line: (line[0], line[1] != "default", str(line[1]).split()[0]))
     title = "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)"

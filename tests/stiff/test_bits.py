@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kgs import Gaussians
-from kgs.bench.extremes import camera, gaussians, ordinary, render
+from kgs.bench.extremes import gaussians, ordinary, render
 from kgs.bench.scenes import PARAMETERS, Scene
 
 pytestmark = pytest.mark.usefixtures("each_backend")
@@ -36,31 +36,32 @@ def largest_difference(results: list[Result]) -> float:
     return largest
 
 
-def with_more(cloud: Gaussians, more: Gaussians) -> Scene:
-    """One after the other."""
-    return Gaussians(*(torch.cat([getattr(cloud, name), getattr(more, name)]) for name in PARAMETERS)), camera()
+def with_more(scene: Scene, more: Gaussians) -> Scene:
+    """One after the other, before the scene's camera."""
+    cloud, view = scene
+    return Gaussians(*(torch.cat([getattr(cloud, name), getattr(more, name)]) for name in PARAMETERS)), view
 
 
 def spoilt(dtype: torch.dtype) -> Iterator[Result]:
     """Every parameter of a last Gaussian in turn NaN, inf and -inf, against the scene without it."""
-    yield render((gaussians(100), camera()), dtype)
+    yield render(ordinary(100), dtype)
     for name in PARAMETERS:
         for value in (math.nan, math.inf, -math.inf):
-            yield render(with_more(gaussians(100), gaussians(1, **{name: value})), dtype)
+            yield render(with_more(ordinary(100), gaussians(1, **{name: value})), dtype)
 
 
 def behind(dtype: torch.dtype) -> Iterator[Result]:
     """A thousand Gaussians more, at and behind the near plane and the camera."""
     near, means = 2**-7, gaussians(1000, seed=3).means.clone()
     means[:, 2] = torch.tensor([-5.0, -1e-30, 0.0, near]).double().repeat(250)
-    yield render((gaussians(100), camera()), dtype, near_plane=near)
-    yield render(with_more(gaussians(100), gaussians(1000, seed=3, means=means)), dtype, near_plane=near)
+    yield render(ordinary(100), dtype, near_plane=near)
+    yield render(with_more(ordinary(100), gaussians(1000, seed=3, means=means)), dtype, near_plane=near)
 
 
 def transparent(dtype: torch.dtype) -> Iterator[Result]:
     """A hundred Gaussians more, at an opacity of 0."""
-    yield render((gaussians(100), camera()), dtype)
-    yield render(with_more(gaussians(100), gaussians(100, seed=3, opacities=0.0)), dtype)
+    yield render(ordinary(100), dtype)
+    yield render(with_more(ordinary(100), gaussians(100, seed=3, opacities=0.0)), dtype)
 
 
 def under_autocast(dtype: torch.dtype) -> Iterator[Result]:
@@ -93,7 +94,7 @@ def on_threads(dtype: torch.dtype) -> Iterator[Result]:
 
 def under_a_budget(dtype: torch.dtype) -> Iterator[Result]:
     """The image alone: gradients of a Gaussian are then summed in another order."""
-    scene = gaussians(300, scales=60.0, opacities=0.02), camera((64, 64))
+    scene = ordinary(300, (64, 64), scales=60.0, opacities=0.02)
     for most in (2**30, 2**21):
         yield render(scene, dtype, max_bytes=most)[0], {}
 

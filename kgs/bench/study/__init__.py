@@ -20,6 +20,7 @@ def study(
     """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
 
     For example:
+      kgs bench study -o study
       KGS_DATA=SCENES kgs bench study -o study-cpu --preset cpu
 
     Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. For many machines:

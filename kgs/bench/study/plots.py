@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from .presets import FAMILIES, FIXED, MAIN, OFF, PAPER
-from .tables import KEYS, STARTS, difference, each, main_cells
+from .tables import KEYS, STARTS, difference, grouped, main_cells
 
 # Colours of Okabe and Ito, told apart by colour-blind people too; those that share one differ in the marker.
 STYLES = {OFF: ("#000000", "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
@@ -30,9 +30,9 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
     columns, rows = min(2, count), -(-count // 2)
     size = (9, 0.9 + 0.2 * len(points)) if named else (3.9 * columns + 0.4, 3.2 * rows + 0.5)
     figure, found = Figure(size, dpi=DPI, layout="constrained"), dict[str, Any]()
-    for place, ((title,), some) in enumerate(each(points, "panel"), 1):
+    for place, ((title,), some) in enumerate(grouped(points, "panel"), 1):
         axis = figure.add_subplot(rows, columns, place)
-        for (label, start), part in each(some.assign(start=some.get("start", "")), "label", "start"):
+        for (label, start), part in grouped(some.assign(start=some.get("start", "")), "label", "start"):
             colour, marker = styles[label]
             look: dict[str, Any] = {"marker": marker, "ls": "" if scattered or named else "-", "alpha": 0.85, "ms": 5}
             fill = _FILLS.get(start, "none" if scattered else "full")
@@ -66,7 +66,7 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
 def _forest(frame: pd.DataFrame) -> pd.DataFrame:
     main = main_cells(frame)
     groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
-    groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in each(frame, *KEYS[:3])}
+    groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in grouped(frame, *KEYS[:3])}
     lines = [
         {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": gain.high - gain.mean}
         for where, cells in groups.items()
@@ -104,7 +104,7 @@ def _over_seeds(cells: pd.DataFrame) -> pd.DataFrame:
     means = {"x": ("x", "first"), "y": ("y", "mean"), "dy": ("y", "std")}
     lines = [
         some.groupby("place").agg(**means).dropna(subset="y").fillna(0).assign(panel=panel, label=label)
-        for (panel, label), some in each(points, "panel", "label")
+        for (panel, label), some in grouped(points, "panel", "label")
     ]
     return pd.concat(lines) if lines else points
 

@@ -97,7 +97,7 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return cells.join(results).iloc[places.sort_values([*KEYS], kind="stable").index]
 
 
-def each(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
+def grouped(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
     """The cells that share these fields, group by group in their order; the fields are a tuple."""
     return frame.groupby(list(keys), sort=False)
 
@@ -128,7 +128,7 @@ def findings(frame: pd.DataFrame) -> list[str]:
     for what, pair in _COMPARISONS.items():
         cells = main[main.start == "dense"] if pair[0] == "method" else main[main.method == PAPER]
         gain, cost = difference(cells, *pair), difference(cells, *pair, LPIPS)
-        by_scene = {name.rpartition("/")[2]: difference(some, *pair) for (name,), some in each(cells, "scene")}
+        by_scene = {name.rpartition("/")[2]: difference(some, *pair) for (name,), some in grouped(cells, "scene")}
         scenes = [f"{name} {found.text()}" for name, found in by_scene.items() if found.pairs]
         if scenes:
             spread = "" if math.isnan(gain.sd) else f", standard deviation of a pair: {gain.sd:.2f} dB"
@@ -148,10 +148,10 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     main, dense = main_cells(frame), frame[frame.start == "dense"]
     several = dense[dense.groupby("scene").views.transform("nunique") > 1]
     by_views = _settings(several)
-    for (n,), cells in each(several.sort_values("views", kind="stable"), "views"):
+    for (n,), cells in grouped(several.sort_values("views", kind="stable"), "views"):
         by_views += _compared(cells, MAIN, f"mean of {{}} scenes ({{}}), {n} views")
     tables = {_TITLE: _methods(main), "Numbers of views": by_views, "First points": _starts(frame)}
-    for _, cells in each(main, *KEYS[:3]):
+    for _, cells in grouped(main, *KEYS[:3]):
         where, found = _setting(cells), set(cells.method)
         if found <= set(MAIN):
             continue
@@ -170,10 +170,10 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = [
         {"scene": _setting(cells), "method": method, "n": str(len(cells))}
         | {head: mean_sd(cells[key], 2 if key in ("gap", "thousandths") else 0) for head, key in _COST.items()}
-        for (*_, method), cells in each(main, *KEYS)
+        for (*_, method), cells in grouped(main, *KEYS)
     ]
     tables["Scenes, splits and settings"] = protocol = Lines()
-    for (scene, views), cells in each(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
+    for (scene, views), cells in grouped(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
         train, test, (height, width) = (cells[f"protocol.{key}"].iloc[0] for key in ("train", "test", "image_size"))
         shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
         line = {"scene": f"{scene}, {views} views", "training views": str(len(train)), "test views": str(len(test))}
@@ -183,7 +183,7 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def _settings(cells: pd.DataFrame) -> Lines:
-    return [line for _, some in each(cells, *KEYS[:3]) for line in _compared(some, MAIN)]
+    return [line for _, some in grouped(cells, *KEYS[:3]) for line in _compared(some, MAIN)]
 
 
 def _methods(main: pd.DataFrame) -> Lines:
@@ -215,9 +215,9 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
 
 def _starts(frame: pd.DataFrame) -> Lines:
     lines = []
-    for (scene, views, method), cells in each(frame[frame.method.isin(MAIN)], *KEYS[:2], "method"):
+    for (scene, views, method), cells in grouped(frame[frame.method.isin(MAIN)], *KEYS[:2], "method"):
         same = frame[(frame.scene == scene) & (frame.views == views)]
-        for (start,), some in each(cells, "start") if cells.start.nunique() > 1 else ():
+        for (start,), some in grouped(cells, "start") if cells.start.nunique() > 1 else ():
             gave = sorted({*some["init.kind"]} - {start}) if start in ("dense", "sift") else []
             note = " (sees test views)" if start in ("model-points", "full-model") else ""
             line = {"scene": f"{scene}, {views} views", "method": method}
@@ -231,7 +231,7 @@ def _starts(frame: pd.DataFrame) -> Lines:
 
 
 def _noise(frame: pd.DataFrame) -> Lines:
-    scenes = [(scene, "test.psnr", cells) for (scene,), cells in each(frame, "scene")]
+    scenes = [(scene, "test.psnr", cells) for (scene,), cells in grouped(frame, "scene")]
     lines = []
     for name, measure, cells in [*(scenes if len(scenes) > 1 else []), *(("all cells", m, frame) for m in QUALITY)]:
         noise = noise_floor(wide(cells, measure))
@@ -250,7 +250,7 @@ def _setting(cells: pd.DataFrame) -> str:
 
 def _benchmark(cells: pd.DataFrame) -> tuple[str | None, int]:
     """The paper's benchmark that all these cells are from, and its number of views."""
-    found = {(benchmark_of(scene, views), views) for (scene, views), _ in each(cells, *KEYS[:2])}
+    found = {(benchmark_of(scene, views), views) for (scene, views), _ in grouped(cells, *KEYS[:2])}
     return found.pop() if len(found) == 1 else (None, 0)
 
 

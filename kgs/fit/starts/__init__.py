@@ -35,7 +35,7 @@ class FirstPoints:
     Args:
         points: in the frame of the views, `(P, 3)` float32 on the CPU.
         colors: RGB in [0, 1], `(P, 3)` float32.
-        kind: where the points come from: "dense", "sift", "random" or "file".
+        kind: where the points come from: "dense", "sift", "random", "file", or the scene's `init_kind`.
     """
 
     points: Tensor

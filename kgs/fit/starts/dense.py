@@ -33,7 +33,7 @@ def dense_points(
     maps = sweep_depths(views, near, far, stage, backend)
     certain = [there.is_inner & (there.scores > SCORE) for there in maps]
     if views.masks is not None:
-        certain = [pixels & (mask[0] > 0.5).cpu() for pixels, mask in zip(certain, views.masks, strict=True)]
+        certain = [good & (mask[0] > 0.5).cpu() for good, mask in zip(certain, views.masks, strict=True)]
     found = [_agreed(views, maps, certain, view) for view in range(len(views))]
     points, colors = (torch.cat(parts) for parts in zip(*found, strict=True))
     chosen = torch.randperm(len(points), generator=generator)[:count]
