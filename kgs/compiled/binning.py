@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .kernel import ONE, TWO, ZERO, f32, inline, jit
+from .kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
 
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048
@@ -118,7 +118,7 @@ def fill_tables(
         geometry[i, 4], geometry[i, 5], geometry[i, 6] = xy / yy, det / yy, ONE / yy
         geometry[i, 7] = xy * math.sqrt(cut / xx)
         for j in range(8):
-            geometry[i, j] = geometry[i, j] if math.isfinite(geometry[i, j]) else _INFINITY
+            geometry[i, j] = geometry[i, j] if is_finite(geometry[i, j]) else _INFINITY
         pivot = max(xx, yy)
         slope = -xy / pivot
         along, across = _ROOT / math.sqrt(pivot), _ROOT * math.sqrt(pivot / det)

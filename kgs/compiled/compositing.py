@@ -6,12 +6,10 @@ is compiled for: V is linear in the features and in the gradient of the light, s
 the other, and their moments added.
 """
 
-import math
-
 import numpy as np
 
 from .binning import SIZE, variances
-from .kernel import HALF, ONE, ZERO, exp2, f32, inline, jit, scratch
+from .kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
 
 P = SIZE * SIZE
 K = 16
@@ -275,7 +273,7 @@ def fill_gradients(
             b0, b1, b2 = factors[g, 1, 0], factors[g, 1, 1], factors[g, 1, 2]
             xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
             d_opacities[g] = total[0] / opacities[g] if ranks[g] >= 0 else ZERO
-            if ranks[g] < 0 or not math.isfinite(det):  # in no list, or wider than numbers reach: flat over the image
+            if ranks[g] < 0 or not is_finite(det):  # in no list, or wider than numbers reach: flat over the image
                 d_means2d[g, 0] = d_means2d[g, 1] = ZERO
                 d_factors[g] = ZERO
                 continue
