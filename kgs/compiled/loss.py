@@ -17,7 +17,7 @@ import numpy as np
 from .kernel import ONE, TWO, ZERO, f32, inline, jit, scratch
 from .threads import over
 
-RADIUS, BAND = 5, 16  # of the window; rows of a band
+RADIUS, BAND = 5, 32  # of the window; rows of a band
 PIECES = 16  # for the threads
 C1, C2, EPS = f32(0.01**2), f32(0.03**2), f32(1e-12)
 
