@@ -9,6 +9,7 @@ gives the same within the rounding of its dtype and differentiates the same. Arg
     "projection"   (gaussians, cameras, image size, RasterOptions, with colours) -> ProjectedGaussians
     "compositing"  (projected, features (M, F), RasterOptions, median depth, chunk size) -> Composited
     "loss"         (image (B, C, H, W), target, TargetMoments or None, weight, pixels left out or None, fast) -> loss
+    "matching"     (lines (N, 3), places (M, 2), descriptors (N, F), (M, F)) -> distances, rows, columns, each (K,)
     "sweep"        (image (H, W), others (N, H, W), homographies (N, D, 3, 3)) -> smoothed costs, scores, each (D, H, W)
 
 The lists of tiles are no stage: each "compositing" makes its own, laid out for its kernels.
@@ -25,7 +26,7 @@ from torch import Tensor
 
 __all__ = ["available", "check_backend", "choose", "compiled_covers", "register", "resolve"]
 
-STAGES = ("projection", "compositing", "loss", "sweep")
+STAGES = ("projection", "compositing", "loss", "matching", "sweep")
 Pair = tuple[Callable[..., Any] | str, Callable[..., bool]]  # run, covers
 _registry: dict[str, dict[str, Pair]] = {stage: {} for stage in STAGES}
 

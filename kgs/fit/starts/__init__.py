@@ -68,7 +68,7 @@ def first_points(
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
         stage: shows how far the work is: :func:`kgs.fit.progress.each`, or nothing.
-        backend: one of :func:`kgs.backends.available`, for "dense".
+        backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.
@@ -85,7 +85,7 @@ def first_points(
         if file is None:
             raise ValueError("file: expected a path for the kind 'file', got None")
         return FirstPoints(*read_points(Path(file), origin), kind)
-    points, tracks = triangulate_certain(find_tracks(views, stage), views.cameras)
+    points, tracks = triangulate_certain(find_tracks(views, stage, backend), views.cameras)
     good = _within_typical_depths(points, tracks.seen, views.cameras)
     points, tracks = points[good], tracks.select(good)
     if len(points) >= FEWEST_POINTS:

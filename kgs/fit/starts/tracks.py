@@ -15,6 +15,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
+from kgs.backends import choose, compiled_covers, register
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
@@ -37,7 +38,7 @@ class Tracks:
         return type(self)(self.pixels[rows], self.seen[rows])
 
 
-def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
+def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> Tracks:
     """Find points that at least two of the views see, where the views' masks, if any, are above 0.5.
 
     Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
@@ -51,7 +52,10 @@ def find_tracks(views: Views, stage: Stage = silent) -> Tracks:
     nodes, pixels, owners = _places([places for places, _ in features])
     links = list[tuple[float, int, int]]()
     for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
-        distances, rows, columns = _match(features[i], features[j], projections[i], projections[j])
+        (places1, descriptors1), (places2, descriptors2) = features[i], features[j]
+        lines = _lines(places1, projections[i], projections[j])
+        arguments = (lines, places2.float(), descriptors1, descriptors2)
+        distances, rows, columns = choose("matching", backend, *arguments)(*arguments)
         links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
     tracks = _join(links, owners)
     table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
@@ -83,15 +87,17 @@ def _detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
     return (places + 0.5) / factor - 0.5, descriptors
 
 
-def _match(
-    first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], projection1: Tensor, projection2: Tensor
-) -> tuple[Tensor, ...]:
-    """Descriptor distances and the keypoints' numbers in both views, each `(M,)`, of the matches between two views."""
-    (places1, descriptors1), (places2, descriptors2) = first, second
+def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
+    """The epipolar lines of places in the first view, in the second, `(N, 3)` float32; normals of length 1."""
     fundamental = fundamental_from_projections(projection1[None], projection2[None])[0]
-    lines = convert_points_to_homogeneous(places1) @ fundamental.T
-    lines = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
-    targets = convert_points_to_homogeneous(places2).float().T
+    lines = convert_points_to_homogeneous(places) @ fundamental.T
+    unit: Tensor = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
+    return unit
+
+
+def torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
+    """The stage "matching"."""
+    targets = convert_points_to_homogeneous(places).T
     candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
     for start in range(0, len(lines), CHUNK):
         rows, columns = ((lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
@@ -99,10 +105,16 @@ def _match(
         differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
         candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
     rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
-    nearest1, rival1 = _nearest(distances, rows, len(places1))
-    nearest2, rival2 = _nearest(distances, columns, len(places2))
+    nearest1, rival1 = _nearest(distances, rows, len(lines))
+    nearest2, rival2 = _nearest(distances, columns, len(places))
     good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)
     return distances[good], rows[good], columns[good]
+
+
+register("matching", "torch", torch_matches)
+register(
+    "matching", "numba", "kgs.fit.starts.tracks_compiled:compiled_matches", lambda lines, *_: compiled_covers(lines)
+)
 
 
 def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,66 @@
+"""Matches of keypoints along epipolar lines, by the rules of `kgs.fit.starts.tracks`; what differs is rounding.
+
+    lines           (N, 3), of the first view's keypoints in the second, normals of length 1
+    places          (2, M), x and y of the second view's keypoints
+    descriptors     (N, F) and (M, F), of both views
+
+A distance without a candidate is infinite. Bands of rows have their own columns, so that no two threads meet.
+"""
+
+import numpy as np
+
+from .kernel import ZERO, f32, jit
+from .threads import over
+
+BANDS = 16
+INFINITY = f32(np.inf)
+
+
+def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, most):
+    """Descriptor distances and numbers in both views, `(K,)`, of pairs that are each other's nearest by far."""
+    n, m = len(lines), places.shape[1]
+    near1, rival1 = np.full((2, n), INFINITY)
+    near2, rival2 = np.full((2, BANDS, m), INFINITY)
+    match1, match2 = np.zeros(n, np.int64), np.zeros((BANDS, m), np.int64)
+    found = (near1, rival1, match1, near2, rival2, match2)
+    over(threads, BANDS, find_nearest, lines, places, *descriptors, f32(line_distance), *found, pieces=BANDS)
+    if not m:
+        return near1[:0], match1[:0], match1[:0]
+    rival2 = np.partition(np.concatenate([near2, rival2]), 1, axis=0)[1]
+    match2 = np.take_along_axis(match2, near2.argmin(0)[None], 0)[0]
+    clear = near1 < f32(ratio) * np.minimum(rival1, rival2[match1])
+    rows = np.nonzero(clear & (near1 < f32(most)) & (match2[match1] == np.arange(n)))[0]
+    return near1[rows], rows, match1[rows]
+
+
+@jit
+def find_nearest(
+    begin, end, lines, places, descriptors1, descriptors2, line_distance, near1, rival1, match1, near2, rival2, match2
+):
+    """The nearest candidate of each row and, in a band, of each column, of equal ones the first; the next distance."""
+    (n, m), x, y = (len(lines), places.shape[1]), places[0], places[1]
+    off, candidates = np.empty(m, np.float32), np.empty(m, np.int32)
+    for band in range(begin, end):
+        near, rival, match = near2[band], rival2[band], match2[band]
+        for i in range(band * n // BANDS, (band + 1) * n // BANDS):
+            a, b, c = lines[i, 0], lines[i, 1], lines[i, 2]
+            for j in range(m):
+                off[j] = abs(a * x[j] + b * y[j] + c)
+            count = 0
+            for j in range(m):  # without a branch: one in about a hundred is kept
+                candidates[count] = j
+                count += off[j] < line_distance
+            for k in range(count):
+                j, distance = candidates[k], ZERO
+                for f in range(descriptors1.shape[1]):
+                    difference = descriptors1[i, f] - descriptors2[j, f]
+                    distance += difference * difference
+                distance = np.sqrt(distance)
+                if distance < near1[i]:
+                    near1[i], rival1[i], match1[i] = distance, near1[i], j
+                elif distance < rival1[i]:
+                    rival1[i] = distance
+                if distance < near[j]:
+                    near[j], rival[j], match[j] = distance, near[j], i
+                elif distance < rival[j]:
+                    rival[j] = distance

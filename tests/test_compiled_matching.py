@@ -1,0 +1,78 @@
+"""The compiled matching of keypoints against torch's: the same pairs, ties included, on any number of threads."""
+
+import re
+
+import pytest
+import torch
+
+from kgs.backends import choose
+from kgs.fit.starts import tracks
+
+nb = pytest.importorskip("numba")
+
+from kgs.compiled import matching as kernels  # noqa: E402  # needs numba
+from kgs.fit.starts import tracks_compiled  # noqa: E402
+
+
+def keypoints(n, m, seed=0):
+    """Lines, places, and descriptors of which some are nearly those of the other view, and some are there twice."""
+    generator = torch.Generator().manual_seed(seed)
+    angles = 0.2 * torch.rand(n, generator=generator)
+    lines = torch.stack([angles.sin(), angles.cos(), -100 * torch.rand(n, generator=generator)], 1)
+    places = 100 * torch.rand(m, 2, generator=generator)
+    first, second = (
+        torch.nn.functional.normalize(torch.rand(k, 128, generator=generator) ** 4, p=1, dim=1).sqrt() for k in (n, m)
+    )
+    same = min(n, m) // 2
+    places[:same, 1] = -(lines[:same, 0] * places[:same, 0] + lines[:same, 2]) / lines[:same, 1]
+    second[:same] = first[:same] + 0.02 * torch.rand(same, 128, generator=generator)
+    second[: same // 4], places[same : same + same // 4] = second[:1], places[: same // 4]
+    second[same : same + same // 4] = second[: same // 4]  # equal distances, to the bit
+    return lines, places, first, second
+
+
+def matches(arguments, backend):
+    return choose("matching", backend, *arguments)(*arguments)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (5, 200), (300, 37), (400, 500), (0, 20), (20, 0), (0, 0)])
+def test_matches_are_torchs(n, m):
+    arguments = keypoints(n, m)
+    (distances, *pairs), (expected, *others) = (matches(arguments, backend) for backend in ("numba", "torch"))
+    assert all(torch.equal(a, b) and a.dtype == b.dtype for a, b in zip(pairs, others, strict=True))
+    torch.testing.assert_close(distances, expected, rtol=1e-6, atol=1e-7)
+    assert len(distances) > 100 or min(n, m) < 400
+
+
+def test_the_first_of_equal_pairs_has_the_other_as_its_rival(monkeypatch):
+    for module in (tracks, tracks_compiled):
+        monkeypatch.setattr(module, "MAX_RATIO", 1.5)
+    arguments = (*(x.repeat(2, 1) for x in keypoints(300, 300)[:2]), *(x.repeat(2, 1) for x in keypoints(300, 300)[2:]))
+    found, expected = (matches(arguments, backend) for backend in ("numba", "torch"))
+    assert len(found[0]) > 50
+    assert all(torch.equal(a, b) for a, b in zip(found[1:], expected[1:], strict=True))
+
+
+def test_bits_do_not_depend_on_threads():
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(matches(keypoints(333, 444), "numba"))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for some in found for a, b in zip(some, found[0], strict=True))
+
+
+def test_inner_loops_are_vector_code():
+    rows, numbers, floats = nb.float32[:, ::1], nb.int64[:, ::1], nb.float32[::1]
+    arguments = (rows, rows, rows, rows, nb.float32, floats, floats, nb.int64[::1], rows, rows, numbers)
+    fresh = nb.njit(nogil=True, fastmath=kernels.find_nearest.targetoptions["fastmath"], error_model="numpy")(
+        kernels.find_nearest.py_func
+    )
+    fresh.compile((nb.int64, nb.int64, *arguments))
+    assembly = "".join(fresh.inspect_asm().values())
+    if "ymm" not in assembly:
+        pytest.skip("no AVX")
+    for operation in ("sub", "add|mul|fm", "and"):  # of descriptors; of lines; the absolute value
+        assert re.search(rf"\bv\w*(?:{operation})\w*\b.*[yz]mm", assembly)
