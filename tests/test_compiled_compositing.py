@@ -26,12 +26,17 @@ from kgs.raster.compiled_passes import _arrays
 THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
 
 
-def sample(n=300, seed=1, size=(40, 56), thresholds=THRESHOLDS[0], opacities=(0.05, 1.3)):
-    """Projected Gaussians, and where float32 cannot change a decision."""
-    gaussians = random_gaussians(n, seed, torch.float32, None, max(size), opacities)
-    camera = random_camera(*size, seed, torch.float32)
+def drawn(n=300, size=(40, 56)):
+    """Projected Gaussians, and what they are projected from."""
+    gaussians = random_gaussians(n, 1, torch.float32, None, max(size), (0.05, 1.3))
+    camera = random_camera(*size, 1, torch.float32)
     with torch.no_grad():
-        projected = project(gaussians, camera, alpha_threshold=0.0)
+        return project(gaussians, camera, alpha_threshold=0.0), gaussians, camera
+
+
+def sample(n=300, size=(40, 56), thresholds=THRESHOLDS[0]):
+    """Projected Gaussians, and where float32 cannot change a decision."""
+    projected, gaussians, camera = drawn(n, size)
     return projected, ~near_threshold(gaussians, camera, *thresholds)
 
 
@@ -168,7 +173,7 @@ def bits(projected, features, **options):
 
 @pytest.mark.parametrize("max_bytes", [2**30, 2**18])
 def test_the_same_bits_on_any_number_of_threads(threads, max_bytes):
-    projected, _ = sample(3000, size=(80, 112))
+    projected, *_ = drawn(3000, size=(80, 112))
     threads(1)
     first = bits(projected, projected.colors, max_bytes=max_bytes)
     for count in (1, 2, 3, 4):
@@ -178,7 +183,7 @@ def test_the_same_bits_on_any_number_of_threads(threads, max_bytes):
 
 
 def test_what_is_asked_for_beside_the_image_does_not_change_its_bits():
-    projected, _ = sample()
+    projected, *_ = drawn()
     features = random(len(projected), 20)
     first = composite(projected, features[:, :3], backend="numba")
     for width in (3, 4, 6, 8, 9, 12, 20):
@@ -215,7 +220,8 @@ def test_only_what_is_wanted_is_differentiated(wanted):
 
 
 def test_backward_again_without_graph_and_in_inference_mode():
-    projected, inputs = leaves(sample()[0], random(100000, 3)[: len(sample()[0])])
+    sampled, *_ = drawn()
+    projected, inputs = leaves(sampled, random(100000, 3)[: len(sampled)])
     out = composite(projected, inputs[-1], backend="numba")
     loss = out.features.square().sum() + out.transmittance.sum()
     first = torch.autograd.grad(loss, inputs, retain_graph=True)
@@ -229,7 +235,7 @@ def test_backward_again_without_graph_and_in_inference_mode():
 
 
 def test_gradients_that_are_views_and_inputs_that_are_not_contiguous():
-    projected, _ = sample()
+    projected, *_ = drawn()
     features = random(6, len(projected)).t()[:, ::2]
     factors = projected.factors.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     strided, inputs = leaves(dataclasses.replace(projected, factors=factors), features)

@@ -69,16 +69,21 @@ CASES = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _coarse_plots():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kgs.bench.study.plots.DPI", 40)  # time
+        yield
+
+
 @pytest.fixture(scope="module")
 def reports(tmp_path_factory):
     """The report on each case: its folder, and what was returned."""
     folder = tmp_path_factory.mktemp("reports") / "new"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.study.plots.DPI", 40)  # time
-        return {
-            name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench study --preset cpu", 99))
-            for k, (name, rows) in enumerate(CASES.items())
-        }
+    return {
+        name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench study --preset cpu", 99))
+        for k, (name, rows) in enumerate(CASES.items())
+    }
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +136,7 @@ def test_plots_without_data_are_left_out(reports, tmp_path):
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["gap.png"]
 
 
-def test_the_same_rows_give_the_same_bytes(reports, tmp_path, monkeypatch):
-    monkeypatch.setattr("kgs.bench.study.plots.DPI", 40)
+def test_the_same_rows_give_the_same_bytes(reports, tmp_path):
     write_report(CASES["one cell"], tmp_path, "kgs bench study --preset cpu", 99)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (reports["one cell"][0] / path.name).read_bytes()

@@ -19,8 +19,8 @@ __all__ = ["PATIENCE", "Fit", "memory_of"]
 
 SIZE = (48, 64)
 PATIENCE = 300.0  # seconds after which a process is taken to hang
-_PROCESSES = multiprocessing.get_context("forkserver")  # which has imported torch once for all of them
-_PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.fit.run"])
+_PROCESSES = multiprocessing.get_context("forkserver")  # which has imported what they need once for all of them
+_PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.fit.run", "torch._dynamo", "matplotlib.figure", "trimesh"])
 
 
 def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
