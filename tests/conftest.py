@@ -22,7 +22,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """What is of float64 or of a GPU by its parameters or marks no kernel covers: it is not run a second time."""
+    """What no kernel covers is not run a second time: of float64, of a GPU or of torch alone, by what it asks for."""
     items[:] = [item for item in items if not _runs_on_torch_again(item)]
 
 
@@ -31,7 +31,7 @@ def _runs_on_torch_again(item: pytest.Function) -> bool:
     if values.get("each_backend") != "numba":
         return False
     double = any(value is torch.float64 or (isinstance(value, str) and value == "float64") for value in values.values())
-    return double or item.get_closest_marker("cuda") is not None
+    return double or item.get_closest_marker("cuda") is not None or "torch_alone" in item.fixturenames
 
 
 @pytest.fixture(scope="module", params=sorted({"torch", backends.resolve("auto", torch.device("cpu"))}))

@@ -77,6 +77,7 @@ def dense(means2d, factors, opacities, features, depths, size, eps2d):
     return torch.cat([sums, light[-1:]]).view(1, -1, *size)
 
 
+@pytest.mark.usefixtures("torch_alone")  # in float64
 @pytest.mark.parametrize("chunk_size", [1, 3, None])
 @pytest.mark.parametrize("max_bytes", [2**30, 2**19])
 def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
