@@ -88,6 +88,12 @@ def _has_numba() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
+@functools.cache
+def _loaded(name: str) -> Callable[..., Any]:
+    found: Callable[..., Any] = pkgutil.resolve_name(name)
+    return found
+
+
 def choose(stage: str, backend: str, *arguments: Any) -> Callable[..., Any]:
     """The implementation of a stage for these arguments.
 
@@ -102,6 +108,5 @@ def choose(stage: str, backend: str, *arguments: Any) -> Callable[..., Any]:
     names = list(there) if backend == "auto" else [backend if backend in there else "torch"]
     for run, covers in (there[name] for name in names):
         if covers(*arguments):
-            found: Callable[..., Any] = pkgutil.resolve_name(run) if isinstance(run, str) else run
-            return found
+            return _loaded(run) if isinstance(run, str) else run
     raise ValueError(f'backend: {backend!r} does not cover this call of {stage}, expected "auto" or "torch"')

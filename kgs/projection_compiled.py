@@ -12,9 +12,8 @@ from torch import Tensor
 from .camera import Cameras, tangent_limits
 from .compiled.projection import BLOCK, footprint_gradients, footprints
 from .compiled.threads import over
-from .full_precision import full_precision
 from .memory import empty
-from .projection import finite_gaussians, inverse_turn, project_torch, seen_within
+from .projection import finite_gaussians, project_torch, seen_within
 from .types import Gaussians, ProjectedGaussians, RasterOptions
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -101,12 +100,14 @@ def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
 
 
 def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, ...]]:
-    """What the kernels know of each camera."""
-    views = []
-    with full_precision(cameras.extrinsics.device):
-        for k, pose in zip(cameras.intrinsics.detach(), cameras.extrinsics.detach(), strict=True):
-            limits, centre = tangent_limits(k.diagonal()[:2], k[:2, 2], *size), -(inverse_turn(pose)[0] @ pose[:3, 3])
-            views.append(_arrays(pose[:3], k[:2, :3], limits, centre))
+    """What the kernels know of each camera; in NumPy, which is faster for numbers as few."""
+    views = list[tuple[Array, ...]]()
+    for matrix, pose in zip(cameras.intrinsics.detach(), _arrays(cameras.extrinsics)[0], strict=True):
+        limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], *size)
+        rotation = pose[:3, :3]
+        turned = (np.abs(rotation @ rotation.T - np.eye(3, dtype=pose.dtype)) <= 1e-3).all()
+        inverse = rotation.T if turned else np.linalg.inv(rotation)
+        views.append((pose[:3], *_arrays(matrix[:2, :3], limits), -(inverse @ pose[:3, 3])))
     return views
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 
 import factories
+import pytest
 import torch
 from factories import random_camera, random_gaussians
 
@@ -12,6 +13,12 @@ TH, STOP = 1 / 255, 1e-4
 
 
 DTYPES = [torch.float32, torch.float64]
+
+
+@pytest.fixture(autouse=True)
+def many_bands(monkeypatch):
+    """Small pictures in many bands, as large ones are: in each file of tests that imports it."""
+    monkeypatch.setattr("kgs.compiled.bands.LEAST", 1)
 
 
 def footprints(opacities, centres=None, factors=None, depths=None, size=(3, 4), dtype=torch.float64, eps2d=0.0):

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from compositing_checks import STOP, TH, footprints, leaves
+from compositing_checks import STOP, TH, footprints, leaves, many_bands  # noqa: F401 - a fixture for all tests
 from factories import random_camera, random_gaussians
 from oracles import near_threshold
 from tile_checks import scene

@@ -17,6 +17,12 @@ from kgs.compiled import loss as kernels  # noqa: E402  # needs numba
 SIZES = [(1, 1, 11, 11), (2, 3, 11, 17), (1, 3, 16, 11), (1, 2, 33, 129), (3, 1, 27, 12), (1, 4, 70, 43)]
 
 
+@pytest.fixture(autouse=True)
+def _many_pieces(monkeypatch):
+    """Small pictures in many pieces, as large ones are."""
+    monkeypatch.setattr(kernels, "LEAST", 1)
+
+
 def make_pair(shape, seed=0):
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(shape, generator=generator)

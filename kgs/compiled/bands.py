@@ -30,6 +30,7 @@ from .binning import (
 from .threads import over
 
 BANDS = 16
+LEAST = 4096  # entries of a band: what is done once a band costs as much as some hundreds of them
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class Reach:
             starts, spans = self._all
         work = np.cumsum(self.entries_per_row + self.grid[1])
         before = work[begin - 1] if begin else 0
-        count = max(1, round(BANDS * (work[end - 1] - before) / work[-1]))
+        count = max(1, round(min(BANDS, work[-1] / LEAST) * (work[end - 1] - before) / work[-1]))
         targets = before + np.arange(1, count) * (work[end - 1] - before) / count
         bounds = np.unique([begin, *(np.searchsorted(work, targets) + 1), end])
         offsets, members = np.zeros(len(bounds), np.int64), np.empty(len(spans), np.int32)

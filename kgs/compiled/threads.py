@@ -24,6 +24,10 @@ def over(threads: int, count: int, kernel: Callable[..., None], *arguments: Any,
         pieces: how many ranges; None goes by `count`.
     """
     step = max(1, -(-count // (pieces or max(1, min(16, count // _LEAST)))))
+    if step >= count:
+        if count:
+            kernel(0, count, *arguments)
+        return
     ranges = deque((begin, min(begin + step, count)) for begin in range(0, count, step))
 
     def drain() -> None:
