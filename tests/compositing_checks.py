@@ -21,6 +21,14 @@ def many_bands(monkeypatch):
     monkeypatch.setattr("kgs.compiled.bands.LEAST", 1)
 
 
+def drawn(n=300, size=(40, 56)):
+    """Projected Gaussians, and what they are projected from."""
+    gaussians = random_gaussians(n, 1, torch.float32, None, max(size), (0.05, 1.3))
+    camera = random_camera(*size, 1, torch.float32)
+    with torch.no_grad():
+        return project(gaussians, camera, alpha_threshold=0.0), gaussians, camera
+
+
 def footprints(opacities, centres=None, factors=None, depths=None, size=(3, 4), dtype=torch.float64, eps2d=0.0):
     """Hand-made projected Gaussians, front to back; without `factors` so wide that alpha is the same everywhere."""
     opacities = torch.as_tensor(opacities, dtype=dtype)

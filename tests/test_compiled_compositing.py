@@ -7,14 +7,14 @@ import re
 import numpy as np
 import pytest
 import torch
-from compositing_checks import STOP, TH, footprints, leaves, many_bands  # noqa: F401 - a fixture for all tests
+from compositing_checks import STOP, TH, drawn, footprints, leaves, many_bands  # noqa: F401 - a fixture for all
 from factories import random_camera, random_gaussians
 from oracles import near_threshold
 from tile_checks import scene
 
 import kgs
 import kgs.reference
-from kgs import GaussianRenderer, composite, project
+from kgs import GaussianRenderer, composite
 from kgs.raster.tiles import bin_to_tiles
 
 pytest.importorskip("numba")
@@ -24,14 +24,6 @@ from kgs.compiled.bands import Reach
 from kgs.raster.compiled_passes import _arrays
 
 THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
-
-
-def drawn(n=300, size=(40, 56)):
-    """Projected Gaussians, and what they are projected from."""
-    gaussians = random_gaussians(n, 1, torch.float32, None, max(size), (0.05, 1.3))
-    camera = random_camera(*size, 1, torch.float32)
-    with torch.no_grad():
-        return project(gaussians, camera, alpha_threshold=0.0), gaussians, camera
 
 
 def sample(n=300, size=(40, 56), thresholds=THRESHOLDS[0]):
