@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from compiled_checks import assembly
 from compositing_checks import STOP, TH, drawn, footprints, leaves, many_bands  # noqa: F401 - a fixture for all
 from factories import random_camera, random_gaussians
 from oracles import near_threshold
@@ -291,8 +292,6 @@ def test_pixels_are_the_lanes(kernel):
     types |= {"grads": f[:, :, :, ::1], "moments": nb.boolean, "colors": nb.boolean}
     types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
     names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
-    fresh = nb.njit(**{k: kernel.targetoptions[k] for k in ("nogil", "fastmath", "error_model")})(kernel.py_func)
-    fresh.compile(tuple(types.get(name, i8) for name in names))
-    (assembly,) = fresh.inspect_asm().values()
-    packed, scalar = (len(re.findall(pattern, assembly)) for pattern in (PACKED, SCALAR))
+    text = assembly(kernel, *(types.get(name, i8) for name in names))
+    packed, scalar = (len(re.findall(pattern, text)) for pattern in (PACKED, SCALAR))
     assert packed > max(60, 1.5 * scalar)

@@ -6,6 +6,7 @@ from itertools import product
 
 import pytest
 import torch
+from compiled_checks import avx_assembly
 from kornia.losses import ssim_loss
 
 from kgs.losses import photometric_loss, target_moments
@@ -139,11 +140,5 @@ TAPS, SUMS = nb.types.UniTuple(nb.float32, 6), nb.float64[:, ::1]
 )
 def test_loops_over_columns_are_vector_code(name, arguments, operations):
     """All that they compute stands in the assembly for whole AVX registers; single numbers are what is left over."""
-    kernel = getattr(kernels, name)
-    options = {key: value for key, value in kernel.targetoptions.items() if key not in ("cache", "nopython")}
-    fresh = nb.njit(**options)(kernel.py_func)
-    fresh.compile((nb.int64, nb.int64, *arguments))
-    assembly = "".join(fresh.inspect_asm().values())
-    if "ymm" not in assembly:
-        pytest.skip("no AVX")
+    assembly = avx_assembly(getattr(kernels, name), nb.int64, nb.int64, *arguments)
     assert len(re.findall(r"\bv\w*(?:add|sub|mul)\w*ps\b.*[yz]mm", assembly)) >= operations

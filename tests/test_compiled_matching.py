@@ -4,6 +4,7 @@ import re
 
 import pytest
 import torch
+from compiled_checks import avx_assembly
 
 from kgs.backends import choose
 from kgs.fit.starts import tracks
@@ -67,12 +68,6 @@ def test_bits_do_not_depend_on_threads():
 def test_inner_loops_are_vector_code():
     rows, numbers, floats = nb.float32[:, ::1], nb.int64[:, ::1], nb.float32[::1]
     arguments = (rows, rows, rows, rows, nb.float32, floats, floats, nb.int64[::1], rows, rows, numbers)
-    fresh = nb.njit(nogil=True, fastmath=kernels.find_nearest.targetoptions["fastmath"], error_model="numpy")(
-        kernels.find_nearest.py_func
-    )
-    fresh.compile((nb.int64, nb.int64, *arguments))
-    assembly = "".join(fresh.inspect_asm().values())
-    if "ymm" not in assembly:
-        pytest.skip("no AVX")
+    assembly = avx_assembly(kernels.find_nearest, nb.int64, nb.int64, *arguments)
     for operation in ("sub", "add|mul|fm", "and"):  # of descriptors; of lines; the absolute value
         assert re.search(rf"\bv\w*(?:{operation})\w*\b.*[yz]mm", assembly)

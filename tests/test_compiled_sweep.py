@@ -5,6 +5,7 @@ from itertools import product
 
 import pytest
 import torch
+from compiled_checks import avx_assembly
 
 from kgs.backends import choose
 from kgs.datasets.synthetic import synthetic_scene
@@ -72,11 +73,5 @@ def test_bits_depend_neither_on_threads_nor_on_repetition():
     ],
 )
 def test_inner_loops_are_vector_code(name, arguments, pattern, operations):
-    kernel = getattr(kernels, name)
-    options = {key: value for key, value in kernel.targetoptions.items() if key not in ("cache", "nopython")}
-    fresh = nb.njit(**options)(kernel.py_func)
-    fresh.compile((nb.int64, nb.int64, *arguments))
-    assembly = "".join(fresh.inspect_asm().values())
-    if "ymm" not in assembly:
-        pytest.skip("no AVX")
+    assembly = avx_assembly(getattr(kernels, name), nb.int64, nb.int64, *arguments)
     assert len(re.findall(rf"\bv\w*(?:{pattern})\w*p[sd]\b.*[yz]mm", assembly)) >= operations
