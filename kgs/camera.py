@@ -29,7 +29,7 @@ from torch import Tensor
 from .full_precision import in_full_precision
 from .types import check_tensor
 
-_MARGIN = 0.15
+MARGIN = 0.15
 Pixels = Callable[[Tensor], Tensor]
 
 
@@ -229,7 +229,7 @@ def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor],
 def tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Tensor:
     """Limits of x/z and y/z in rows (lower, upper), `(2, 2)`, no gradient; also where a focal length is negative."""
     focal, centre, size = focal.detach(), centre.detach(), focal.new_tensor([width, height])
-    first, last = -(centre + 0.5 + _MARGIN * size) / focal, (size - 0.5 - centre + _MARGIN * size) / focal
+    first, last = -(centre + 0.5 + MARGIN * size) / focal, (size - 0.5 - centre + MARGIN * size) / focal
     return torch.stack([torch.minimum(first, last), torch.maximum(first, last)], 1)
 
 

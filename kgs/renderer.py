@@ -123,15 +123,15 @@ class GaussianRenderer(nn.Module):
         rules |= {"tile_size": self.tile_size, "transmittance_stop": self.transmittance_stop}
         rules |= {"max_bytes": self.max_bytes, "median_depth": "median_depth" in outputs}
         result = composite(projected, values, **rules)
-        alpha = 1.0 - result.transmittance
         ends = accumulate((x.shape[1] for x in features.values()), initial=0)
         found = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
         if "depth" in outputs:
+            alpha = 1.0 - result.transmittance
             covered = alpha >= 1e-6
             found["depth"] = torch.where(covered, found["depth"] / torch.where(covered, alpha, 1.0), 0.0)
         picture = blend(found["image"], result.transmittance, background) if image else None
-        shown, depth, normal = alpha if "alpha" in outputs else None, found.get("depth"), found.get("normal")
-        return Rendering(picture, shown, depth, result.median_depth, projected, normal)
+        shown = 1.0 - result.transmittance if "alpha" in outputs else None
+        return Rendering(picture, shown, found.get("depth"), result.median_depth, projected, found.get("normal"))
 
     def extra_repr(self) -> str:
         """What `print` shows."""

@@ -6,6 +6,7 @@ import threading
 import pytest
 import torch
 
+from kgs.compiled.threads import over
 from kgs.raster.threads import run_all
 
 CPU = torch.device("cpu")
@@ -65,6 +66,26 @@ def test_results_do_not_depend_on_the_number_of_threads():
         torch.set_num_threads(before)
     assert torch.equal(found[0], found[1])
     assert torch.equal(found[0], found[2])
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 50])
+def test_kernels_get_every_range_once_and_an_error_comes_when_nothing_runs(threads, count):
+    found, running = [], set()
+
+    def kernel(begin, end, fails):
+        running.add(begin)
+        found.extend(range(begin, end))
+        running.discard(begin)
+        if fails and begin == 0:
+            raise ZeroDivisionError
+
+    over(threads, count, kernel, False, pieces=10)
+    assert sorted(found) == list(range(count))
+    if count:
+        with pytest.raises(ZeroDivisionError):
+            over(threads, count, kernel, True, pieces=10)
+        assert not running
+        assert sorted(found) == sorted(2 * list(range(count)))
 
 
 @pytest.mark.parametrize("count", [1, 20])

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from .binning import (
     SIZE,
     begin_spans,
-    count_entries,
     count_rows,
-    fill_entries,
+    fill_band,
     fill_tables,
     find_members,
     find_rows,
     find_spans,
-    gather_rows,
     sort_by_depth,
 )
 from .threads import over
@@ -100,7 +98,7 @@ class Reach:
         """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
         ends, n = np.cumsum(self.heads[:, 1]), len(self.ids)
         total = int(ends[-1]) if n else 0
-        bounds = [0, *np.unique(np.searchsorted(ends, range(max_spans, total, max_spans))).tolist(), n]
+        bounds = [0, *sorted({*np.searchsorted(ends, range(max_spans, total, max_spans)).tolist()}), n]
         self.spans_per_row, self.entries_per_row = np.zeros((2, self.total_rows), np.int64)
         self._all = None
         for low, high in pairwise(bounds):
@@ -142,8 +140,6 @@ class Reach:
         (begin, end), own, columns = part.bounds[b : b + 2], slice(*part.offsets[b : b + 2]), self.grid[1]
         members, offsets = part.members[own], np.zeros((end - begin) * columns + 1, np.int64)
         spans = (part.first_row, columns, self.heads, part.starts, part.spans, members)
-        count_entries(begin, end, *spans, offsets)
         entries, rows = part.entries[slice(*part.entry_offsets[b : b + 2])], part.table[own]
-        gather_rows(members, self.table, rows)
-        fill_entries(begin, end, *spans, offsets, entries)
+        fill_band(begin, end, *spans, self.table, offsets, entries, rows)
         return Band(begin * columns, own, rows, offsets, entries)

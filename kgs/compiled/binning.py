@@ -233,3 +233,11 @@ def fill_entries(begin, end, first_row, columns, heads, starts, spans, members, 
                 at = cursors[c] & 0x7FFFFFFFFFFFFFFF
                 cursors[c] = at + 1
                 entries[at] = m
+
+
+@jit
+def fill_band(begin, end, first_row, columns, heads, starts, spans, members, table, offsets, entries, rows):
+    """The lists of a band and the rows of its members, in one call: calls by several threads wait for each other."""
+    count_entries(begin, end, first_row, columns, heads, starts, spans, members, offsets)
+    gather_rows(members, table, rows)
+    fill_entries(begin, end, first_row, columns, heads, starts, spans, members, offsets, entries)

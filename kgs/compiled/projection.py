@@ -11,7 +11,7 @@ import numpy as np
 from .harmonics import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
 from .kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
 
-BLOCK = 4096  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
+BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
 
 
 @inline

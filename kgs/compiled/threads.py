@@ -3,18 +3,46 @@
 import os
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
 
 _LEAST = 8192  # numbers or rows of a range: below that a second thread costs more than it gains
-_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Ranges that are still to do, and for each one that is done None or its error."""
+
+    ranges: deque[tuple[int, int]]
+    kernel: Callable[..., None]
+    arguments: tuple[Any, ...]
+    done: SimpleQueue[BaseException | None] = field(default_factory=SimpleQueue)
+
+    def drain(self) -> None:
+        """Do what nobody else has begun."""
+        while True:
+            try:
+                begin, end = self.ranges.popleft()
+            except IndexError:
+                return
+            try:
+                self.kernel(begin, end, *self.arguments)
+            except BaseException as error:  # raised by the caller, when nothing runs any more
+                self.done.put(error)
+            else:
+                self.done.put(None)
+
+
+_helpers: list[SimpleQueue[_Work]] = []  # a queue of each thread
 
 
 def over(threads: int, count: int, kernel: Callable[..., None], *arguments: Any, pieces: int | None = None) -> None:
     """Call `kernel(begin, end, *arguments)` on ranges that make up 0 .. count, on at most `threads` threads.
 
     The ranges do not depend on the number of threads: the last turns of a vector loop are scalar and may round
-    differently, which would show in the bits.
+    differently, which would show in the bits. A thread that wakes up when all ranges are taken is not waited for.
 
     Args:
         threads: the calling one included.
@@ -28,34 +56,23 @@ def over(threads: int, count: int, kernel: Callable[..., None], *arguments: Any,
         if count:
             kernel(0, count, *arguments)
         return
-    ranges = deque((begin, min(begin + step, count)) for begin in range(0, count, step))
-
-    def drain() -> None:
-        while True:
-            try:
-                begin, end = ranges.popleft()
-            except IndexError:
-                return
-            try:
-                kernel(begin, end, *arguments)
-            except BaseException:
-                ranges.clear()
-                raise
-
-    futures = [_pool(threads).submit(drain) for _ in range(min(threads, len(ranges)) - 1)]
-    try:
-        drain()
-    finally:
-        wait(futures)  # all of them, so that nothing runs on after an error
-    for future in futures:
-        future.result()
+    work = _Work(deque((begin, min(begin + step, count)) for begin in range(0, count, step)), kernel, arguments)
+    total = len(work.ranges)
+    for helper in range(min(threads, total) - 1):
+        if helper == len(_helpers):
+            _helpers.append(SimpleQueue())
+            Thread(target=_serve, args=_helpers[-1:], name=f"kgs-compiled-{helper}", daemon=True).start()
+        _helpers[helper].put(work)
+    work.drain()
+    errors = [error for error in (work.done.get() for _ in range(total)) if error is not None]
+    if errors:
+        raise errors[0]
 
 
-def _pool(threads: int) -> ThreadPoolExecutor:
-    if threads not in _pools:
-        _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="kgs-compiled")
-    return _pools[threads]
+def _serve(queue: "SimpleQueue[_Work]") -> None:
+    while True:
+        queue.get().drain()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pools.clear)
+    os.register_at_fork(after_in_child=_helpers.clear)
