@@ -19,11 +19,11 @@ def test_one_knob_is_turned_at_a_time(monkeypatch, tmp_path):
     (tmp_path / "llff/fern").mkdir(parents=True)
     monkeypatch.setenv("KGS_DATA", str(tmp_path))
     cells = knob_cells()
-    assert len(cells) == 2 * 3 * (2 + sum(map(len, KNOBS.values())))
+    assert len(cells) == 2 * 3 * (2 + sum(map(len, KNOBS.values())) + len(KNOBS["backend"]) * len(KNOBS["steps"]))
     default = FitConfig()
     for cell in cells:
         turned = cell.keys() - {"scene", "seed"}
-        assert len(turned) <= 1
+        assert len(turned) <= 1 or turned == {"backend", "steps"}
         assert all(getattr(default, knob) != cell[knob] for knob in turned - {"fast"})
 
 
@@ -45,6 +45,21 @@ def test_summary_is_mean_and_deviation_over_seeds(tmp_path):
     assert float(lines[0]["psnr_sd"]) == pytest.approx(2**0.5)
     assert lines[1]["psnr_sd"] == ""
     assert (tmp_path / "training.png").stat().st_size > 1000
+
+
+def test_each_backend_is_a_curve_of_its_own(monkeypatch, tmp_path):
+    drawn, panels = [], training.panels
+    monkeypatch.setattr(training, "panels", lambda points, *rest, **axes: drawn.append(points) or panels(points, *rest))
+    turned = [
+        {},
+        {"steps": 500},
+        *({"backend": name, **more} for name in ("torch", "numba") for more in ({}, {"steps": 500})),
+    ]
+    text = write_knobs([row(0, 20.0, **each) for each in turned], tmp_path)
+    curves = {label: set(points.value) for label, points in drawn[0].groupby("label")}
+    own = {"default", "steps 500"}
+    assert curves == {"default": {""}, "steps": {"", "500"}, "torch": own, "numba": own}
+    assert "| s | torch steps 500 | 1 | 20.00 |" in text
 
 
 def test_a_fit_of_a_cell(monkeypatch):

@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from kgs.backends import available
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FAST, FitConfig
 from kgs.fit.run import choose_points
@@ -49,7 +50,7 @@ def training(*, out: Path, quick: bool = False, processes: int | None = None, sc
 
 
 def knob_cells(quick: bool = False) -> list[Cell]:
-    """The default, `--fast` and each value of each knob, with three seeds, or (`quick`) two tiny cells."""
+    """The default, `--fast`, each value of each knob and the steps of each backend; (`quick`) two tiny cells."""
     if quick:
         return [{"scene": SYNTHETIC, "seed": 0, "steps": steps} for steps in (20, 40)]
     scenes = [SYNTHETIC]
@@ -57,6 +58,7 @@ def knob_cells(quick: bool = False) -> list[Cell]:
         check_scenes(Path(os.environ["KGS_DATA"]), ["llff/fern"])
         scenes.append("fern")
     settings: list[Cell] = [{}, {"fast": True}, *({knob: value} for knob in KNOBS for value in KNOBS[knob])]
+    settings += [{"backend": backend, "steps": steps} for backend in KNOBS["backend"] for steps in KNOBS["steps"]]
     return [{"scene": scene, "seed": seed, **setting} for seed in range(3) for setting in settings for scene in scenes]
 
 
@@ -91,7 +93,8 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     title = "Test views and CPU seconds of the fit, mean (standard deviation over n seeds)"
     text = markdown_table(title, ["setting", "n", *HEADS.values()], lines, first="scene")
     (out / "training.md").write_text(text, encoding="utf-8")
-    lines_of = [table[table.knob.isin(("default", knob))].assign(label=knob) for knob in table.knob.unique()]
+    curves = {knob: (knob,) if knob in available() else ("default", knob) for knob in table.knob.unique()}
+    lines_of = [table[table.knob.isin(knobs)].assign(label=knob) for knob, knobs in curves.items()]
     points = pd.concat(line.sort_values("cpu_seconds") for line in [*lines_of[1:], *lines_of[:1]])
     points = points.rename(columns={"scene": "panel", "cpu_seconds": "x", "psnr": "y", "psnr_sd": "dy"})
     axes = {"xscale": "log", "xlabel": "CPU seconds of the fit", "ylabel": "test PSNR [dB]"}
@@ -99,6 +102,9 @@ def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     return text
 
 
-def _knob(scene: str, seed: int, **turned: Any) -> dict[str, Any]:
+def _knob(scene: str, seed: int, backend: str = "", **turned: Any) -> dict[str, Any]:
+    """What was turned, and how far; of a backend that is named, which has a curve of its own, the rest is "how far"."""
     knob, value = next(iter(turned.items()), ("default", ""))
-    return {"scene": scene, "seed": seed, "knob": knob, "value": "" if value is True else str(value)}
+    value = "" if value is True else str(value)
+    value = f"{knob} {value}".strip() if backend else value
+    return {"scene": scene, "seed": seed, "knob": backend or knob, "value": value}
