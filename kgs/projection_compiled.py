@@ -103,19 +103,14 @@ def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, .
     """What the kernels know of each camera; in NumPy, which is faster for numbers as few."""
     views = list[tuple[Array, ...]]()
     for matrix, pose in zip(*_arrays(cameras.intrinsics, cameras.extrinsics), strict=True):
-        limits = _tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], *size)
+        focal, centre, extent = matrix.diagonal()[:2], matrix[:2, 2], np.array(size[::-1], matrix.dtype)
+        first, last = -(centre + 0.5 + MARGIN * extent) / focal, (extent - 0.5 - centre + MARGIN * extent) / focal
+        limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
         rotation = pose[:3, :3]
         turned = (np.abs(rotation @ rotation.T - np.eye(3, dtype=pose.dtype)) <= 1e-3).all()
         inverse = rotation.T if turned else np.linalg.inv(rotation)
         views.append((pose[:3], matrix[:2, :3].copy(), limits, -(inverse @ pose[:3, 3])))
     return views
-
-
-def _tangent_limits(focal: Array, centre: Array, height: int, width: int) -> Array:
-    """`kgs.camera.tangent_limits` of arrays."""
-    size = np.array([width, height], focal.dtype)
-    first, last = -(centre + 0.5 + MARGIN * size) / focal, (size - 0.5 - centre + MARGIN * size) / focal
-    return np.stack([np.minimum(first, last), np.maximum(first, last)], 1)
 
 
 def _arrays(*tensors: Tensor) -> tuple[Array, ...]:
