@@ -52,7 +52,7 @@ class _Notice(event.Listener):
     def on_start(self, event: Any) -> None:
         """A function is being compiled: of kgs or of anybody."""
         ours = event.data["dispatcher"].py_func.__module__.startswith(__package__ + ".")
-        if ours and not self.said and sys.stderr.isatty():
+        if ours and not self.said and sys.stderr is not None and sys.stderr.isatty():  # None: closed by `2>&-`
             print("kgs: compiling, once, about 20 s", file=sys.stderr, flush=True)
             self.said = True
 
