@@ -21,9 +21,24 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the 
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
 
+# What pytest -n hands out first: a file that compiles the kernels, beside it those that use none; then long ones.
+_FIRST = (
+    *("test_resume", "test_study_report", "test_synthetic", "test_wheel", "test_figures", "test_notebooks"),
+    *("test_cli_process", "test_trainer", "test_study_grid", "test_study_cells", "test_bench_speed", "test_faults"),
+)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """What no kernel covers is not run a second time: of float64, of a GPU or of torch alone, by what it asks for."""
     items[:] = [item for item in items if not _runs_on_torch_again(item)]
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        items.sort(key=lambda item: _FIRST.index(item.path.stem) if item.path.stem in _FIRST else len(_FIRST))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config) -> None:
+    """Files are handed out in this order, not by their number of tests: a long one at the end would run alone."""
+    config.option.loadscopereorder = False
 
 
 def _runs_on_torch_again(item: pytest.Function) -> bool:

@@ -152,8 +152,9 @@ def execute(path, folder, quick):
         km=AsyncKernelManager(kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[])),
         resources={"metadata": {"path": str(folder / "notebooks")}},
         timeout_func=lambda cell: max(1, end - time.monotonic()),
+        shutdown_kernel="immediate",
     )
-    client.execute(env=environment)
+    client.execute(env=environment, cleanup_kc=True)  # else the kernel lives, with its memory, as long as the tests
     return notebook
 
 
