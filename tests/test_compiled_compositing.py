@@ -281,7 +281,7 @@ def test_pixels_are_the_lanes(kernel):
 
     f, i8 = nb.float32, nb.int64
     types = {"grid": nb.types.UniTuple(i8, 2), "offsets": i8[::1], "entries": nb.int32[::1], "table": f[:, ::1]}
-    types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3), "median": nb.types.Tuple(())}
+    types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
     types |= {
         "starts": f[:, ::1],
         "done": i8[::1],

@@ -51,8 +51,7 @@ def alpha_of(o, ax, ay, bx, by, dx, dy, threshold):
 
 @jit
 def composite_forward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, median, starts, done, light, depths,
-    sums,
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, light, depths, sums
 ):  # fmt: skip
     """A block of features: sums over layers, the light behind them and the median depth, straight into the images.
 
@@ -66,18 +65,17 @@ def composite_forward(
         stop: less light is 0.
         feature: where the block begins.
         channels: any tuple of as many numbers as the block has features.
-        median: any tuple of one number where the median depth is wanted, else of none.
         starts: out, T at the beginning of each chunk, `(chunks, P)`, see `count_chunks`; or empty.
         done: out, how many entries of each tile were reached.
         light: out, `(C, H, W)`.
-        depths: out, `(C, H, W)`, where the median depth is wanted.
+        depths: out, the median depth, `(C, H, W)`; or empty.
         sums: out, `(C, F, H, W)`.
     """
     height, width = light.shape[1], light.shape[2]
-    F, M = len(channels), len(median)
+    F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
     place_pixels(pixels)
-    s = scratch((2 + F + M) * P)  # T, w, sums, median depth
+    s = scratch((3 + F) * P)  # T, w, sums, depth of the last layer before which T was at least one half
     layers = np.empty((K, 7 + F), np.float32)
     last_column = table.shape[1] - 1
     keep = len(starts) > 0
@@ -87,7 +85,7 @@ def composite_forward(
         cx, cy = f32(x0) + _CENTRE, f32(y0) + _CENTRE
         for p in range(P):  # pixels beyond the image have no light
             s[p] = ONE if (x0 + p % SIZE < width and y0 + p // SIZE < height) else ZERO
-        for p in range((F + M) * P):
+        for p in range((F + 1) * P):
             s[2 * P + p] = ZERO
         first, last = offsets[t], offsets[t + 1]
         chunk = first // K + t
@@ -107,15 +105,15 @@ def composite_forward(
             for k in range(n):
                 o, ux, uy = layers[k, 0], layers[k, 1] - cx, layers[k, 2] - cy
                 ax, ay, bx, by = layers[k, 3], layers[k, 4], layers[k, 5], layers[k, 6]
-                depth = table[entries[e + k], last_column]
+                if median:
+                    depth = table[entries[e + k], last_column]
+                    for p in range(P):
+                        s[(2 + F) * P + p] = depth if s[p] >= HALF else s[(2 + F) * P + p]
                 for p in range(P):
                     a = alpha_of(o, ax, ay, bx, by, pixels[p] - ux, pixels[P + p] - uy, threshold)
                     w = a * s[p]
                     left = s[p] - w
                     left = left if left >= stop else ZERO
-                    if M:
-                        crossed = s[p] >= HALF and left < HALF
-                        s[(2 + F) * P + p] = depth if crossed else s[(2 + F) * P + p]
                     s[P + p] = w
                     s[p] = left
                 for f in range(F):
@@ -126,9 +124,9 @@ def composite_forward(
         done[t] = e - first
         for y in range(min(SIZE, height - y0)):
             for x in range(min(SIZE, width - x0)):
-                light[camera, y0 + y, x0 + x] = s[y * SIZE + x]
-                if M:
-                    depths[camera, y0 + y, x0 + x] = s[(2 + F) * P + y * SIZE + x]
+                left = light[camera, y0 + y, x0 + x] = s[y * SIZE + x]
+                if median:
+                    depths[camera, y0 + y, x0 + x] = s[(2 + F) * P + y * SIZE + x] if left < HALF else ZERO
                 for f in range(min(F, sums.shape[1] - feature)):
                     sums[camera, feature + f, y0 + y, x0 + x] = s[(2 + f) * P + y * SIZE + x]
 

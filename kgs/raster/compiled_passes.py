@@ -84,7 +84,6 @@ class _Passes:
         count = len(part.bounds) - 1
         done: list[_Done] = [None] * count  # type: ignore[list-item]
         rules = (self.threshold, self.stop)
-        depth = (0,) * (len(median) > 0)
 
         def work(begin: int, end: int) -> None:
             for b in range(begin, end):
@@ -95,7 +94,7 @@ class _Passes:
                 lists = (band.first_tile, self.reach.grid, band.offsets, band.entries, band.table, *rules)
                 for first, width in self.blocks if len(sums) else self.blocks[:1]:
                     rest = (starts, reached, light, median, sums)
-                    kernels.composite_forward(*lists, first, (0,) * width, depth, *rest)
+                    kernels.composite_forward(*lists, first, (0,) * width, *rest)
                 if keep:
                     done[b] = _Done(band, starts, reached)
 
