@@ -196,7 +196,7 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
             return _perspective_jacobian(k, points, limits)
         if brown_conrady:
             z = points[:, 2]
-            points = torch.stack([*((points[:, i] / z).clamp(*limits[i]) * z for i in (0, 1)), z], 1)
+            points = torch.stack([*(_held(points[:, i] / z, *limits[i]) * z for i in (0, 1)), z], 1)
         return _reverse_jacobian(pixels, points)
 
     sees = None if plain else _before_fold(params.tolist(), brown_conrady)
@@ -236,9 +236,14 @@ def tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Te
 def _perspective_jacobian(k: Tensor, points: Tensor, limits: Tensor) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
     inverse = 1.0 / points[:, 2]
-    tangents = [(points[:, i] * inverse).clamp(low, high) for i, (low, high) in enumerate(limits)]
+    tangents = [_held(points[:, i] * inverse, low, high) for i, (low, high) in enumerate(limits)]
     last = -inverse[:, None] * in_full_precision(torch.matmul, torch.stack(tangents, 1), k.T)
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
+
+
+def _held(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """`x.clamp(low, high)` with the gradient of `x` at the limits too, as before torch 2.14."""
+    return x.masked_fill(x < low, low).masked_fill(x > high, high)
 
 
 def _reverse_jacobian(pixels: Pixels, points: Tensor) -> Tensor:

@@ -257,7 +257,7 @@ class Trainer:
                 self.drop.scores = gaussian_scores(config.drop_by, self.densifier, camera)
         gaussians = self.model()
         out = self.renderer(gaussians, camera, self._background)
-        image = out.image.clamp(max=1.0)  # it is never below 0
+        image = out.image.masked_fill(out.image > 1, 1.0)  # it is never below 0
         loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
         if config.opacity_l1:
             low = config.opacity_l1_by == "gradient"
