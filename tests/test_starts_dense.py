@@ -13,7 +13,7 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.starts import _sweep_range, first_points
 from kgs.fit.starts.dense import dense_points
-from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, sweep_depths, warp
+from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, planes_wanted, sweep_depths, warp
 from kgs.fit.starts.triangulate import project_all
 
 
@@ -190,3 +190,45 @@ def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float
     same = (scaled.depths / (1e-3 * plain.depths) - 1).abs() < 1e-3
     assert float(same.double().mean()) > 0.99
     assert math.isfinite(float(scaled.scores.sum()))
+
+
+# -- how many planes, and which points ------------------------------------------------------------------------------
+
+
+def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
+    """Side by side, a point of depth z is f b / z pixels apart."""
+    intrinsics, extrinsics = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = 500.0
+    extrinsics[1, 0, 3] = -0.3
+    side = torch.full((2,), 64.0)
+    views = Views(PinholeCamera(intrinsics, extrinsics, side, side), torch.rand(2, 3, 64, 64), ("a", "b"))
+    assert planes_wanted(views, 2.0, 10.0) * 127 / 128 == pytest.approx(500 * 0.3 * (1 / 2 - 1 / 10), rel=1e-6)
+    assert planes_wanted(views.select([0]), 2.0, 10.0) == 0.0
+
+
+@pytest.mark.parametrize("count", [50, 400])
+def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
+    spread, _ = dense_points(views, *span, count, generator(), draw="spread")
+    uniform, _ = dense_points(views, *span, count, generator(), draw="uniform")
+    assert 0.9 * count <= len(spread) <= count == len(uniform)
+
+    def apart(points: torch.Tensor) -> float:
+        """The lower quartile of the distances to the nearest other point's pixel, in the nearest view."""
+        pixels, _ = project_all(points, views.cameras)
+        distances = torch.cdist(pixels[:, 0], pixels[:, 0]).fill_diagonal_(math.inf)
+        return float(distances.amin(1).quantile(0.25))
+
+    assert apart(spread) > apart(uniform)
+    again, _ = dense_points(views, *span, count, generator(), draw="spread")
+    assert torch.equal(spread, again)
+
+
+def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
+    every = [dense_points(views, *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")]
+    assert len(every[0]) == len(every[1])
+    assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
+
+
+def test_another_draw_is_refused(views: Views) -> None:
+    with pytest.raises(ValueError, match="draw: expected one of"):
+        first_points(views, draw="even")

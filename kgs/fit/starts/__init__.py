@@ -21,7 +21,7 @@ from .triangulate import camera_centers, project_all, triangulate_certain, unpro
 
 __all__ = ["FirstPoints", "first_points", "typical_depths"]
 
-KINDS = ("dense", "sift", "random", "file")
+KINDS, DRAWS = ("dense", "sift", "random", "file"), ("uniform", "spread")
 FEWEST_DENSE = 1000
 FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
 MAX_SPACING = 4.0  # of a point, in medians of all
@@ -53,6 +53,7 @@ def first_points(
     origin: Tensor | None = None,
     stage: Stage = silent,
     backend: str = "auto",
+    draw: str = "uniform",
 ) -> FirstPoints:
     """Find the points a fit starts from.
 
@@ -69,16 +70,19 @@ def first_points(
         origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
         stage: shows how far the work is: :func:`kgs.fit.progress.each`, or nothing.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
+        draw: of "dense" points: "uniform", or "spread" evenly over the pictures.
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.
 
     Raises:
-        ValueError: another kind, `count` below 1, or no file for "file".
+        ValueError: another kind or draw, `count` below 1, or no file for "file".
         DataError: the file is missing, broken, compressed, too large, or has no points.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
+    if draw not in DRAWS:
+        raise ValueError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     if kind == "file":
@@ -95,7 +99,7 @@ def first_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
-        dense, colors = dense_points(views, near, far, count, generator, stage, backend)
+        dense, colors = dense_points(views, near, far, count, generator, stage, backend, draw)
         if len(dense) >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind)
         message = f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead"

@@ -1,17 +1,21 @@
 """A dense first cloud: points of the training views' depth maps, where the views agree."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
-from .plane_sweep import DepthMap, sweep_depths
+from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 from .triangulate import project_all, unproject
 
 SCORE = 0.6  # a patch of a point has to match at least so well
-MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000
-AGREEMENT = 0.01  # relative difference of the depths that two views have of a point
+MOST_PIXELS, MOST_PIXELS_OF_ALL, SMALLEST = 250_000, 1_600_000, 64
+# Two views agree on a point whose depths differ by this share, or whose places by so many pixels: far away, and where
+# planes are far apart, depths are vaguer than the pictures tell.
+AGREEMENT, AGREEMENT_PIXELS = 0.01, 0.5
 
 
 def dense_points(
@@ -22,26 +26,45 @@ def dense_points(
     generator: torch.Generator,
     stage: Stage = silent,
     backend: str = "auto",
+    draw: str = "uniform",
 ) -> tuple[Tensor, Tensor]:
     """At most `count` points between two depths that two views agree on, drawn at random, and RGB, both `(P, 3)`.
 
-    Where the views have masks, points lie where both are above 0.5. Large pictures, and many, are swept at half the
-    width and height, or a quarter: they give enough points, in bounded time and memory.
+    The draw is "uniform", or "spread" evenly over the pictures: one point from each of as many cells. Where the views
+    have masks, points lie where both are above 0.5. Large pictures, and many, and such as move by more pixels than a
+    sweep has planes, are swept at half the width and height, or a quarter: enough points, in bounded time and memory.
     """
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
+        views = views.halved()
+    while planes_wanted(views, near, far) > MOST_PLANES and min(views.images.shape[-2:]) >= 2 * SMALLEST:
         views = views.halved()
     maps = sweep_depths(views, near, far, stage, backend)
     certain = [there.is_inner & (there.scores > SCORE) for there in maps]
     if views.masks is not None:
         certain = [good & (mask[0] > 0.5).cpu() for good, mask in zip(certain, views.masks, strict=True)]
     found = [_agreed(views, maps, certain, view) for view in range(len(views))]
-    points, colors = (torch.cat(parts) for parts in zip(*found, strict=True))
-    chosen = torch.randperm(len(points), generator=generator)[:count]
+    points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
+    chosen = torch.randperm(len(points), generator=generator)
+    chosen = chosen[_one_a_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     return points[chosen].float(), colors[chosen]
 
 
-def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor]:
-    """The points of one view's certain pixels that another view's have too, and their colours in that view."""
+def _one_a_cell(places: NDArray[np.int64], count: int) -> Tensor:
+    """The rows of the first place `(view, x, y)` in each of at most `count` cells, as small as that allows."""
+    first = np.arange(len(places))
+    least, most = 1.0, float(places.max(initial=0) + 1)  # of the side of a cell, in pixels
+    while len(first) > count or (len(places) > count and most - least > 1e-3):
+        side = 0.5 * (least + most)
+        cells = np.column_stack([places[:, 0], (places[:, 1:] / side).astype(np.int64)])
+        _, first = np.unique(cells, axis=0, return_index=True)
+        least, most = (side, most) if len(first) > count else (least, side)
+        if most - least < 1e-9:
+            break  # more views than points
+    return torch.from_numpy(np.sort(first))[:count]
+
+
+def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The points of one view's certain pixels that another view's have too, their colours and places in that view."""
     here = maps[view].depths
     rows, columns = certain[view].nonzero().unbind(1)
     pixels = torch.stack([columns, rows], 1)
@@ -52,5 +75,13 @@ def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int
         places, depth = pixels[:, other].round(), depths[:, other]
         inside = ((places >= 0) & (places < torch.tensor(here.mT.shape))).all(1) & (depth > 0)
         x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
-        agreed |= inside & ((maps[other].depths[y, x] / depth - 1).abs() < AGREEMENT) & certain[other][y, x]
-    return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed]
+        there = maps[other].depths[y, x].double()
+        here_again = [
+            project_all(unproject(torch.stack([x, y], 1), z, torch.full_like(x, other), views.cameras), views.cameras)
+            for z in (there, depth)
+        ]
+        apart = (here_again[0][0][:, view] - here_again[1][0][:, view]).norm(dim=1)
+        near = ((there / depth - 1).abs() < AGREEMENT) | (apart < AGREEMENT_PIXELS)
+        agreed |= inside & near & certain[other][y, x]
+    places = torch.stack([torch.full_like(rows, view), columns, rows], 1)[agreed]
+    return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed], places

@@ -20,7 +20,7 @@ from kgs.fit.progress import Stage, silent
 
 from .triangulate import camera_centers, matrices
 
-PLANES = 128
+PLANES, MOST_PLANES = 128, 256  # as many as a picture moves by pixels, in these limits
 WINDOW = 7  # pixels, the side of the patches that are compared
 NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
@@ -47,7 +47,8 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, b
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
-    inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
+    planes = min(max(math.ceil(planes_wanted(views, near, far)), PLANES), MOST_PLANES)
+    inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
         if others := _neighbours(views, view, 1 / float(inverse.mean())):
@@ -59,6 +60,20 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, b
             unknown = torch.full_like(grey[view], -1.0)
             maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
     return maps
+
+
+def planes_wanted(views: Views, near: float, far: float) -> float:
+    """The number of pixels by which the middle of a view moves in a neighbour from one depth to the other: a median."""
+    inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
+    middle = torch.tensor([views.images.shape[-1] / 2, views.images.shape[-2] / 2, 1.0], dtype=torch.float64)
+    steps = []
+    for view in range(len(views)):
+        for other in _neighbours(views, view, 1 / float(inverse.mean())):
+            mapped = _homographies(views.cameras, view, other, inverse) @ middle
+            mapped = mapped[mapped[:, 2] > 0]
+            if len(mapped) > 1:
+                steps.append((mapped[1:, :2] / mapped[1:, 2:] - mapped[:-1, :2] / mapped[:-1, 2:]).norm(dim=1).median())
+    return PLANES * float(torch.stack(steps).median()) if steps else 0.0
 
 
 def _neighbours(views: Views, view: int, depth: float) -> list[int]:
