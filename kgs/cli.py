@@ -11,14 +11,15 @@ import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from importlib import import_module
+from itertools import pairwise
 from typing import Annotated, Any, get_type_hints
 
 from .errors import DataError, TrainingDiverged
 from .fit.commands import demo, evaluate, fit, render
-from .fit.config import FAST, FitConfig, Recipe
+from .fit.config import FAST, PRESETS, FitConfig, Recipe
 from .fit.progress import say
 
 _COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
@@ -141,6 +142,11 @@ def _call(function: Callable[..., Any], prog: str, words: list[str]) -> int:
             hints[name] = Annotated[hints[name], marks[name]]
     function.__annotations__ = hints
     if "config" in hints:
-        function = partial(function, config=FAST if "--fast" in words else FitConfig())
+        chosen = [word.removeprefix("--preset=") for word in words if word.startswith("--preset=")]
+        chosen += [then for word, then in pairwise(words) if word == "--preset"]
+        config = PRESETS.get((chosen or ["auto"])[-1], PRESETS["auto"])
+        function = partial(
+            function, config=replace(config, steps=FAST.steps, coarse=FAST.coarse) if "--fast" in words else config
+        )
     result = tyro.cli(function, prog=prog, args=words, config=(tyro.conf.FlagCreatePairsOff,))
     return result if isinstance(result, int) else 0

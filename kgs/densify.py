@@ -168,6 +168,14 @@ class Densifier:
         lowered = self.model.opacity_logits.clamp(max=math.log(ceiling / (1.0 - ceiling)))
         self._replace("opacity_logits", lowered, kept=torch.empty(0, dtype=torch.int64, device=lowered.device))
 
+    @torch.no_grad()
+    def decay_opacity(self, factor: float) -> None:
+        """Multiply all opacities by `factor`, in (0, 1) (else a ValueError), in place; Adam's moments stay."""
+        if not 0.0 < factor < 1.0:
+            raise ValueError(f"factor: expected a number in (0, 1), got {factor}")
+        logits = self.model.opacity_logits  # of f s(x): log f - log(e^-x + 1 - f)
+        logits.copy_(math.log(factor) - torch.logaddexp(-logits, logits.new_tensor(1.0 - factor).log()))
+
     def state_dict(self) -> dict[str, Tensor]:
         """The statistics and the generator's state, for a checkpoint."""
         return {name: x.clone() for name, x in self._statistics.items()} | {"generator": self.generator.get_state()}

@@ -105,6 +105,13 @@ class GaussianModel(nn.Module):
         sh_dc = ((colors.detach().to(points) - 0.5) / SH_C0)[:, None]
         return cls(points, quats, log_scales, logits, sh_dc, points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3))
 
+    def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
+        """A model of the Gaussians at `rows`, bool `(N,)` or integers, with harmonics up to a degree, None: as here."""
+        degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
+        values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
+        values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
+        return GaussianModel(**values, sh_degree=min(degree, self.sh_degree))
+
     @property
     def max_sh_degree(self) -> int:
         """The degree the harmonics have room for."""

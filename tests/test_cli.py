@@ -16,7 +16,7 @@ import pytest
 
 import kgs
 from kgs import cli
-from kgs.fit.config import FAST, FitConfig
+from kgs.fit.config import FAST, PAPER, FitConfig
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
@@ -46,8 +46,8 @@ def test_fit_writes_everything(fitted):
 def test_metrics_have_the_agreed_keys(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
-        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "steps", "seed", "drop", "init", "backend",
-        "protocol", "versions",
+        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "needs", "steps", "seed", "drop", "init",
+        "backend", "protocol", "versions",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None
@@ -60,7 +60,7 @@ def test_metrics_have_the_agreed_keys(fitted):
 def test_the_splat_is_the_model(fitted):
     model = kgs.load_ply(fitted / "splat.ply")
     assert len(model) == json.loads((fitted / "metrics.json").read_text())["gaussians"]
-    assert model.max_sh_degree == 3
+    assert model.max_sh_degree == 0  # three training views
 
 
 def test_config_says_what_happens_when(fitted):
@@ -182,7 +182,7 @@ def test_as_many_first_points_as_asked_for(folder, tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text())["init"] == {"kind": "random", "points": 321}
 
 
-def test_fast_is_a_start_that_options_change(folder, tmp_path, monkeypatch):
+def test_presets_and_fast_are_starts_that_options_change(folder, tmp_path, monkeypatch):
     seen = []
 
     def fit_scene(scene, config, *args, **kwargs):
@@ -190,9 +190,14 @@ def test_fast_is_a_start_that_options_change(folder, tmp_path, monkeypatch):
         raise kgs.DataError(folder, "", "enough")
 
     monkeypatch.setattr("kgs.fit.run.fit_scene", fit_scene)
-    for options in ([], ["--fast"], ["--fast", "--steps", 700], ["--steps", 700]):
+    paper = ["--preset", "paper"]
+    for options in ([], ["--fast"], ["--fast", "--steps", 700], ["--steps", 700], paper, [*paper, "--fast"]):
         assert run("fit", folder, "-o", tmp_path, *options) == 2
-    assert seen == [FitConfig(), FAST, replace(FAST, steps=700), FitConfig(steps=700)]
+    fast_paper = replace(PAPER, steps=FAST.steps, coarse=FAST.coarse)
+    assert seen == [FitConfig(), FAST, replace(FAST, steps=700), FitConfig(steps=700), PAPER, fast_paper]
+    assert run("fit", folder, "-o", tmp_path, "--preset=plain", "--sh-degree", 1) == 2
+    assert seen[-1] == replace(PAPER, drop=0.0, sh_degree=1)
+    assert run("fit", folder, "-o", tmp_path, "--preset", "none") == 2
 
 
 def test_versions(capsys):

@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,11 +12,11 @@ import numpy as np
 import pytest
 
 import kgs.fit
-from kgs.fit.config import FitConfig, Recipe, timetable
+from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, timetable
 
 
 def test_full_length_is_the_release():
-    times = timetable(FitConfig(steps=10_000))
+    times = timetable(replace(PAPER, steps=10_000))
     assert times.sh == (1000, 2000, 3000)
     assert times.densify == tuple(range(600, 10_000, 100))
     assert len(times.densify) == 94
@@ -23,7 +24,7 @@ def test_full_length_is_the_release():
 
 
 def test_short_fit_scales_counts():
-    times = timetable(FitConfig(steps=2000))
+    times = timetable(replace(PAPER, steps=2000))
     assert times.sh == (200, 400, 600)
     assert times.densify == tuple(range(200, 2000, 100))  # on as much evidence as the recipe, see timetable
     assert times.reset == (600, 1200)
@@ -38,8 +39,19 @@ def test_densification_is_never_closer_than_ten_steps(steps):
 
 @pytest.mark.parametrize("steps", [500, 2000, 4000, 10_000, 30_000])
 def test_a_reset_leaves_time_to_recover(steps):
-    times = timetable(FitConfig(steps=steps))
+    times = timetable(replace(PAPER, steps=steps))
     assert all(end - step >= 200 for step, end in pairwise([*times.reset, steps]))
+
+
+def test_the_default_leaves_out_resets_and_harmonics():
+    times = timetable(PRESETS["auto"])
+    assert (times.sh, times.reset) == ((), ())
+    assert times.densify == timetable(PAPER).densify
+
+
+def test_plain_is_paper_without_dropping():
+    assert replace(PRESETS["plain"], drop=PAPER.drop) == PRESETS["paper"] == PAPER
+    assert PRESETS["plain"].drop == 0
 
 
 def test_config_survives_json():

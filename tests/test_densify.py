@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from densifiers import LARGE, SMALL, seen
 from densifiers import densifier as make
+from factories import random_model
 
-from kgs.densify import DensifyReport, camera_extent
+from kgs.densify import Densifier, DensifyReport, camera_extent
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 
@@ -237,3 +239,22 @@ def test_mean_gradients_go_on_through_a_step_and_children_inherit_them():
     assert densifier.mean_gradients.tolist() == pytest.approx([1.6 / 3, 0.1 / 2, 1.6 / 3, 1.8 / 3, 1.8 / 3])
     densifier.observe(seen(model, [1], [[0.4, 0.0]]))
     assert densifier.mean_gradients.tolist() == pytest.approx([1.6 / 3, 0.45 / 2, 1.6 / 3, 1.8 / 3, 1.8 / 3])
+
+
+def test_decay_multiplies_opacities():
+    model = random_model(50, 0)
+    with torch.no_grad():
+        model.opacity_logits[:4] = torch.tensor([30.0, -30.0, math.inf, -math.inf])
+    densifier = Densifier(model, torch.optim.Adam(model.parameters()), 1.0)
+    before = model.opacity_logits.detach().double().sigmoid()
+    parameter = model.opacity_logits
+    densifier.decay_opacity(0.99)
+    assert model.opacity_logits is parameter
+    np.testing.assert_allclose(model.opacity_logits.detach().double().sigmoid(), 0.99 * before, rtol=2e-6)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0, -0.5, math.nan])
+def test_decay_wants_a_factor_below_one(factor):
+    model = random_model(5, 0)
+    with pytest.raises(ValueError, match="factor: expected a number in"):
+        Densifier(model, torch.optim.Adam(model.parameters()), 1.0).decay_opacity(factor)

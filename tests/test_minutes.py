@@ -15,7 +15,8 @@ from kgs.fit.minutes import steps_within
 from kgs.fit.run import choose_points
 from kgs.json_files import read_json
 
-CONFIG = FitConfig(minutes=0.1, init="random", init_points=60, recipe=Recipe(grad_threshold=1e-5))
+# The time ends with the last step.
+CONFIG = FitConfig(minutes=0.1, init="random", init_points=60, keep_all=True, recipe=Recipe(grad_threshold=1e-5))
 
 
 @pytest.fixture

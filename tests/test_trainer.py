@@ -13,6 +13,7 @@ from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.trainer import Trainer
+from kgs.renderer import GaussianRenderer
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -39,9 +40,9 @@ def whole(each_backend, scene, points):
     return fitted(scene, points)
 
 
-def test_it_learns(whole, scene, points):
-    curve = whole.curve
-    assert [point["step"] for point in curve] == [10, 20, 30]
+def test_it_learns(each_backend, scene, points):
+    curve = fitted(scene, points, replace(CONFIG, steps=60)).curve
+    assert [point["step"] for point in curve] == [20, 40, 60]
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"]
     assert curve[-1]["train_psnr"] > Trainer(scene, CONFIG, points).psnr(scene.train) + 1
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
@@ -220,3 +221,44 @@ def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path)
     assert sizes[-1] == (32, 40)
     assert_same_bits(trainer, resumed)
     assert not torch.equal(trainer.model.means, whole.model.means[: len(trainer.model)])
+
+
+def test_nothing_is_dropped_in_the_last_tenth(scene, points):
+    trainer, active = Trainer(scene, replace(CONFIG, drop_until=0.9, evaluations=1), points), []
+
+    def note(trainer, _):
+        active.append(trainer.drop.training)
+        trainer.render(scene.train.camera(0))  # which draws all Gaussians, and may not change this
+        return False
+
+    trainer.fit(note)
+    assert active[:-1] == [True] * 27 + [False] * 2
+
+
+# -- backgrounds ------------------------------------------------------------------------------------------------------
+
+
+def test_dark_photos_become_opaque_before_random_backgrounds_alone(scene, points):
+    """Where the background is black, nothing says whether a dark photo is transparent."""
+    dark = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images)))
+    seen = {}
+    for background in ("random", "scene"):
+        config = replace(CONFIG, steps=60, drop=0.0, training_background=background)
+        trainer = fitted(dark, points, config)
+        renderer = GaussianRenderer(near_plane=trainer.near_plane).eval()
+        with torch.no_grad():
+            out = renderer(trainer.model(), scene.train.camera(0), outputs=("alpha",))
+        seen[background] = float(out.alpha.mean())
+    assert seen["random"] > 1.5 * seen["scene"]
+
+
+def test_transparent_photos_stay_transparent_before_random_backgrounds(scene, points):
+    masks = torch.zeros_like(scene.train.images[:, :1])
+    clear = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images), masks=masks))
+    trainer = Trainer(clear, replace(CONFIG, steps=60, drop=0.0), points)
+    renderer, alphas = GaussianRenderer(near_plane=trainer.near_plane).eval(), []
+    for steps in (0, 59):
+        trainer.fit(lambda trainer, _, steps=steps: trainer.step >= steps)
+        with torch.no_grad():
+            alphas.append(float(renderer(trainer.model(), scene.train.camera(0), outputs=("alpha",)).alpha.mean()))
+    assert alphas[1] < 0.5 * alphas[0]

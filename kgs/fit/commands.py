@@ -70,6 +70,7 @@ def fit(
     views: int | None = None,
     downscale: float | None = None,
     background: _Background = "black",
+    preset: Literal["auto", "paper", "plain"] = "auto",
     fast: bool = False,
     resume: bool = False,
     lpips_weights: Path | None = None,
@@ -87,7 +88,9 @@ def fit(
         views: training views, spread over the views that are not held out; all of them unless given.
         downscale: shrink the photos by this factor.
         background: behind photos with transparency.
-        fast: a third of the time for 0.1 to 0.5 dB less PSNR of test views: other defaults, see --fast --help.
+        preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
+            counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
+        fast: half the steps or less, for some less PSNR of test views: other defaults, see --fast --help.
         resume: continue from the checkpoint in the output folder.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
@@ -95,6 +98,7 @@ def fit(
     from .folder import RESULTS
     from .outputs import check_folder
     from .run import fit_scene
+    from .slim import in_words
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
@@ -112,6 +116,8 @@ def fit(
     _print_metrics(metrics)
     splat, renders, shrunk = out / "splat.ply", out / "renders", ("--downscale", downscale) if downscale else ()
     say(f"{splat}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
+    if left_out := in_words(metrics["needs"]):
+        say(f"left out: {left_out}")
     if stopped_by:
         _next("the same command with --resume goes on where it stopped")
         return 128 + stopped_by

@@ -1,10 +1,11 @@
 """Every number of a fit, as frozen dataclasses; each is checked here, and only here.
 
-Source: the official release of "DropGaussian" (CVPR 2025) for the recipe, which is that of Kerbl et al. 2023 with
-another densification threshold and without pruning by size.
+Source: the official release of "DropGaussian" (CVPR 2025) for the recipe of the presets `paper` and `plain`, which is
+that of Kerbl et al. 2023 with another densification threshold and without pruning by size. The default leaves out the
+resets of opacities and, where the training views do not need them, harmonics; docs/recipe.md has what each part gains.
 """
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from os import PathLike
@@ -58,7 +59,9 @@ class Recipe:
         grad_threshold: mean gradient in normalised device coordinates from which a Gaussian is densified.
         percent_dense: largest scale, relative to the extent, up to which it is cloned rather than split.
         prune_opacity: Gaussians below this opacity are removed.
-        reset_interval: steps between two resets of all opacities.
+        opacity_decay: all opacities are multiplied by it after each step, in (0, 1]; never scaled.
+        decay_from: share of the steps before that, in [0, 1].
+        reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: what they are lowered to.
         reset_recovery: a reset is left out where fewer steps than this follow before the next one or the end.
         near_plane: times the 1st percentile of the first points' depths.
@@ -70,8 +73,8 @@ class Recipe:
     lr_sh_dc: _Weight = 2.5e-3
     lr_sh_rest: _Weight = 1.25e-4
     lr_opacity: _Weight = 0.05
-    lr_scales: _Weight = 0.005
-    lr_quats: _Weight = 0.001
+    lr_scales: _Weight = 0.02
+    lr_quats: _Weight = 0.004
     adam_eps: _Weight = 1e-15
     sh_interval: _Steps = 1000
     dssim_weight: _Weight = 0.2
@@ -80,7 +83,9 @@ class Recipe:
     grad_threshold: _Weight = 5e-4
     percent_dense: _Positive = 0.01
     prune_opacity: _Share = 0.005
-    reset_interval: _Steps = 3000
+    opacity_decay: Annotated[float, _Range(0, 1, "(]")] = 0.995
+    decay_from: _Share = 0.05
+    reset_interval: _Count = 0
     reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
     reset_recovery: _Count = 300
     near_plane: _Positive = 0.05
@@ -99,11 +104,13 @@ class FitConfig:
             fix the steps once, after a warm-up, to within a tenth; a resumed fit keeps them. A Trainer goes by `steps`.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
+        drop_until: share of the steps, the first ones, in which Gaussians are dropped; in [0, 1].
         drop_by: random is the method. The others drop by scores, for comparison: the Gaussians with the highest or
             lowest mean gradient, those nearest to or farthest from the camera.
         opacity_l1: weight of the L1 penalty on opacities; 0 leaves it out.
         opacity_l1_by: the penalty is heavier on Gaussians with a low mean gradient, or at a great distance.
-        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3.
+        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, what the training
+            views need, see :mod:`kgs.fit.needs`.
         coarse: share of the steps, the first ones, that see the training views at half their width; in [0, 1].
         seed: everything random derives from it: first points, order of views, splits and masks.
         init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
@@ -112,10 +119,14 @@ class FitConfig:
             file: those of init_file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
         init_points: how many first points random gives, and dense at most.
-        max_gaussians: densification stops at this number; unless given 10 per step, and at least twice the first
+        draw: how these are chosen. spread: one from each of as many even cells of the pictures. uniform: all alike.
+        training_background: random: another colour in each step, so that nothing may stay transparent, or dark, where
+            a photo is opaque. scene: that of the scene, as in test views.
+        max_gaussians: densification stops at this number; unless given 10 per step, and at least 1.5 times the first
             points.
         growth: share of the steps over which the limit rises evenly from the first points to max_gaussians; 0 sets it
             at once. In [0, 1].
+        keep_all: keep Gaussians that no training view shows, and harmonics that change no picture.
         max_bytes: bound for the working memory of a render in bytes; it changes rounding alone.
         evaluations: how often the curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
@@ -130,17 +141,21 @@ class FitConfig:
     minutes: Annotated[float | None, _Range(0, 1e6, "(]")] = None
     drop: Annotated[float, _Range(0, 1, "[)")] = 0.2
     drop_schedule: Literal["linear", "constant"] = "linear"
+    drop_until: _Share = 0.9
     drop_by: Literal["random", "high-gradient", "low-gradient", "near", "far"] = "random"
     opacity_l1: _Weight = 0.0
     opacity_l1_by: Literal["gradient", "distance"] = "gradient"
-    sh_degree: Annotated[int, _Range(0, 3)] = 3
+    sh_degree: Annotated[int | None, _Range(0, 3)] = None
     coarse: _Share = 0.0
     seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed is one of torch's
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"
     init_file: Path | None = None
-    init_points: Annotated[int, _Range(1, 10**9)] = 10_000
+    init_points: Annotated[int, _Range(1, 10**9)] = 20_000
+    draw: Literal["spread", "uniform"] = "spread"
+    training_background: Literal["random", "scene"] = "random"
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
     growth: _Share = 0.0
+    keep_all: bool = False
     max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30
     evaluations: _Steps = 8
     device: str = "cpu"
@@ -166,6 +181,18 @@ class FitConfig:
             raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
 
 
+class Choice(NamedTuple):
+    """What an entry of FitConfig that is None may become."""
+
+    cheaper: Any
+    dearer: Any
+    rule: Any  # where there are too few views for probes
+
+
+# Measured, see docs/recipe.md.
+CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3, rule=0)}
+
+
 class Timetable(NamedTuple):
     """The steps at which things happen in a fit of a given length."""
 
@@ -185,10 +212,10 @@ def timetable(config: FitConfig) -> Timetable:
     recipe, steps = config.recipe, config.steps
     scale = steps / recipe.steps
     interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
-    spacing = max(1, round(recipe.reset_interval * scale))
+    spacing = max(1, round(recipe.reset_interval * scale)) if recipe.reset_interval else steps
     resets, evaluations = [*range(spacing, steps, spacing), steps], range(1, config.evaluations + 1)
     return Timetable(
-        sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, config.sh_degree + 1)),
+        sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
         reset=tuple(s for s, then in pairwise(resets) if then - s >= recipe.reset_recovery),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
@@ -222,13 +249,28 @@ def _plain(value: Any, hint: Any) -> tuple[Any, str]:
     return python(value) if is_number and limits.holds(value) else None, f"a {word} number {limits}"
 
 
-# A third of the default's time for the same PSNR of test views, see docs/error-and-time.md: half the steps at twice the
-# rates, nine in ten of them on a quarter of the pixels, and Gaussians that come as they are needed.
-_FAST_RECIPE = Recipe(lr_means=3e-4, lr_scales=0.01, lr_sh_dc=0.005, lr_sh_rest=2.5e-4)
-FAST = FitConfig(steps=1000, coarse=0.9, max_gaussians=14_000, growth=0.8, recipe=_FAST_RECIPE)
+# The paper's rule and recipe, with its counts scaled; and the same without dropping.
+PAPER = FitConfig(
+    drop_until=1.0,
+    sh_degree=3,
+    init_points=10_000,
+    draw="uniform",
+    training_background="scene",
+    keep_all=True,
+    recipe=Recipe(lr_scales=0.005, lr_quats=0.001, opacity_decay=1.0, reset_interval=3000),
+)
+PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
+# Half the steps, a third of them on a quarter of the pixels, see docs/error-and-time.md.
+FAST = FitConfig(steps=1000, coarse=0.3)
 
 # Small pictures, many Gaussians and raised rates: a minute is then enough to overfit, which is what is to be shown.
-_DEMO_RECIPE = Recipe(
-    lr_means=8e-4, lr_means_final=8e-5, lr_scales=0.015, lr_sh_dc=0.01, lr_sh_rest=0.005, grad_threshold=1e-4
+_DEMO_RECIPE = replace(
+    PAPER.recipe,
+    lr_means=8e-4,
+    lr_means_final=8e-5,
+    lr_scales=0.015,
+    lr_sh_dc=0.01,
+    lr_sh_rest=0.005,
+    grad_threshold=1e-4,
 )
-DEMO = FitConfig(steps=1200, drop=0.2, init="sift", max_gaussians=3000, recipe=_DEMO_RECIPE)
+DEMO = replace(PAPER, steps=1200, init="sift", max_gaussians=3000, recipe=_DEMO_RECIPE)

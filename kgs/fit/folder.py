@@ -144,7 +144,8 @@ def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
     path = out / CHECKPOINT
     state, _ = newest_checkpoint(path)
     try:
-        model = GaussianModel(**state["model"]).to(device)
+        model = GaussianModel(**state["model"])
+        model = (model.select(**part) if (part := state.get("shown")) else model).to(device)
         backend = str(state.get("backend", "torch")) if model.means.device.type == "cpu" else "auto"
         return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend)
     except (KeyError, TypeError, ValueError) as error:

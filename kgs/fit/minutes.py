@@ -32,7 +32,7 @@ def steps_within(scene: Scene, config: FitConfig, points: FirstPoints, begun: fl
     end, config = begun + 60.0 * (config.minutes or 0.0), replace(config, minutes=None, steps=2 * _FIRST)
 
     def most(steps: float) -> float:
-        return config.max_gaussians or max(10 * steps, 2 * len(points.points))  # as in Trainer
+        return config.max_gaussians or max(10 * steps, 3 * len(points.points) // 2)  # as in Trainer
 
     trial = Trainer(scene, replace(config, evaluations=1, coarse=0.0), points)
     trial.fit(lambda trainer, _: trainer.step == _FIRST)

@@ -23,8 +23,10 @@ from .lpips import Lpips
 from .machine import check_device, peak_rss_mb, versions
 from .metrics import evaluate
 from .minutes import steps_within
+from .needs import decide
 from .outputs import check_folder, is_own, png_names, write_json, write_png
 from .progress import Stage, each, progress, say, silent
+from .slim import slim
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
 
@@ -99,12 +101,14 @@ def fit_scene(
             if is_own(out / "splat.ply"):
                 say(f"{out}: the fit there will be replaced when this one is done (--resume would go on with it)")
             begun = time.perf_counter()
+            config, needs = decide(scene, config, choose_points, each)
             points = choose_points(scene, config, each)
             say(f"first points: {len(points.points)} ({points.kind})")
             if config.minutes is not None:
                 config = replace(config, steps=steps_within(scene, config, points, begun))
                 say(f"{config.minutes:g} minutes: {config.steps} steps")
             trainer = Trainer(scene, config, points)
+            trainer.needs |= needs
             say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
@@ -119,7 +123,7 @@ def fit_scene(
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
             write_json(new / "config.json", settings)
             stopped_by = train(trainer, new / CHECKPOINT)
-            save_ply(new / "splat.ply", trainer.model, offset=scene.offset)
+            save_ply(new / "splat.ply", trainer.shown, offset=scene.offset)
             write_curve(new / "curve.png", {"": trainer.curve})
             (new / "test").mkdir(exist_ok=True)
             for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
@@ -165,7 +169,8 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
         "curve": trainer.curve,
         "seconds": round(trainer.seconds, 2),
         "peak_rss_mb": peak_rss_mb() or None,
-        "gaussians": len(trainer.model),
+        "gaussians": len(trainer.shown),
+        "needs": trainer.needs,
         "steps": trainer.step,
         "seed": config.seed,
         "drop": config.drop,
@@ -191,15 +196,13 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
             raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
-    count, file = config.init_points, config.init_file  # in the world's coordinates, as the files that kgs writes
-    origin, backend = scene.offset, config.backend
-    return first_points(
-        views, kind, seed=config.seed, count=count, file=file, origin=origin, stage=stage, backend=backend
-    )
+    rules: dict[str, Any] = {"seed": config.seed, "count": config.init_points, "draw": config.draw}
+    rules |= {"file": config.init_file, "origin": scene.offset}  # files that kgs writes are in the world's coordinates
+    return first_points(views, kind, stage=stage, backend=config.backend, **rules)
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
-    """Train to the end with a progress line and checkpoints, each minute and at evaluations.
+    """Train to the end with a progress line and checkpoints, each minute and at evaluations; then :func:`slim` it.
 
     On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved, and the signal's number returned, else 0. Where a
     checkpoint cannot be written (a full disk) a note says so, and the next one is tried.
@@ -224,6 +227,7 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
             return bool(stopped)
 
         trainer.fit(after_step)
+        slim(trainer)
         save()
     return stopped[0] if stopped else 0
 

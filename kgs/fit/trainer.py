@@ -1,6 +1,7 @@
 """The training loop: one training view per step, deterministic, resumable at every step.
 
-The random streams of views, of splits and of masks never mix: fits of two drop rates see the same views in one order.
+The random streams of views, of splits, of masks and of backgrounds never mix: fits of two drop rates see the same views
+in one order.
 """
 
 import copy
@@ -21,19 +22,18 @@ from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
 from kgs.errors import DataError, TrainingDiverged
-from kgs.losses import TargetMoments, opacity_l1, photometric_loss, target_moments
+from kgs.losses import opacity_l1, photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
 from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
-from .config import FitConfig, timetable
+from .config import CHOICES, FitConfig, timetable
 from .divergence import gradient_fault, parameter_fault, scale_fault
-from .machine import check_device
+from .machine import bytes_of, check_device
 from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
+from .targets import targets
 
-# Measured, with room: what libraries load at first use; parameters, gradients, moments and copies of each Gaussian.
-_BYTES_AT_FIRST_USE, _BYTES_PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 _RATES = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacity"}
 _RATES |= {"sh_dc": "sh_dc", "sh_rest": "sh_rest"}
 
@@ -54,17 +54,19 @@ class Trainer:
         backend: "numba" or "torch", which a resumed fit goes on with.
         notes: lines that a user should read (a capped count, for instance).
         saved: the last checkpoint that was written or read, in words; "" before the first.
+        shown: what :meth:`render` draws: the model, or after :meth:`show` a part of it.
+        needs: what was decided of the scene, for metrics.json.
         init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
         order, stack: the random stream of views, and the views that still come before it is asked again.
+        colors: the random stream of backgrounds.
     """
 
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
         self._prepare(scene, config)
         nearest, median = typical_depths(scene.train, points.points)
-        # a rig without extent (one camera, or a pure rotation) still has to move its Gaussians
-        self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)
+        self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)  # of a rig without one, too
         self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
-        model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree)
+        model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)
         model.sh_degree = 0
         self.near_plane = config.recipe.near_plane * nearest
         self._build(model)
@@ -76,17 +78,17 @@ class Trainer:
         self.times = timetable(config)
         self.step, self.seconds, self.saved = 0, 0.0, ""
         self.curve: list[dict[str, float | None]] = []
-        self.notes: list[str] = []
-        self.stack: list[int] = []
+        self.notes, self.needs, self.stack = list[str](), dict[str, Any](), list[int]()
         self._fingerprint = fingerprint(scene)
         self._background = scene.background.to(self.device, torch.float32) if scene.background.any() else None
-        self._views = self._targets(scene.train)
-        self._coarse_views = self._targets(scene.train.halved()) if self.times.coarse else []
+        sizes = [scene.train, *([scene.train.halved()] if self.times.coarse else [])]
+        self._views = [targets(views, scene.background, self.device) for views in sizes]
 
     def _build(self, model: GaussianModel) -> None:
         config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
-        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 2 * int(self.init["points"]))
-        self.model = model.to(self.device)
+        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 3 * int(self.init["points"]) // 2)
+        self.model = self.shown = model.to(self.device)
+        self._part: dict[str, Any] = {}
         groups = [
             {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
             for name, rate in _RATES.items()  # the means first
@@ -98,27 +100,18 @@ class Trainer:
         limits = {name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")}
         limits |= {"max_gaussians": self.max_gaussians, "generator": torch.Generator().manual_seed(seed + 2)}
         self.densifier = Densifier(self.model, self.optimizer, self.extent, **limits)
-        self.order = torch.Generator().manual_seed(seed + 3)
-
-    def _targets(self, views: Views) -> list[tuple[PinholeCamera, Tensor, TargetMoments]]:
-        """What a step needs of each view: its camera, its image and what D-SSIM wants of that."""
-        images = [image[None].to(self.device, torch.float32) for image in views.images]
-        cameras = [move_camera(views.camera(i), self.device) for i in range(len(views))]
-        return [(camera, image, target_moments(image)) for camera, image in zip(cameras, images, strict=True)]
+        self.order, self.colors = (torch.Generator().manual_seed(seed + stream) for stream in (3, 4))
 
     @property
     def most_bytes(self) -> int:
         """A bound for the bytes that the fit takes beyond what there is now, known before it begins."""
-        images = self.scene.train.images
-        pictures: int = images[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * images.nbytes
-        return _BYTES_AT_FIRST_USE + self.config.max_bytes + self.max_gaussians * _BYTES_PER_GAUSSIAN + pictures
+        return self.config.max_bytes + bytes_of(self.max_gaussians, self.scene.train.images)
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
 
         Raises:
-            TrainingDiverged: a loss, gradient or parameter is not finite, or a scale explodes; no parameter has been
-                changed by that step, and the error names the last good checkpoint.
+            TrainingDiverged: something is not finite, or a scale explodes; no parameter has been changed by that step.
         """
         while self.step < self.config.steps:
             loss = self.train_step()
@@ -135,6 +128,7 @@ class Trainer:
         if self.step >= self.config.steps:
             raise ValueError(f"steps: expected a step of {self.config.steps} to be left, got none")
         start = time.perf_counter()
+        self.shown, self._part = self.model, {}
         loss, step = self._descend(), self.step
         self.seconds += time.perf_counter() - start
         if step in self.times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
@@ -154,11 +148,15 @@ class Trainer:
         self.seconds += time.perf_counter() - start
         return loss
 
+    def show(self, rows: Tensor, sh_degree: int) -> None:
+        """Draw and measure only the Gaussians at `rows`, bool `(N,)`, until the next step; the fit keeps all."""
+        self._part, self.shown = {"rows": rows.cpu(), "sh_degree": sh_degree}, self.model.select(rows, sh_degree)
+
     def render(self, camera: PinholeCamera) -> Tensor:
-        """All Gaussians from one camera, `(1, 3, H, W)`; what `evaluate` wants."""
+        """All Gaussians that are shown from one camera, `(1, 3, H, W)`; what `evaluate` wants."""
         self.renderer.eval()
         with torch.no_grad():
-            image: Tensor = self.renderer(self.model(), move_camera(camera, self.device), self._background).image
+            image: Tensor = self.renderer(self.shown(), move_camera(camera, self.device), self._background).image
         self.renderer.train()
         return image
 
@@ -178,7 +176,9 @@ class Trainer:
             "optimizer": moments_of(self.optimizer),
             "densifier": self.densifier.state_dict(),
             "order": self.order.get_state(),
+            "colors": self.colors.get_state(),
             "drop": None if self.drop is None else self.drop.get_rng_state(),
+            "shown": self._part,
         }
         return copy.deepcopy(parts | {name: getattr(self, name) for name in PLAIN})
 
@@ -199,12 +199,15 @@ class Trainer:
             self.backend = resolve(self.backend if self.device.type == "cpu" else "auto", self.device)
             self.notes += longer
             model = GaussianModel(**state["model"])
-            if model.max_sh_degree != self.config.sh_degree or model.means.dtype != torch.float32:
+            if model.max_sh_degree != (self.config.sh_degree or 0) or model.means.dtype != torch.float32:
                 raise ValueError(f"model: expected float32 and harmonics of degree {self.config.sh_degree}, got others")
             self._build(model)
             load_moments(self.optimizer, copy.deepcopy(state["optimizer"]))
             self.densifier.load_state_dict(state["densifier"])
             self.order.set_state(state["order"])
+            self.colors.set_state(state["colors"])
+            if state["shown"]:
+                self.show(**state["shown"])
             if self.drop is not None:
                 self.drop.set_rng_state(state["drop"])
         except KeyError as error:
@@ -229,6 +232,8 @@ class Trainer:
         try:
             if config.minutes is not None:
                 config = replace(config, steps=state["config"]["steps"])
+            decided = {name: state["config"][name] for name in CHOICES if getattr(config, name) is None}
+            config = replace(config, **decided)
             trainer._prepare(scene, config)
             trainer.load_state_dict(state)
         except (KeyError, TypeError) as error:
@@ -249,14 +254,18 @@ class Trainer:
         self.optimizer.param_groups[0]["lr"] = self.extent * math.exp((1 - progress) * first + progress * last)
         degree = sum(self.step >= step for step in self.times.sh)
         self.model.sh_degree = max(self.model.sh_degree, degree)  # a fit that is trained on keeps what it has
-        views = self._coarse_views if self.step <= self.times.coarse else self._views
-        camera, target, moments = views[self._next_view()]
+        view, background = self._views[self.step <= self.times.coarse][self._next_view()], self._background
+        camera, target, moments = view[:3]
+        if config.training_background == "random":
+            background = torch.rand(3, generator=self.colors, dtype=torch.float32).to(self.device)
+            target, moments = view.before(background)
         if self.drop is not None:
             self.drop.progress = progress
+            self.drop.train(progress <= config.drop_until)
             if config.drop_by != "random":
                 self.drop.scores = gaussian_scores(config.drop_by, self.densifier, camera)
         gaussians = self.model()
-        out = self.renderer(gaussians, camera, self._background)
+        out = self.renderer(gaussians, camera, background)
         image = out.image.masked_fill(out.image > 1, 1.0)  # it is never below 0
         loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
         if config.opacity_l1:
@@ -275,6 +284,8 @@ class Trainer:
                 self.densifier.observe(out.projected)
             if self.step < config.steps:  # as in the release, the last step only looks
                 self.optimizer.step()
+                if recipe.opacity_decay < 1.0 and progress > recipe.decay_from:
+                    self.densifier.decay_opacity(recipe.opacity_decay)
             self.optimizer.zero_grad(set_to_none=True)
         return value
 
@@ -285,5 +296,5 @@ class Trainer:
 
     def _next_view(self) -> int:
         if not self.stack:
-            self.stack = torch.randperm(len(self._views), generator=self.order).tolist()
+            self.stack = torch.randperm(len(self._views[0]), generator=self.order).tolist()
         return self.stack.pop()

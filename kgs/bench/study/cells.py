@@ -17,11 +17,13 @@ from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
-from kgs.fit.config import FitConfig
+from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.lpips import Lpips
 from kgs.fit.machine import peak_rss_mb
 from kgs.fit.metrics import MEASURES
+from kgs.fit.needs import decide
 from kgs.fit.run import choose_points, measure
+from kgs.fit.slim import slim
 from kgs.fit.starts import FirstPoints
 from kgs.fit.starts.triangulate import camera_centers
 from kgs.fit.trainer import Trainer
@@ -61,12 +63,16 @@ def fit_and_measure(
     scene: Scene, config: FitConfig, points: FirstPoints, lpips: Lpips | None = None
 ) -> tuple[Trainer, dict[str, Any], dict[str, Any]]:
     """One fit, its metrics, and what every cell stores of it; "cpu_seconds" are of the training and its curve."""
-    trainer = Trainer(scene, config, points)
     start = time.process_time()
+    config, needs = decide(scene, config, choose_points)
+    trainer = Trainer(scene, config, choose_points(scene, config) if needs else points)
+    trainer.needs |= needs
     trainer.fit()
+    slim(trainer)
     stored: dict[str, Any] = {"cpu_seconds": round(time.process_time() - start, 2)}
     metrics = measure(trainer, lpips)
-    stored |= {"curve": trainer.curve, "gaussians": len(trainer.model), "config": config.to_dict()}
+    stored |= {"curve": trainer.curve, "gaussians": len(trainer.shown), "needs": trainer.needs}
+    stored |= {"config": trainer.config.to_dict()}
     stored |= {"wall_seconds": round(trainer.seconds, 2), "peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
     stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
     return trainer, metrics, stored
@@ -101,7 +107,8 @@ def _start(
 
 
 def _config(start: str, seed: int, fit: dict[str, Any] | None = None, **_: Any) -> FitConfig:
-    return FitConfig(**{"init": "model-points" if start == FULL else start, "seed": seed, **(fit or {})})
+    preset, fit = PRESETS[(fit or {}).get("preset", "paper")], {k: v for k, v in (fit or {}).items() if k != "preset"}
+    return replace(preset, **{"init": "model-points" if start == FULL else start, "seed": seed, **fit})
 
 
 def _full_model(scene: Scene, seed: int) -> FirstPoints:

@@ -1,0 +1,84 @@
+"""What a fitted splat can do without: Gaussians that no training view shows, and harmonics that no picture shows."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kgs.camera import move_camera
+from kgs.renderer import GaussianRenderer
+
+from .trainer import Trainer
+
+TOLERANCE = 0.01  # decibels by which the PSNR of a training view may change
+WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0)  # pixels that a Gaussian covers in all training views together
+QUANTUM = 0.5 / 255  # what an 8-bit picture does not show
+_BEST = 200.0  # decibels that stand for an infinite PSNR
+
+
+def slim(trainer: Trainer) -> None:
+    """Show only what the training views need; the fit itself keeps everything. Nothing is done with `keep_all`.
+
+    Of the limits in `WEIGHTS` the highest is taken that changes the PSNR of no training view by more than `TOLERANCE`,
+    and of the degrees of harmonics the lowest that changes no value of their pictures by more than `QUANTUM`.
+
+    `trainer.needs` gets "gaussians": how many were "fitted" and are "kept", the limit "weight", and "sh_degree".
+    """
+    if trainer.config.keep_all:
+        return
+    model, views = trainer.model, trainer.scene.train
+    weights = contributions(trainer)
+    levels = _levels(trainer)
+    for limit in WEIGHTS:
+        rows = weights > limit
+        trainer.show(rows, model.sh_degree)
+        if all(abs(now - whole) <= TOLERANCE for now, whole in zip(_levels(trainer), levels, strict=True)):
+            break
+    else:
+        limit, rows = -1.0, weights > -1.0
+    trainer.show(rows, model.sh_degree)
+    pictures = [trainer.render(views.camera(i)) for i in range(len(views))]
+    for degree in range(model.sh_degree + 1):
+        trainer.show(rows, degree)
+        renders = (trainer.render(views.camera(i)) for i in range(len(views)))
+        if all(bool(((now - whole).abs() <= QUANTUM).all()) for now, whole in zip(renders, pictures, strict=True)):
+            break
+    found = {"fitted": len(model), "kept": len(trainer.shown), "weight": limit, "sh_degree": degree}
+    trainer.needs["gaussians"] = found
+
+
+def _levels(trainer: Trainer) -> list[float]:
+    views = trainer.scene.train
+    return [min(trainer.psnr(views.select([i])) or _BEST, _BEST) for i in range(len(views))]
+
+
+def contributions(trainer: Trainer) -> Tensor:
+    """The sum of each Gaussian's blending weights over the pixels of all training views, `(N,)`.
+
+    It is the gradient of the pictures' sum by a colour of its own.
+    """
+    model, views = trainer.model, trainer.scene.train
+    rules: dict[str, Any] = {"max_bytes": trainer.config.max_bytes, "backend": trainer.backend}
+    renderer = GaussianRenderer(near_plane=trainer.near_plane, **rules).eval()
+    with torch.no_grad():
+        gaussians = model()
+    colors = torch.zeros_like(gaussians.means).requires_grad_()
+    for i in range(len(views)):
+        camera = move_camera(views.camera(i), trainer.device)
+        renderer(replace(gaussians, colors=colors), camera).image[:, 0].sum().backward()
+    return torch.zeros_like(colors[:, 0]) if colors.grad is None else colors.grad[:, 0]
+
+
+def in_words(needs: dict[str, Any]) -> str:
+    """What a fit left out, for its last line; "" where that is nothing."""
+    parts, harmonics, gaussians = [], needs.get("sh_degree"), needs.get("gaussians")
+    if harmonics and harmonics["chosen"] == 0:
+        why = "too few views to leave one out"
+        if harmonics["by"] == "probes":
+            why = f"{harmonics['gain']:+.2f} dB in {harmonics['n']} probes, noise {harmonics['noise']:.2f}"
+        parts.append(f"harmonics ({why})")
+    if gaussians and gaussians["kept"] < gaussians["fitted"]:
+        share = 1 - gaussians["kept"] / gaussians["fitted"]
+        parts.append(f"{100 * share:.0f} % of the Gaussians (no contribution to a training view)")
+    return ", ".join(parts)

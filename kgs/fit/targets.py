@@ -1,0 +1,37 @@
+"""What a step compares its render with: a photo, what D-SSIM wants of it, and where it is transparent."""
+
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.camera import move_camera
+from kgs.datasets.scene import Views
+from kgs.losses import TargetMoments, target_moments
+
+
+class Target(NamedTuple):
+    """One view on the device of a fit."""
+
+    camera: PinholeCamera
+    image: Tensor  # (1, 3, H, W)
+    moments: TargetMoments
+    clear: Tensor | None  # (1, 1, H, W), how much of the background shows; None: nothing
+    background: Tensor  # (3,), the one that shows
+
+    def before(self, background: Tensor) -> tuple[Tensor, TargetMoments]:
+        """The image, and its moments, before another background, `(3,)`."""
+        if self.clear is None:
+            return self.image, self.moments
+        image = self.image + self.clear * (background - self.background)[:, None, None]
+        return image, target_moments(image)
+
+
+def targets(views: Views, background: Tensor, device: torch.device) -> list[Target]:
+    """One for each view; `background`, `(3,)`, is that of the scene."""
+    images = [image[None].to(device, torch.float32) for image in views.images]
+    masks = [None] * len(views) if views.masks is None else [1.0 - mask[None].to(images[0]) for mask in views.masks]
+    cameras = [move_camera(views.camera(i), device) for i in range(len(views))]
+    parts = zip(cameras, images, map(target_moments, images), masks, strict=True)
+    return [Target(*each, background.to(images[0])) for each in parts]
