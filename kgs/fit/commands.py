@@ -90,7 +90,7 @@ def fit(
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
             counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
-        fast: half the steps or less, for some less PSNR of test views: other defaults, see --fast --help.
+        fast: half the steps, a third of them on small pictures: other defaults, see --fast --help.
         resume: continue from the checkpoint in the output folder.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.

@@ -260,7 +260,7 @@ PAPER = FitConfig(
     recipe=Recipe(lr_scales=0.005, lr_quats=0.001, opacity_decay=1.0, reset_interval=3000),
 )
 PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
-# Half the steps, a third of them on a quarter of the pixels, see docs/error-and-time.md.
+# Half the steps, a third of them on a quarter of the pixels, see docs/recipe.md.
 FAST = FitConfig(steps=1000, coarse=0.3)
 
 # Small pictures, many Gaussians and raised rates: a minute is then enough to overfit, which is what is to be shown.
