@@ -12,7 +12,7 @@ from kgs.renderer import GaussianRenderer
 from .trainer import Trainer
 
 TOLERANCE = 0.01  # decibels by which the PSNR of a training view may change
-WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0)  # pixels that a Gaussian covers in all training views together
+WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)  # pixels that a Gaussian covers in all training views; -1: all
 QUANTUM = 0.5 / 255  # what an 8-bit picture does not show
 _BEST = 200.0  # decibels that stand for an infinite PSNR
 
@@ -29,19 +29,17 @@ def slim(trainer: Trainer) -> None:
         return
     model, views = trainer.model, trainer.scene.train
     weights = contributions(trainer)
+    trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # also where a part was shown, of a fit that was done before
     levels = _levels(trainer)
     for limit in WEIGHTS:
         rows = weights > limit
         trainer.show(rows, model.sh_degree)
         if all(abs(now - whole) <= TOLERANCE for now, whole in zip(_levels(trainer), levels, strict=True)):
             break
-    else:
-        limit, rows = -1.0, weights > -1.0
-    trainer.show(rows, model.sh_degree)
-    pictures = [trainer.render(views.camera(i)) for i in range(len(views))]
+    degree, pictures = 0, [trainer.render(views.camera(i)) for i in range(len(views))] if model.sh_degree else []
     for degree in range(model.sh_degree + 1):
         trainer.show(rows, degree)
-        renders = (trainer.render(views.camera(i)) for i in range(len(views)))
+        renders = (trainer.render(views.camera(i)) for i in range(len(pictures)))
         if all(bool(((now - whole).abs() <= QUANTUM).all()) for now, whole in zip(renders, pictures, strict=True)):
             break
     found = {"fitted": len(model), "kept": len(trainer.shown), "weight": limit, "sh_degree": degree}

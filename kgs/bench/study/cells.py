@@ -42,11 +42,14 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     Args:
         cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
             "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test views),
-            "method" (a name, for the report), "seed", and "fit", the fields of FitConfig that are not the default's.
+            "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given), and the
+            fields of FitConfig that are not as it has them.
         data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
     """
-    scene, points, seconds = _start(data, *(cell[key] for key in ("scene", "views", "downscale", "start", "seed")))
+    preset = cell["fit"].get("preset", "paper")
+    known = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
+    scene, points, seconds = _start(data, *known, preset)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
     trainer, metrics, result = fit_and_measure(scene, _config(**cell), points, lpips)
     return result | {
@@ -65,7 +68,7 @@ def fit_and_measure(
     """One fit, its metrics, and what every cell stores of it; "cpu_seconds" are of the training and its curve."""
     start = time.process_time()
     config, needs = decide(scene, config, choose_points)
-    trainer = Trainer(scene, config, choose_points(scene, config) if needs else points)
+    trainer = Trainer(scene, config, points)
     trainer.needs |= needs
     trainer.fit()
     slim(trainer)
@@ -91,7 +94,7 @@ def revision(path: Path) -> str | None:
 
 @lru_cache(maxsize=1)  # cells of one start follow each other
 def _start(
-    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int
+    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int, preset: str = "paper"
 ) -> tuple[Scene, FirstPoints, float]:
     """A scene, its first points, and the processor's seconds that they took."""
     if name == SYNTHETIC:
@@ -100,15 +103,15 @@ def _start(
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
         scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
-    begin = time.process_time()
+    begin, config = time.process_time(), _config(start, seed, {"preset": preset})
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # a start that fell back says so by its kind
-        points = _full_model(scene, seed) if start == FULL else choose_points(scene, _config(start, seed))
+        points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
     return scene, points, time.process_time() - begin
 
 
 def _config(start: str, seed: int, fit: dict[str, Any] | None = None, **_: Any) -> FitConfig:
-    preset, fit = PRESETS[(fit or {}).get("preset", "paper")], {k: v for k, v in (fit or {}).items() if k != "preset"}
-    return replace(preset, **{"init": "model-points" if start == FULL else start, "seed": seed, **fit})
+    values = {"preset": "paper", "init": "model-points" if start == FULL else start, "seed": seed, **(fit or {})}
+    return replace(PRESETS[values.pop("preset")], **values)
 
 
 def _full_model(scene: Scene, seed: int) -> FirstPoints:

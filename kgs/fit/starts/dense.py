@@ -51,12 +51,12 @@ def dense_points(
 
 def _one_a_cell(places: NDArray[np.int64], count: int) -> Tensor:
     """The rows of the first place `(view, x, y)` in each of at most `count` cells, as small as that allows."""
-    first = np.arange(len(places))
-    least, most = 1.0, float(places.max(initial=0) + 1)  # of the side of a cell, in pixels
+    first, across = np.arange(len(places)), places.max(initial=0) + 1
+    least, most = 1.0, float(across)  # of the side of a cell, in pixels
     while len(first) > count or (len(places) > count and most - least > 1e-3):
         side = 0.5 * (least + most)
-        cells = np.column_stack([places[:, 0], (places[:, 1:] / side).astype(np.int64)])
-        _, first = np.unique(cells, axis=0, return_index=True)
+        columns, rows = (places[:, 1:] / side).astype(np.int64).T
+        _, first = np.unique((places[:, 0] * across + columns) * across + rows, return_index=True)
         least, most = (side, most) if len(first) > count else (least, side)
         if most - least < 1e-9:
             break  # more views than points
@@ -65,7 +65,7 @@ def _one_a_cell(places: NDArray[np.int64], count: int) -> Tensor:
 
 def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor, Tensor]:
     """The points of one view's certain pixels that another view's have too, their colours and places in that view."""
-    here = maps[view].depths
+    here, camera = maps[view].depths, views.camera(view)
     rows, columns = certain[view].nonzero().unbind(1)
     pixels = torch.stack([columns, rows], 1)
     points = unproject(pixels, here[rows, columns].double(), torch.full_like(rows, view), views.cameras)
@@ -76,11 +76,9 @@ def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int
         inside = ((places >= 0) & (places < torch.tensor(here.mT.shape))).all(1) & (depth > 0)
         x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
         there = maps[other].depths[y, x].double()
-        here_again = [
-            project_all(unproject(torch.stack([x, y], 1), z, torch.full_like(x, other), views.cameras), views.cameras)
-            for z in (there, depth)
-        ]
-        apart = (here_again[0][0][:, view] - here_again[1][0][:, view]).norm(dim=1)
+        rays = torch.stack([x, y], 1), torch.full_like(x, other)
+        back = [project_all(unproject(rays[0], z, rays[1], views.cameras), camera)[0][:, 0] for z in (there, depth)]
+        apart = (back[0] - back[1]).norm(dim=1)
         near = ((there / depth - 1).abs() < AGREEMENT) | (apart < AGREEMENT_PIXELS)
         agreed |= inside & near & certain[other][y, x]
     places = torch.stack([torch.full_like(rows, view), columns, rows], 1)[agreed]
