@@ -43,7 +43,7 @@ def plain_jpeg(data: bytes) -> bytes:
     Scan parameters that only progressive images need are set right in others: some phones leave them 0.
     """
     parts, sequential = bytearray(data), False
-    for marker, at in _markers(data):
+    for marker, at in jpeg_markers(data):
         if marker in (0xC0, 0xC1):
             sequential = True
         elif marker == 0xDA and sequential:
@@ -83,7 +83,7 @@ def _png(data: Buffer) -> tuple[int, ...]:
 
 
 def _jpeg(data: Buffer) -> tuple[int, ...]:
-    for marker, at in _markers(data):
+    for marker, at in jpeg_markers(data):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack_from(">HH", data, at + 3)
             return width, height
@@ -92,7 +92,7 @@ def _jpeg(data: Buffer) -> tuple[int, ...]:
     raise ValueError
 
 
-def _markers(data: Buffer) -> Iterator[tuple[int, int]]:
+def jpeg_markers(data: Buffer) -> Iterator[tuple[int, int]]:
     """A JPEG's markers and where what follows each begins; the coded data behind a scan's header are passed over."""
     at = 2
     while found := _MARKER.search(data, at):

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
@@ -14,14 +15,16 @@ from torch import Tensor
 
 from kgs.errors import DataError
 
+from .border import border_light
 from .frames import LARGEST, Frame, FrameSet
 from .images import read_image, read_size, rectification, remap, resize
 from .layouts import find_layout
 from .scene import Scene, Views, pinholes
-from .splits import select_evenly, split_by_name
+from .splits import TEST_EVERY, select_evenly, split_by_name
 
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
+_BORDER = "the photos have a dark border, left by undistortion: it is taken for part of the lens, not of the scene"
 _FINE_PIXELS = 1_000_000  # of the images for the first points: twice the width and height halves the error of depths
 
 
@@ -30,6 +33,7 @@ def load_scene(
     train_views: int | None = None,
     downscale: float | None = None,
     *,
+    hold_out: int | None = None,
     background: str = "black",
     points: str = "none",
     photos: bool = True,
@@ -46,10 +50,11 @@ def load_scene(
 
     Args:
         path: the scene's folder.
-        train_views: how many views to train on, spread evenly over those that are not held out (every eighth photo by
-            name is, unless the files name the test views); None takes all.
+        train_views: how many views to train on, spread evenly over those that are not held out; None takes all.
         downscale: how many times smaller the images shall be than those that are read (`images/`, else the largest
             `images_k/`), >= 1; None leaves them as they are.
+        hold_out: N >= 2 holds out every Nth photo by name, the first included, whatever the files say; 0 none, and
+            `Scene.test` is empty. None holds out the test views that the files name, or else every eighth photo.
         background: "black" or "white", put behind images with an alpha channel.
         points: "none", or "model-points" for the points of a COLMAP model that at least two training views observe.
             Their positions were refined with the test views too.
@@ -58,7 +63,7 @@ def load_scene(
 
     Raises:
         DataError: the folder is no scene, or its files are missing, damaged or contradict each other.
-        ValueError: train_views, downscale, background or points is out of range.
+        ValueError: train_views, downscale, hold_out, background or points is out of range.
 
     Examples:
         >>> scene = load_scene("fern", train_views=3, downscale=2)  # doctest: +SKIP
@@ -72,10 +77,13 @@ def load_scene(
             raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
     if downscale is not None and not (isinstance(downscale, (int, float)) and 1 <= downscale < math.inf):
         raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
+    whole = isinstance(hold_out, int) and not isinstance(hold_out, bool)
+    if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
+        raise ValueError(f"hold_out (--hold-out): expected None, 0 or a whole number of at least 2, got {hold_out!r}")
     root = Path(path)
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):  # which costs time
         found = find_layout(root)
-        train, test = _split(root, found, train_views)
+        train, test = _split(root, found, train_views, hold_out)
         cloud = found.points
         if points == "model-points":
             if found.model_points is None:
@@ -93,12 +101,23 @@ def load_scene(
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
         is_finer = photos and downscale is not None and fine_downscale < downscale
         views = partial(_views, offset=offset, background=color, photos=photos)
-        finer = views(train, _common_size(train, fine_downscale)) if is_finer else None
+        finer = _behind_border(views(train, _common_size(train, fine_downscale))) if is_finer else None
         first = (cloud.points - offset).float(), cloud.colors.float(), cloud.kind
-        return Scene(views(train, size), views(test, size), *first, offset, color, root, finer, found.notes)
+        seen, held_out = _behind_border(views(train, size)), views(test, size)
+        notes = (*found.notes, *([_BORDER] if seen.light is not None else []))
+        held_out = replace(held_out, light=seen.light)
+        return Scene(seen, held_out, *first, offset, color, root, finer, notes)
 
 
-def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[Frame], list[Frame]]:
+def _behind_border(train: Views) -> Views:
+    """The training views with the dark border that their photos have, if they are opaque and have one."""
+    known = train.images.device.type != "meta" and train.masks is None
+    return replace(train, light=border_light(train.images)) if known else train
+
+
+def _split(
+    root: Path, found: FrameSet, train_views: int | None, hold_out: int | None
+) -> tuple[list[Frame], list[Frame]]:
     """The frames to train on and those to test on, no photo in both."""
     frames, test_frames = found.frames, list(found.test or ())
     times = Counter(frame.path for frame in (*frames, *test_frames))
@@ -107,10 +126,11 @@ def _split(root: Path, found: FrameSet, train_views: int | None) -> tuple[list[F
             both = {frame.path} <= {f.path for f in frames} & {f.path for f in test_frames}
             where = "in the training and in the test views" if both else "several times"
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
-    if found.test is None:
-        if len(frames) < 2:
+    if found.test is None or hold_out is not None:
+        frames, every = [*frames, *test_frames], TEST_EVERY if hold_out is None else hold_out
+        if len(frames) < 2 and every:
             raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
-        train, test = split_by_name([frame.name for frame in frames], train_views)
+        train, test = split_by_name([frame.name for frame in frames], train_views, every)
         return [frames[i] for i in train], [frames[i] for i in test]
     chosen: Sequence[int] = select_evenly(len(frames), train_views)
     if train_views == len(found.published) and len(frames) > max(found.published):
@@ -162,7 +182,7 @@ def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, backg
         intrinsics[i, :3, :3] = torch.from_numpy(lens.matrix())
     opaque = torch.ones(1, *size, dtype=torch.float32)
     masks = torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None
-    poses = torch.stack([frame.pose for frame in frames])
+    poses = torch.stack([frame.pose for frame in frames]) if frames else torch.zeros(0, 4, 4, dtype=torch.float64)
     u, _, vh = torch.linalg.svd(poses[:, :3, :3])  # u @ vh is a rotation exactly
     extrinsics = kg.Rt_to_matrix4x4(*kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])).float()
     return Views(pinholes(intrinsics, extrinsics, size), images, tuple(frame.name for frame in frames), masks)

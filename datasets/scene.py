@@ -33,6 +33,8 @@ class Views:
             loaded with `photos=False`.
         names: file names, unique, in the order of the images.
         masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
+        light: `(H, W)` in [0, 1], how much of the scene's light each pixel of all images lets through, or None: all.
+            It is below 1 in the dark border that removing a lens's distortion can leave.
 
     Raises:
         ValueError: counts, shapes or sizes do not fit.
@@ -49,6 +51,7 @@ class Views:
     images: Tensor
     names: tuple[str, ...]
     masks: Tensor | None = None
+    light: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -61,6 +64,8 @@ class Views:
             raise ValueError(f"cameras: expected height {height} and width {width} as images, got others")
         if self.masks is not None and tuple(self.masks.shape) != (count, 1, height, width):
             raise ValueError(f"masks: expected shape ({count}, 1, {height}, {width}), got {tuple(self.masks.shape)}")
+        if self.light is not None and tuple(self.light.shape) != (height, width):
+            raise ValueError(f"light: expected shape ({height}, {width}), got {tuple(self.light.shape)}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -100,6 +105,17 @@ class Views:
         names = tuple(self.names[i] for i in indices)
         return replace(self, cameras=self.camera(rows), images=self.images[rows], names=names, masks=masks)
 
+    def shaded(self, image: Tensor) -> Tensor:
+        """An image of the scene, `(..., H, W)`, behind the border that these views' photos have, if any."""
+        return image if self.light is None else image * self.light.to(image)
+
+    @property
+    def usable(self) -> Tensor | None:
+        """Which pixels show the scene: opaque ones that no border covers, bool `(V, H, W)`; None: all."""
+        parts = [] if self.masks is None else [self.masks[:, 0] > 0.5]
+        parts += [] if self.light is None else [(self.light >= 1).expand(len(self), -1, -1)]
+        return torch.stack(parts).all(dim=0) if parts else None
+
     def halved(self) -> Self:
         """The views at half the width and height: means of 2 x 2 pixels; an odd last row or column is left out.
 
@@ -113,7 +129,8 @@ class Views:
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
         cameras = pinholes(intrinsics, self.cameras.extrinsics, size)
         masks = None if self.masks is None else avg_pool2d(self.masks, 2)
-        return replace(self, cameras=cameras, images=avg_pool2d(self.images, 2), masks=masks)
+        light = None if self.light is None else avg_pool2d(self.light[None], 2)[0]
+        return replace(self, cameras=cameras, images=avg_pool2d(self.images, 2), masks=masks, light=light)
 
 
 @dataclass(frozen=True, eq=False)

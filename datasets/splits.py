@@ -8,15 +8,18 @@ TEST_EVERY = 8
 BLENDER_TRAIN_FRAMES = (2, 16, 26, 55, 73, 76, 86, 93)
 
 
-def split_by_name(names: Sequence[str], train_views: int | None = None) -> tuple[list[int], list[int]]:
-    """Hold out every eighth name for testing and choose training views evenly among the others.
+def split_by_name(
+    names: Sequence[str], train_views: int | None = None, every: int = TEST_EVERY
+) -> tuple[list[int], list[int]]:
+    """Hold out each `every`-th name for testing (0: none) and choose training views evenly among the others.
 
     Names are sorted by code point ("img10" before "img2"), as the published splits were; the first one is a test view.
     Positions in `names` of the training and of the test views come back, both in the order of the sorted names.
     """
     order = sorted(range(len(names)), key=lambda i: names[i])
-    pool = [index for position, index in enumerate(order) if position % TEST_EVERY]
-    return [pool[i] for i in select_evenly(len(pool), train_views)], order[::TEST_EVERY]
+    test = order[::every] if every else []
+    pool = [index for position, index in enumerate(order) if not every or position % every]
+    return [pool[i] for i in select_evenly(len(pool), train_views)], test
 
 
 def select_evenly(count: int, train_views: int | None = None) -> list[int]:

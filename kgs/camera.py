@@ -128,6 +128,21 @@ def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
 
 
+def meeting_point(extrinsics: Tensor) -> Tensor | None:
+    """The point nearest to all optical axes, `(3,)` float64; None where axes are near-parallel, or it is behind one.
+
+    Convention:
+        World-to-camera extrinsics, OpenCV axes, `(V, 4, 4)`. Within some 5 degrees axes do not tell where they meet.
+    """
+    poses = torch.linalg.inv(extrinsics.double().cpu())
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    if torch.linalg.eigvalsh(across.mean(0))[0] <= 0.005:
+        return None
+    meeting = torch.linalg.solve(across.sum(0), (across @ centers[..., None]).sum(0)[:, 0])
+    return meeting if bool((((meeting - centers) * axes).sum(1) > 0).all()) else None
+
+
 def image_size(cameras: Cameras) -> tuple[int, int]:
     """Height and width in pixels, the same for all cameras; checks what `cameras` is."""
     if isinstance(cameras, PosedCamera):

@@ -20,9 +20,10 @@ from typing import Annotated, Any, get_type_hints
 from .errors import DataError, TrainingDiverged
 from .fit.commands import demo, evaluate, fit, render
 from .fit.config import FAST, PRESETS, FitConfig, Recipe
+from .fit.page_command import page
 from .fit.progress import say
 
-_COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate}
+_COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate, "page": page}
 _BENCHES = {
     "speed": "time and memory of rendering and of training steps",
     "precision": "errors of images, gradients and footprints against time",
@@ -33,7 +34,6 @@ _BENCHES = {
 }
 _EXTRAS = {
     "numba": "fast",
-    "viser": "view",
     "pycolmap": "sfm",
     "distributed": "study",
     "pandas": "study",

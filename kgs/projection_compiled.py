@@ -1,4 +1,4 @@
-"""`project` on compiled kernels: float32 on a CPU, pinhole cameras that want no gradient."""
+"""`project` on compiled kernels: float32 on a CPU, pinhole cameras."""
 
 import math
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from .camera import MARGIN, Cameras
+from .compiled.cameras import camera_gradients
 from .compiled.projection import BLOCK, footprint_gradients, footprints
 from .compiled.threads import over
 from .memory import empty
@@ -31,7 +32,9 @@ def project_compiled(
     reach = float(seen_within(opacities, options.alpha_threshold))
     rules = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, reach))
     harmonics = colors and gaussians.colors.ndim == 3
-    fields = _Projection.apply(*vars(gaussians).values(), _views(cameras, size), rules, harmonics)
+    views = _views(cameras, size)
+    inputs = *vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics
+    fields = _Projection.apply(*inputs, views, rules, harmonics)
     means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, broken = fields
     if colors and not harmonics:
         rgb = gaussians.colors.index_select(0, ids)
@@ -42,7 +45,7 @@ def project_compiled(
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *inputs, views, rules, harmonics = arguments
+        *inputs, _, _, views, rules, harmonics = arguments
         ctx.save_for_backward(*inputs)
         arrays, n, parts = _fields(inputs), len(inputs[0]), []
         shapes = ((n, 2), (n, 6), (n,), (n,), (n, 3 if harmonics else 0), (n,))
@@ -60,8 +63,11 @@ class _Projection(torch.autograd.Function):
         camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(x) for x in ctx.ids]))
         broken, factors = ids.new_tensor(int(counts[:, 1].sum())), factors.view(-1, 2, 3)
         by_mean, by_turn, by_scale, by_opacity, by_color = ctx.needs_input_grad[:5]
-        moved = by_color or (by_mean and inputs[4].shape[1] > 1)
-        wants = (by_mean, by_mean or by_turn or by_scale, by_mean, by_opacity, harmonics and moved)
+        by_pose, by_lens = ctx.needs_input_grad[5:7]
+        by_place = by_mean or by_pose
+        colored = harmonics and (by_color or (by_place and inputs[4].shape[1] > 1))
+        by_shape = by_place or by_lens or by_turn or by_scale
+        wants = (by_place or by_lens, by_shape, by_place, by_opacity, colored)
         outputs = means2d, factors, depths, alphas, rgb
         constant = [x for x, wanted in zip(outputs, wants, strict=True) if not wanted]
         ctx.mark_non_differentiable(*constant, ids, camera_ids, radii, broken)
@@ -78,25 +84,41 @@ class _Projection(torch.autograd.Function):
         if not colored:  # the largest by far
             outs = *outs[:4], outs[4][:, :0]
         gradients = _arrays(gradients[0], gradients[1].flatten(1), *gradients[2:5])
+        matrices = np.zeros((2, len(ctx.views), 4, 4), np.float32)  # poses, intrinsics
         for c, (view, ids) in enumerate(zip(ctx.views, ctx.ids, strict=True)):
             part = tuple(x[begin : begin + len(ids)] for x in gradients)
-            arguments = means, quats, scales, colors, c, view, ids, part, outs
-            over(torch.get_num_threads(), len(means), footprint_gradients, *arguments)
+            if any(ctx.needs_input_grad[:5]):
+                arguments = means, quats, scales, colors, c, view, ids, part, outs
+                over(torch.get_num_threads(), len(means), footprint_gradients, *arguments)
+            if any(ctx.needs_input_grad[5:7]):
+                rows = np.empty((len(ids), 21), np.float32)
+                inside = means, quats, scales, colors, view, ids, part, rows
+                over(torch.get_num_threads(), len(ids), camera_gradients, *inside)
+                total = rows.sum(0, np.float64)
+                matrices[0][c, :3], matrices[1][c, :3, :3] = total[:12].reshape(3, 4), total[12:].reshape(3, 3)
             begin += len(ids)
-        wanted = *ctx.needs_input_grad[:4], colored
+        found += map(torch.from_numpy, matrices)
+        wanted = *ctx.needs_input_grad[:4], colored, *ctx.needs_input_grad[5:7]
         return *(x if w else None for x, w in zip(found, wanted, strict=True)), None, None, None
 
 
 def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
-    """Whether they are pinhole cameras, without gradient, whose matrices are an affine map and a pose."""
+    """Whether they are pinhole cameras whose matrices are an affine map and a pose, one with a gradient a rigid one."""
     if not isinstance(cameras, PinholeCamera):
         return False
     matrices = cameras.intrinsics, cameras.extrinsics
-    if torch.is_grad_enabled() and any(x.requires_grad for x in matrices):
-        return False
+    wanted = torch.is_grad_enabled() and cameras.extrinsics.requires_grad
     (k, pose), unit = (x.detach().numpy() for x in matrices), np.eye(4)
     last = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
-    return bool(last and k[:, 0, 0].all() and k[:, 1, 1].all() and np.isfinite(k).all() and np.isfinite(pose).all())
+    rigid = not wanted or all(_is_turn(each[:3, :3]) for each in pose)
+    return bool(
+        last and rigid and k[:, 0, 0].all() and k[:, 1, 1].all() and np.isfinite(k).all() and np.isfinite(pose).all()
+    )
+
+
+def _is_turn(matrix: Array) -> bool:
+    """As in `kgs.projection.inverse_turn`."""
+    return bool((np.abs(matrix @ matrix.T - np.eye(3, dtype=matrix.dtype)) <= 1e-3).all())
 
 
 def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, ...]]:
@@ -107,8 +129,7 @@ def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, .
         first, last = -(centre + 0.5 + MARGIN * extent) / focal, (extent - 0.5 - centre + MARGIN * extent) / focal
         limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
         rotation = pose[:3, :3]
-        turned = (np.abs(rotation @ rotation.T - np.eye(3, dtype=pose.dtype)) <= 1e-3).all()
-        inverse = rotation.T if turned else np.linalg.inv(rotation)
+        inverse = rotation.T if _is_turn(rotation) else np.linalg.inv(rotation)
         views.append((pose[:3], matrix[:2, :3].copy(), limits, -(inverse @ pose[:3, 3])))
     return views
 

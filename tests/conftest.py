@@ -15,6 +15,7 @@ from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  
 import kgs.losses  # noqa: F401  # has a stage to register
 from kgs import backends
 from kgs.datasets import synthetic_scene
+from kgs.export import film
 from kgs.fit.starts import FirstPoints
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
@@ -65,6 +66,14 @@ def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
 def _reproducible():
     """The same global random stream for every test, whatever ran before."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _short_films() -> Iterator[None]:
+    """Each fit makes a film: of two frames, where it is not the film that is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film, "FRAMES", 2)
+        yield
 
 
 @pytest.fixture

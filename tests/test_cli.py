@@ -17,6 +17,7 @@ import pytest
 import kgs
 from kgs import cli
 from kgs.fit.config import FAST, PAPER, FitConfig
+from kgs.fit.folder import RESULTS
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
@@ -36,7 +37,7 @@ def fitted(folder, tmp_path_factory):
 
 
 def test_fit_writes_everything(fitted):
-    assert {"splat.ply", "metrics.json", "config.json", "curve.png", "test"} <= set(os.listdir(fitted))
+    assert {*RESULTS, "test"} <= set(os.listdir(fitted))
     assert "checkpoint.safetensors" in os.listdir(fitted)
     assert sorted(os.listdir(fitted / "test")) == ["test_r_0.png", "test_r_1.png"]
     assert cv2.imread(str(fitted / "test" / "test_r_0.png")).shape == (36, 40, 3)
@@ -47,7 +48,7 @@ def test_metrics_have_the_agreed_keys(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
         "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "needs", "steps", "seed", "drop", "init",
-        "backend", "protocol", "versions",
+        "backend", "protocol", "versions", "seen",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None
@@ -149,7 +150,9 @@ def test_bare_photos_need_poses(tmp_path, capsys):
         (["render", "{missing}", "--cameras", "{scene}", "-o", "{scene}/train"], "holds files of a scene"),
         (["render", "{missing}", "--cameras", "{scene}", "-o", "{out}", "--device", "foo"], "--device: expected"),
         (["render", "{missing}", "--cameras", "{missing}", "-o", "{out}"], "missing"),
-        (["nonsense"], "one of demo, fit, render, eval, bench"),
+        (["page", "{missing}", "--cameras", "{scene}", "-o", "{scene}.html"], "missing"),
+        (["page", "{missing}", "--cameras", "{scene}", "-o", "{out}"], "--out: expected a file that ends in .html"),
+        (["nonsense"], "one of demo, fit, render, eval, page, bench"),
         (["bench", "nonsense"], "one of speed, precision"),
         (["render", "{missing}", "--cameras", "{scene}", "-o", "{out}"], "missing"),
         (["eval", "{missing}"], "config.json"),
@@ -262,3 +265,15 @@ def test_a_missing_extra_is_one_line_before_any_work(folder, tmp_path, package, 
     said = one_line(capsys)
     assert f'{package} is missing: run pip install -e ".[app]" in a clone of kgs' in said
     assert not (tmp_path / "out").exists()
+
+
+def test_all_photos_can_be_trained_on(folder, tmp_path, capsys):
+    assert run("fit", folder, "-o", tmp_path, "--hold-out", 0, "--steps", 6, *FIT) == 0
+    assert "no photo was held out" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["test"] is None
+    assert len(metrics["protocol"]["train"]) == 6
+    assert os.listdir(tmp_path / "test") == []
+    assert run("eval", tmp_path) == 0
+    assert run("fit", folder, "-o", tmp_path / "other", "--hold-out", 1, *FIT) == 2
+    assert "--hold-out: expected" in capsys.readouterr().err

@@ -19,7 +19,7 @@ def kgs_process(*arguments, shell):
 
 
 FIT = ("--init", "random", "--init-points", 50, "--steps", 12)
-RESULTS = {"splat.ply", "metrics.json", "config.json", "curve.png", "test"}
+RESULTS = {"index.html", "splat.ply", "metrics.json", "config.json", "curve.png", "test"}
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,30 @@ def test_poses_that_are_scaled_or_sheared():
         assert_alike(gaussians, with_camera(cameras, extrinsics=pose))
 
 
+@pytest.mark.parametrize("degree", [None, 0, 1, 3])
+@pytest.mark.parametrize("wanted", [("pose",), ("lens",), ("pose", "lens"), ("pose", "lens", "Gaussians")])
+def test_gradients_of_cameras(degree, wanted, handed_over):
+    gaussians, cameras = wide_scene(degree, cameras=2)
+    lens = cameras.intrinsics + torch.tensor([[0.0, 3.0], [-2.0, 0.0]]).repeat(2, 2) * torch.eye(4)[:, [1, 0, 2, 3]]
+    found = []
+    for backend, dtype in (("numba", torch.float32), ("torch", torch.float64)):
+        matrices = {"pose": cameras.extrinsics, "lens": lens}
+        leaf = {name: x.to(dtype).clone().requires_grad_(name in wanted) for name, x in matrices.items()}
+        values, inputs = leaves(gaussians.to(dtype)) if "Gaussians" in wanted else (gaussians.to(dtype), [])
+        seen = type(cameras)(leaf["lens"], leaf["pose"], cameras.height, cameras.width)
+        fields = [getattr(project(values, seen, backend=backend), name) for name in DIFFERENTIABLE]
+        generator = torch.Generator().manual_seed(2)
+        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
+        used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
+        torch.autograd.backward(*zip(*used, strict=True))
+        found.append(([x.requires_grad for x in fields], [x.grad for x in (*leaf.values(), *inputs)]))
+    assert not handed_over
+    assert found[0][0] == found[1][0]
+    for got, exact in zip(found[0][1], found[1][1], strict=True):
+        assert (got is None) == (exact is None)
+        assert got is None or (got - exact).abs().max() <= 3e-6 * exact.abs().max()
+
+
 @pytest.mark.parametrize("options", [{"near_plane": 4.0}, {"eps2d": 0.0}, {"eps2d": 2.5, "near_plane": 1e-6}])
 def test_options(options):
     assert_alike(*wide_scene(), **options)
@@ -155,11 +179,13 @@ def test_tensors_that_are_not_contiguous():
 # -- what is left to torch -----------------------------------------------------------------------------------------
 
 
-def test_cameras_with_a_gradient_or_another_form_go_to_torch(handed_over):
+def test_cameras_of_another_form_go_to_torch(handed_over):
     gaussians, cameras = wide_scene()
     bent = cameras.intrinsics.clone()
     bent[0, 2, 0] = 1e-3
-    pose = cameras.extrinsics.clone().requires_grad_()
+    pose = (1.1 * cameras.extrinsics).detach()
+    pose[:, 3] = cameras.extrinsics[:, 3]
+    pose.requires_grad_()  # of a pose that is no rigid motion
     wanting = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
     project(gaussians, with_camera(cameras, intrinsics=bent), backend="numba")
     project(gaussians, wanting, backend="numba").means2d.sum().backward()
@@ -189,6 +215,10 @@ def test_the_same_bits_on_any_number_of_threads():
         for threads in (1, 2, 3, 4):
             torch.set_num_threads(threads)
             found.append(list_and_gradients(gaussians, cameras, "numba"))
+            pose = cameras.extrinsics.clone().requires_grad_()
+            moved = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
+            project(gaussians, moved, backend="numba").factors.square().sum().backward()
+            found[-1][1]["pose"] = pose.grad
     finally:
         torch.set_num_threads(before)
     (first, first_grads), *others = found
@@ -196,4 +226,4 @@ def test_the_same_bits_on_any_number_of_threads():
         assert all(
             torch.equal(getattr(got, name), getattr(first, name)) for name in (*DIFFERENTIABLE, "radii", "gaussian_ids")
         )
-        assert all(torch.equal(grads[name], first_grads[name]) for name in FIELDS)
+        assert all(torch.equal(grads[name], first_grads[name]) for name in (*FIELDS, "pose"))

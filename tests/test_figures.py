@@ -1,5 +1,6 @@
 """Figures and facts about the machine, without a display and without touching what is the caller's."""
 
+import re
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ from factories import random_views
 
 from kgs.datasets.scene import Views
 from kgs.fit.figures import write_curve, write_sheet
-from kgs.fit.machine import check_device, peak_rss_mb, versions
+from kgs.fit.machine import check_device, peak_rss_mb, revision, versions
 
 CURVE = [{"step": k, "seconds": 0.1 * k, "test_psnr": 20.0 + k, "train_psnr": None} for k in range(3)]
 
@@ -81,3 +82,20 @@ def test_a_device_that_is_not_there_is_one_line(name):
         check_device(name)
     assert "\n" not in str(caught.value)
     assert check_device("cpu") == torch.device("cpu")
+
+
+def test_the_commit_of_a_file(tmp_path):
+    def git(*arguments):
+        name = ("-c", "user.name=a", "-c", "user.email=a@b.example")
+        subprocess.run(["git", "-C", tmp_path, *name, *arguments], check=True, capture_output=True)
+
+    path = tmp_path / "sparse.jsonl"
+    path.write_text("{}\n")
+    assert revision(path) is None
+    git("init")
+    assert revision(path) is None
+    git("add", ".")
+    git("commit", "-m", "a", "--date", "2026-01-02T03:04:05Z")
+    assert re.fullmatch(r"[0-9a-f]{7,} of \d{4}-\d\d-\d\d", revision(path))
+    path.write_text("{}\n{}\n")
+    assert revision(path).endswith(" and later changes")

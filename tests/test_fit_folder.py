@@ -106,7 +106,9 @@ def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkey
     assert "unfinished" not in os.listdir(done)
 
 
-@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json"])
+@pytest.mark.parametrize(
+    "failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json", "write_fit_page"]
+)
 def test_results_that_cannot_be_written_leave_the_old_ones(
     scene: Any, done: Path, monkeypatch: Any, failing: str
 ) -> None:

@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
-FLOORS = ("core", "fit", "bench", "cli")  # each imports from those before it only
-HEAVY = ("cv2", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "viser", "distributed")
+FLOORS = ("core", "export", "page", "fit", "bench", "cli")  # each imports from those before it only
+HEAVY = ("cv2", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "distributed")
 
 
 def module_name(path):
@@ -81,9 +81,11 @@ def test_imports_go_one_way():
         "core": {"core"},
         "losses": {"losses"},
         "datasets": {"datasets"},
-        "fit": {"core", "losses", "datasets", "fit"},
-        "bench": {"core", "losses", "datasets", "fit", "bench"},
-        "cli": {"core", "losses", "datasets", "fit", "bench", "cli"},
+        "export": {"core", "datasets", "export"},
+        "page": {"core", "page"},
+        "fit": {"core", "losses", "datasets", "export", "page", "fit"},
+        "bench": {"core", "losses", "datasets", "export", "page", "fit", "bench"},
+        "cli": {"core", "losses", "datasets", "export", "page", "fit", "bench", "cli"},
     }
     small = (
         "kgs.errors",
@@ -111,7 +113,7 @@ def test_importing_kgs_is_light():
     code = "import sys, torch; before = set(sys.modules); import kgs; print(*sorted(set(sys.modules) - before))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     new = done.stdout.split()
-    above = [f"kgs.{name}" for name in ("losses", "datasets", "fit", "bench", "cli", "reference")]
+    above = [f"kgs.{name}" for name in ("losses", "datasets", "export", "page", "fit", "bench", "cli", "reference")]
     assert "kgs.renderer" in new
     assert [name for name in new if within(name, *HEAVY, *above)] == []
 
@@ -185,9 +187,9 @@ def test_no_file_is_longer_than_300_lines():
 def test_the_source_stays_small():
     sizes = {name: lines(path) for name, path in SOURCES.items()}
     compiled = sum(size for name, size in sizes.items() if within(name, "kgs.compiled"))
-    assert sum(sizes.values()) - compiled <= 11_800
+    assert sum(sizes.values()) - compiled <= 15_600
     assert compiled <= 1_600
-    assert sum(size for name, size in sizes.items() if within(name, "kgs.bench")) <= 2_100
+    assert sum(size for name, size in sizes.items() if within(name, "kgs.bench")) <= 2_160
 
 
 # -- words ---------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tiny_scenes import write_colmap, write_nerfstudio
+from tiny_scenes import write_blender, write_colmap, write_nerfstudio
 
 from kgs.datasets import Views, load_scene
 from kgs.errors import DataError
@@ -215,3 +215,31 @@ def test_matches_of_real_photos_lie_on_epipolar_lines(kgs_data: Path, name: str,
     apart = [float((centers[i] - centers[j]).norm() * (2 - axes[i] @ axes[j])) for i, j in pairs]
     first, second = pairs[int(torch.tensor(apart).argmin())]
     assert sampson_error(views, first, second) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("hold_out", "test"), [(None, ["0.png"]), (2, ["0.png", "2.png"]), (3, ["0.png"]), (8, ["0.png"]), (0, [])]
+)
+def test_what_is_held_out_is_a_choice(tmp_path: Path, hold_out: int | None, test: list[str]) -> None:
+    write_colmap(tmp_path)
+    scene = load_scene(tmp_path, hold_out=hold_out)
+    assert list(scene.test.names) == test
+    assert {*scene.train.names, *test} == {"0.png", "1.png", "2.png"}
+    assert len(scene.train) + len(test) == 3
+    assert scene.test.images.shape == (len(test), *scene.train.images.shape[1:])
+
+
+def test_test_views_of_the_files_can_be_trained_on(tmp_path: Path) -> None:
+    write_blender(tmp_path)
+    given = load_scene(tmp_path)
+    everything = load_scene(tmp_path, hold_out=0)
+    assert len(everything.test) == 0
+    assert set(everything.train.names) == {*given.train.names, *given.test.names}
+    assert len(load_scene(tmp_path, 2, hold_out=0).train) == 2
+
+
+@pytest.mark.parametrize("hold_out", [1, -1, 2.5, True, "3"])
+def test_what_cannot_be_held_out_is_refused(tmp_path: Path, hold_out: object) -> None:
+    write_colmap(tmp_path)
+    with pytest.raises(ValueError, match=r"hold_out \(--hold-out\): expected None, 0 or a whole number of at least 2"):
+        load_scene(tmp_path, hold_out=hold_out)  # type: ignore[arg-type]

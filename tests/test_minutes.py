@@ -11,7 +11,7 @@ from kgs.fit import FitConfig, Trainer, fit_scene
 from kgs.fit.checkpoint import load_checkpoint
 from kgs.fit.config import FAST, Recipe
 from kgs.fit.folder import CHECKPOINT
-from kgs.fit.minutes import steps_within
+from kgs.fit.minutes import expected_minutes, steps_within
 from kgs.fit.run import choose_points
 from kgs.json_files import read_json
 
@@ -75,3 +75,12 @@ def test_there_is_one_step_where_the_time_is_over(clock, scene, points):
 def test_minutes_are_a_number_above_zero(minutes):
     with pytest.raises(ValueError, match=r"minutes: expected a finite number in \(0, 1000000\]"):
         FitConfig(minutes=minutes)
+
+
+def test_the_time_of_a_fit_is_foretold():
+    config = FitConfig(steps=2000, backend="torch")
+    small, large = expected_minutes(252 * 189, config), expected_minutes(504 * 378, config)
+    assert 1 < small < large < 4 * small  # a step costs something for each Gaussian, too
+    assert expected_minutes(504 * 378, replace(config, steps=1000)) == pytest.approx(large / 2)
+    pytest.importorskip("numba")
+    assert expected_minutes(504 * 378, replace(config, backend="numba")) < large / 2

@@ -48,12 +48,20 @@ class Probes:
 def test_too_few_views_to_leave_one_out_follow_the_rule(views):
     scene = synthetic_scene(train_views=views, size=(48, 64))
     config, found = decide(scene, OPEN, None)
-    assert (config, found) == (replace(OPEN, sh_degree=0), {"sh_degree": {"chosen": 0, "by": "rule"}})
+    by_rule = {"chosen": 0, "by": "rule", "why": "too few views to leave one out"}
+    assert (config, found) == (replace(OPEN, sh_degree=0), {"sh_degree": by_rule})
 
 
-@pytest.mark.parametrize("changes", [{"minutes": 1.0}, {"steps": 20}])
-def test_without_time_for_probes_the_rule_decides(eight, changes):
-    assert decide(eight, replace(OPEN, **changes), None)[1] == {"sh_degree": {"chosen": 0, "by": "rule"}}
+@pytest.mark.parametrize(
+    ("changes", "why"), [({"minutes": 1.0}, "no time for probes"), ({"steps": 20}, "too few steps for probes")]
+)
+def test_without_time_for_probes_the_rule_decides(eight, changes, why):
+    assert decide(eight, replace(OPEN, **changes), None)[1] == {"sh_degree": {"chosen": 0, "by": "rule", "why": why}}
+
+
+def test_in_small_pictures_the_rule_decides(eight):
+    small = replace(eight, train=eight.train.halved())
+    assert decide(small, OPEN, None)[1]["sh_degree"]["why"] == "too small pictures for probes"
 
 
 def test_what_is_given_is_not_decided(eight):
@@ -155,7 +163,11 @@ def test_contributions_are_sums_of_blending_weights(each_backend, scene):
         double = PinholeCamera(camera.intrinsics.double(), camera.extrinsics.double(), camera.height, camera.width)
         total += render(one_each, double, near_plane=0.01).sum((0, 2, 3)).detach()
     assert float(total[:-1].max()) > 1.0
-    np.testing.assert_allclose(contributions(trainer).double(), total, atol=1e-4 * float(total.max()))
+    np.testing.assert_allclose(
+        contributions(trainer.model, trainer.scene.train, trainer.near_plane).double(),
+        total,
+        atol=1e-4 * float(total.max()),
+    )
 
 
 def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scene):
@@ -217,7 +229,7 @@ def test_select_takes_rows_and_bands():
     [
         ({}, ""),
         ({"sh_degree": {"chosen": 3, "by": "probes", "gain": 0.4, "noise": 0.1, "n": 2}}, ""),
-        ({"sh_degree": {"chosen": 0, "by": "rule"}}, "harmonics (too few views to leave one out)"),
+        ({"sh_degree": {"chosen": 0, "by": "rule", "why": "no time for probes"}}, "harmonics (no time for probes)"),
         (
             {
                 "sh_degree": {"chosen": 0, "by": "probes", "gain": -0.1, "noise": 0.2, "n": 2},

@@ -102,6 +102,18 @@ CLAIMS = {
     ),
 }
 
+CLAIMS["07_your_own_photos"] = (
+    """
+    assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
+    assert len(scene.test) == 0 and len(scene.train) == COUNT
+    assert trainer.step == STEPS and [row["name"] for row in judged["photos"]][0] == "0.png"
+    """,
+    """
+    assert max(errors) < 0.2 and trainer.psnr(scene.train) > 28
+    assert judged["n"] == COUNT and judged["psnr"] > 22
+    """,
+)
+
 # Sizes that are smaller still than those of the notebooks' own quick runs: time.
 SMALLER = {
     "02_camera_pose_by_gradient": {"STEPS = 15 if": "STEPS = 8 if", "SLICE = 9 if": "SLICE = 5 if"},

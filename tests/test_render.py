@@ -11,6 +11,7 @@ import kgs
 from kgs.datasets import synthetic_scene
 from kgs.errors import DataError
 from kgs.fit.commands import render
+from kgs.fit.page_command import page
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +67,20 @@ def test_a_second_render_replaces_the_first(splat, llff):
     assert len(first) == 10
     render(splat, cameras=llff, out=out)
     assert hashes(out) == first
+
+
+def test_a_page_of_any_splat(splat, llff, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    page(splat, cameras=llff, out=out)
+    text = out.read_text()
+    assert "10 photos of 40 × 30 pixels" in text
+    assert "Whether the splat was fitted to these photos is not known here." in text
+    assert f"open {out} in a browser" in capsys.readouterr().out
+    page(splat, cameras=llff, out=out)  # its own file is written again
+    out.write_text("mine")
+    with pytest.raises(DataError, match=r"page\.html: was not written by kgs"):
+        page(splat, cameras=llff, out=out)
+    with pytest.raises(ValueError, match=r"out: expected a file that ends in \.html, got"):
+        page(splat, cameras=llff, out=tmp_path / "page")
+    with pytest.raises(DataError, match="expected a file in a folder that is there"):
+        page(splat, cameras=llff, out=tmp_path / "no" / "page.html")

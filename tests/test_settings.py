@@ -24,7 +24,7 @@ def written(path: Path, request: Any = REQUEST, **fit: Any) -> Path:
 @pytest.mark.parametrize("config", [FitConfig(), FAST, replace(FAST, init="file", init_file=Path("/a.ply"))])
 def test_what_was_written_comes_back(tmp_path: Path, config: FitConfig) -> None:
     path = written(tmp_path / "config.json", **config.to_dict())
-    assert read_settings(path) == (REQUEST | {"points": "none"}, config)
+    assert read_settings(path) == (REQUEST | {"points": "none", "hold_out": None}, config)
 
 
 @pytest.mark.parametrize(
@@ -38,6 +38,8 @@ def test_what_was_written_comes_back(tmp_path: Path, config: FitConfig) -> None:
         (REQUEST | {"train_views": True}, "request.train_views"),
         (REQUEST | {"downscale": 0.5}, "request.downscale"),
         (REQUEST | {"downscale": "2"}, "request.downscale"),
+        (REQUEST | {"hold_out": 1}, "request.hold_out"),
+        (REQUEST | {"hold_out": False}, "request.hold_out"),
         (REQUEST | {"background": "red"}, "request.background"),
         (REQUEST | {"points": ["none"]}, "request.points"),
     ],

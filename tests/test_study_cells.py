@@ -1,21 +1,23 @@
 """The study of sparse views: its cells, what one of them measures, and that it goes on where it stopped."""
 
+import base64
 import json
 import math
 import re
-import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
 from itertools import product
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from kgs import DataError
 from kgs.bench.study import cells as cells_module
 from kgs.bench.study import grid, presets, study
-from kgs.bench.study.cells import FULL, revision, sparse_cell
+from kgs.bench.study.cells import FULL, sparse_cell
 from kgs.bench.study.presets import METHODS, SCENES, sparse_cells
 from kgs.cli import main
 from kgs.datasets import load_scene
@@ -76,8 +78,9 @@ def test_each_cell_is_there_once_and_is_a_fit(preset, data):
     cells = sparse_cells(preset, data)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
     for cell in cells:
-        config = FitConfig.from_dict(FitConfig().to_dict() | cell["fit"])
-        assert config.drop == METHODS[cell["method"]]["drop"]
+        fit = {key: value for key, value in cell["fit"].items() if key != "preset"}
+        config = FitConfig.from_dict(FitConfig().to_dict() | fit)
+        assert config.drop == METHODS[cell["method"]].get("drop", 0.2)
 
 
 def test_the_preset_cpu_holds_what_the_study_must_show(data):
@@ -87,10 +90,14 @@ def test_the_preset_cpu_holds_what_the_study_must_show(data):
         for method in ("off", "progressive 0.2", "fixed 0.1"):
             assert count[scene, views, "dense", method] == 3
         assert count[scene, views, "sift", "progressive 0.2"] == 3
-    for scene in ("llff/fern", "llff/flower"):
-        for views in (6, 9):
-            for method in ("off", "progressive 0.2"):
-                assert count[scene, views, "dense", method] == 1
+        assert count[scene, views, "dense", "auto"] == count[scene, views, "dense", "auto, off"] == 3
+    for scene, views in (
+        *product(("llff/fern", "llff/flower"), (6, 9)),
+        ("nerfstudio/fox", 6),
+        ("colmap/monstree", 12),
+    ):
+        for method in ("off", "progressive 0.2", "auto"):
+            assert count[scene, views, "dense", method] == 3
     assert all(count["llff/fern", 3, "dense", method] == 3 for method in METHODS)
     assert {cell["fit"]["steps"] for cell in cells} == {2000}
 
@@ -131,6 +138,20 @@ def test_a_cell_measures_and_repeats_bit_for_bit():
             result.pop(key)
         result["init"].pop("seconds")
     assert results[0] == results[1]
+
+
+def test_only_the_built_in_scene_is_shown(folder):
+    """Photo, render and difference of a test view, in a few kilobytes."""
+    pictures = sparse_cell(tiny_cell())["pictures"]
+    assert sum(map(len, pictures)) < 40_000
+    data = (base64.b64decode(uri.removeprefix("data:image/jpeg;base64,")) for uri in pictures)
+    photo, render, difference = (cv2.imdecode(np.frombuffer(one, np.uint8), 1).astype(float) for one in data)
+    expected = cells_module._start(None, "synthetic", 2, None, "sift", 0)[0].test.images[0]
+    assert np.abs(photo[..., ::-1] / 255 - expected.permute(1, 2, 0).numpy()).mean() < 0.03  # of JPEG
+    assert np.abs(difference - np.clip(4 * np.abs(render - photo), 0, 255)).mean() < 25  # their noise fourfold
+    assert "pictures" not in sparse_cell(tiny_cell(seed=1))
+    other = tiny_cell(start="scene") | {"scene": folder.name, "views": 4}
+    assert "pictures" not in sparse_cell(other, data=str(folder.parent))
 
 
 def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
@@ -220,6 +241,20 @@ def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
 
 
 @pytest.mark.usefixtures("_coarse_plots")
+def test_a_report_of_what_is_there_fits_nothing(tmp_path, monkeypatch, threads):
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
+    with pytest.raises(DataError, match="expected cells of --preset quick, got none"):
+        study(out=tmp_path, report_only=True)
+    study(out=tmp_path, scheduler=threads)
+    cells = (tmp_path / "sparse.jsonl").read_bytes()
+    (tmp_path / "sparse.md").unlink()
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell(), tiny_cell(seed=1)])
+    assert study(out=tmp_path, report_only=True) == 1  # not all are there
+    assert "1 of 2 cells" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
+    assert (tmp_path / "sparse.jsonl").read_bytes() == cells
+
+
+@pytest.mark.usefixtures("_coarse_plots")
 def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, threads):
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     study(out=tmp_path, scheduler=threads)
@@ -250,20 +285,3 @@ def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch, threads):
     path.write_bytes(2 * path.read_bytes())
     study(out=tmp_path, scheduler=threads)
     assert "1 of 1 cells" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
-
-
-def test_the_commit_of_a_file(tmp_path):
-    def git(*arguments):
-        name = ("-c", "user.name=a", "-c", "user.email=a@b.example")
-        subprocess.run(["git", "-C", tmp_path, *name, *arguments], check=True, capture_output=True)
-
-    path = tmp_path / "sparse.jsonl"
-    path.write_text("{}\n")
-    assert revision(path) is None
-    git("init")
-    assert revision(path) is None
-    git("add", ".")
-    git("commit", "-m", "a", "--date", "2026-01-02T03:04:05Z")
-    assert re.fullmatch(r"[0-9a-f]{7,} of \d{4}-\d\d-\d\d", revision(path))
-    path.write_text("{}\n{}\n")
-    assert revision(path).endswith(" and later changes")

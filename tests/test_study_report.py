@@ -14,7 +14,7 @@ pytest.importorskip("pandas")
 
 from kgs import __version__
 from kgs.bench.study.plots import STYLES
-from kgs.bench.study.presets import EQUAL_MEAN_RATE, FAMILIES, METHODS
+from kgs.bench.study.presets import FAMILIES, METHODS
 from kgs.bench.study.report import write_report
 
 TEXTS = ("sparse.csv", "sparse.md", "index.html")
@@ -122,7 +122,6 @@ def test_methods_are_told_apart():
 
 def test_each_method_has_a_table():
     assert {*MAIN, *(name for family in FAMILIES.values() for name in family)} == METHODS.keys()
-    assert {*EQUAL_MEAN_RATE, *EQUAL_MEAN_RATE.values()} <= METHODS.keys()
 
 
 def test_plots_without_data_are_left_out(reports, tmp_path):
@@ -152,9 +151,10 @@ def test_the_main_table(markdown):
         off, paper = (psnrs(rows, scene, method, views) for method in MAIN[:2])
         (row,) = lines(markdown, "Test views", setting, "progressive 0.2")
         expected = ["3", f"{np.mean(paper):.2f} ({np.std(paper, ddof=1):.2f})", f"{max(paper):.2f}"]
-        assert row[2:6] == [*expected, f"{interval(np.subtract(paper, off))} (3)"]
+        assert row[2:5] == expected
+        assert row[5] == f"{np.mean(paper) / 110:.3f} ({np.std(paper, ddof=1) / 110:.3f})"
         assert row[6] == f"{np.mean(paper) / 31:.3f} ({np.std(paper, ddof=1) / 31:.3f})"
-        assert row[7] == f"{np.mean(paper) / 110:.3f} ({np.std(paper, ddof=1) / 110:.3f})"
+        assert row[7] == f"{interval(np.subtract(paper, off))} (3)"
         assert row[8] == interval(np.subtract(paper, off) / 110, decimals=3)
     assert "20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207 | +1.54 or +1.34 |" in markdown
     assert "25.42 / 0.888 / 0.089 | +3.86 |" in markdown
@@ -170,16 +170,19 @@ def test_means_over_scenes(markdown):
     differences = paper - off
     half = student(6) * math.sqrt(differences.var(1, ddof=1).mean() / 9)
     mean = differences.mean()
-    assert row[5] == f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] (9)"
+    over = student(2) * differences.mean(1).std(ddof=1) / math.sqrt(3)
+    both = f"{mean:+.2f} [{mean - over:+.2f}, {mean + over:+.2f}] over scenes, "
+    both += f"[{mean - half:+.2f}, {mean + half:+.2f}] over seeds"
+    assert row[7] == f"{both} (9)"
     assert row[9:] == ["-", "-"]  # the paper has no such mean
     (llff,) = lines(markdown, "Test views", "mean of 2 LLFF scenes (fern, flower)", "progressive 0.2")
     assert llff[9:] == ["20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207", "+1.54 or +1.34"]
-    sentence = next(
-        line for line in markdown.splitlines() if line.startswith("- The paper's rule (progressive 0.2) over")
-    )
-    assert f"no dropping (off): {row[5].removesuffix(' (9)')} dB" in sentence
-    assert f"standard deviation of a pair: {math.sqrt(differences.var(1, ddof=1).mean()):.2f} dB" in sentence
-    assert f"fern {interval(differences[0])}; flower" in sentence
+    what = "The paper's rule (progressive 0.2) over no dropping (off)"
+    sentence = next(line for line in markdown.splitlines() if line.startswith(f"- {what}"))
+    assert f": PSNR [dB] {both}; LPIPS" in sentence
+    (first,) = lines(markdown, "Paired differences", what, "PSNR [dB]")
+    sd = math.sqrt(differences.var(1, ddof=1).mean())
+    assert first[2:] == [both, "3", "9", f"{sd:.2f}", *map(interval, differences)]
 
 
 def test_other_tables(markdown):
@@ -197,14 +200,17 @@ def test_other_tables(markdown):
     assert lines(markdown, "First points", "model-points (sees test views)")
     fixed = psnrs(rows, "llff/fern", "fixed 0.3")
     (rate,) = lines(markdown, "Rates and schedules", "fixed 0.3")
-    assert rate[4:6] == [f"{interval(np.subtract(fixed, values[:2]))} (2)" for values in (off, dense)]
-    assert rate[6:8] == [f"{np.mean(fixed) / d:.3f} ({np.std(fixed, ddof=1) / d:.3f})" for d in (31, 110)]
-    assert rate[9:] == ["20.15 / 0.691 / 0.223", "+0.93", "-0.41"]
+    assert rate[5:7] == [f"{np.mean(fixed) / d:.3f} ({np.std(fixed, ddof=1) / d:.3f})" for d in (110, 31)]
+    for place, values in ((7, off), (9, dense)):
+        gains = np.subtract(fixed, values[:2])
+        assert rate[place : place + 2] == [f"{interval(gains)} (2)", interval(gains / 110, decimals=3)]
+    assert rate[11:] == ["20.15 / 0.691 / 0.223", "+0.93", "-0.41"]
     growing, mean_rate = psnrs(rows, "llff/fern", "progressive 0.3"), psnrs(rows, "llff/fern", "fixed 0.15")
-    (equal,) = lines(markdown, "A growing rate", "progressive 0.3 over fixed 0.15")
-    assert equal[1:] == [f"{interval(np.subtract(growing, mean_rate))} (2)", "-"]
-    assert lines(markdown, "Selected Gaussians", "near")[0][9:] == ["17.49 / 0.582 / 0.273", "-1.73", "-3.27"]
-    assert lines(markdown, "An L1 penalty", "L1 gradient 0.01")[0][9:] == ["19.97 / 0.690 / 0.211", "+0.75", "-0.79"]
+    what = "A growing rate over the fixed one of the same mean (progressive 0.3 over fixed 0.15)"
+    (equal,) = lines(markdown, "Paired differences", what, "PSNR [dB]")
+    assert equal[2:5] == [f"{interval(np.subtract(growing, mean_rate))} over seeds", "1", "2"]
+    assert lines(markdown, "Selected Gaussians", "near")[0][11:] == ["17.49 / 0.582 / 0.273", "-1.73", "-3.27"]
+    assert lines(markdown, "An L1 penalty", "L1 gradient 0.01")[0][11:] == ["19.97 / 0.690 / 0.211", "+0.75", "-0.79"]
     groups = {}
     for row in rows:
         groups.setdefault(tuple(row["cell"].values())[:4], []).append(row["result"]["test"]["psnr"])
@@ -223,6 +229,22 @@ def test_other_tables(markdown):
     assert cost[8] == f"{np.mean(adapted):.2f} ({np.std(adapted, ddof=1):.2f})"
     (scene,) = lines(markdown, "Scenes, splits", "blender/lego, 8 views")
     assert scene[1:] == ["8", "2", "18", "252x189", "drop 0.2, steps 2000"]
+
+
+def test_the_built_in_scene_is_shown_but_counts_in_no_mean(tmp_path):
+    rows = [made_up(scene, 3, "dense", method, 0) for scene in ("llff/fern", "synthetic") for method in MAIN[:2]]
+    uris = [f"data:image/jpeg;base64,{name}" for name in ("cGhvdG8=", "cmVuZGVy", "ZGlmZg==")]
+    rows[2]["result"]["pictures"] = uris
+    text = write_report(rows, tmp_path, "command", 4)
+    assert "4 of 4 cells" in text
+    assert not lines(text, "Test views", "synthetic, 3 views, dense")
+    assert (tmp_path / "sparse.csv").read_text().count("synthetic,") == 2
+    html = (tmp_path / "index.html").read_text()
+    page = Balanced()
+    page.feed(html)
+    assert page.images[-3:] == uris
+    psnr = rows[2]["result"]["test"]["psnr"]
+    assert f"off:\nPSNR {psnr:.2f} dB, SSIM {psnr / 31:.3f}, LPIPS {psnr / 110:.3f}" in html
 
 
 def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
@@ -253,7 +275,15 @@ def test_commits_and_dates_of_the_cells_are_named(tmp_path):
     rows = [made_up("llff/fern", 3, "dense", "off", seed) for seed in range(3)]
     for row, day in zip(rows[:2], (3, 1), strict=True):
         row["result"] |= {"date": f"2026-12-0{day}", "revision": "1a2b3c4 of 2026-11-30"}
+    rows[1]["result"]["versions"] = {"kgs": "0.1.0", "machine": "aarch64, 4 cores"}
     text = write_report(rows, tmp_path, "command", 5)
-    assert "Figures: 3 of 5 cells; " in text
-    assert "2026-12-01 to 2026-12-03" in text
-    assert "1a2b3c4 of 2026-11-30" in text
+    assert "Figures: 3 of 5 cells; from 2026-12-01 to 2026-12-03." in text
+    assert "2 1a2b3c4 of 2026-11-30; 1 of no known commit" in text
+    assert "2 kgs 0.1.0, machine x86_64, 2 cores; 1 kgs 0.1.0, machine aarch64, 4 cores" in text
+    with (tmp_path / "sparse.csv").open(newline="") as file:
+        found = [(row["revision"], row["versions_machine"]) for row in csv.DictReader(file)]
+    assert found == [
+        ("1a2b3c4 of 2026-11-30", "x86_64, 2 cores"),
+        ("1a2b3c4 of 2026-11-30", "aarch64, 4 cores"),
+        ("", "x86_64, 2 cores"),
+    ]

@@ -6,20 +6,22 @@ import random
 import numpy as np
 import pandas as pd
 import pytest
-from study_rows import made_up, student
+from study_rows import MAIN, made_up, psnrs, student
 
 from kgs.bench.output import mean_sd
-from kgs.bench.study.published import PUBLISHED, benchmark_of, published, published_difference
-from kgs.bench.study.tables import (
-    BEST_OF_5,
+from kgs.bench.study.findings import findings, headline, regret
+from kgs.bench.study.pairs import (
     Difference,
     Noise,
     cells_frame,
     difference,
+    main_cells,
     noise_floor,
     paired_difference,
     wide,
 )
+from kgs.bench.study.published import PUBLISHED, benchmark_of, published, published_difference
+from kgs.bench.study.tables import BEST_OF_5, sparse_tables
 
 PAPER = "progressive 0.2"
 
@@ -66,7 +68,39 @@ def test_scenes_weigh_alike_and_share_their_variance():
     assert (found.mean, found.low, found.high) == pytest.approx((16 / 3, 16 / 3 - half, 16 / 3 + half))
 
 
-def test_intervals_over_scenes_hold_as_often_as_they_say():
+def test_the_interval_over_scenes_is_that_of_a_t_test_on_their_means():
+    groups = ([1.0, 3.0], [10.0, 10.0, 10.0, 10.0], [4.0], [])
+    found = paired_difference(columns(*groups))
+    means = [2.0, 10.0, 4.0]
+    half = student(2) * np.std(means, ddof=1) / math.sqrt(3)
+    assert found.scenes == 3
+    assert found.over_scenes == pytest.approx((16 / 3 - half, 16 / 3 + half))
+    # two scenes: Cauchy's quantile, and half of their distance
+    found = paired_difference(columns([0.0, 0.2], [0.3]))
+    assert found.over_scenes == pytest.approx([0.2 + sign * 0.1 * math.tan(math.pi / 2 * 0.95) for sign in (-1, 1)])
+
+
+def test_a_single_scene_has_no_interval_over_scenes():
+    found = paired_difference(columns([0.31, -0.12, 0.44], []))
+    assert found.scenes == 1
+    assert np.isnan(found.over_scenes).all()
+    assert "over scenes" not in found.text(labels=True)
+    assert math.isfinite(found.low)
+
+
+def test_the_interval_over_scenes_covers_the_mean_of_all_scenes_as_often_as_it_says():
+    """Also of the scenes that were not drawn, where that over seeds does not."""
+    rng, held, too_sure, repeats = random.Random(2), 0, 0, 300
+    for _ in range(repeats):
+        effects = [0.4 + rng.gauss(0, 0.3) for _ in range(5)]
+        found = paired_difference(columns(*([effect + rng.gauss(0, 0.2) for _ in range(3)] for effect in effects)))
+        held += found.over_scenes[0] < 0.4 < found.over_scenes[1]
+        too_sure += not found.low < 0.4 < found.high
+    assert abs(held / repeats - 0.95) < 3 * math.sqrt(0.95 * 0.05 / repeats)
+    assert too_sure / repeats > 0.2
+
+
+def test_intervals_over_seeds_hold_as_often_as_they_say():
     rng, held, repeats = random.Random(0), 0, 600
     for _ in range(repeats):
         scenes = [[effect + rng.gauss(0, 0.2) for _ in range(n)] for effect, n in ((0.5, 3), (-0.2, 2), (0.0, 1))]
@@ -80,6 +114,10 @@ def test_differences_as_text():
     none = (math.nan, math.nan)
     assert [Difference(1, -0.001, *none).text(decimals) for decimals in (2, 3)] == ["+0.00", "-0.001"]
     assert Difference(0, math.nan, *none).text() == "-"
+    several = Difference(6, 0.3, 0.2, 0.4, 0.1, 2, (-1.0, 1.6))
+    assert several.text(1) == "+0.3 [-1.0, +1.6] over scenes, [+0.2, +0.4] over seeds"
+    assert several._replace(low=math.nan).text(1) == "+0.3 [-1.0, +1.6] over scenes"
+    assert Difference(3, 0.3, 0.2, 0.4).text(1, labels=True) == "+0.3 [+0.2, +0.4] over seeds"
 
 
 def test_noise_floor():
@@ -112,6 +150,102 @@ def test_pairs_are_those_of_the_seeds_that_both_have():
     frame = cells_frame(rows)
     assert difference(frame, "method", "off", "far")[:2] == (2, pytest.approx((0.5 - 1.0) / 2))
     assert difference(frame, "method", "off", "near").pairs == difference(frame, "method", "off", "off").pairs == 0
+
+
+def cells_of(psnrs):
+    """Made-up cells with these test PSNRs by (scene, views, method), a seed each, and a tenth of them as LPIPS."""
+    rows = []
+    for (scene, views, method), values in psnrs.items():
+        for seed, value in enumerate(values):
+            rows.append(made_up(scene, views, "dense", method, seed))
+            rows[-1]["result"]["test"] |= {"psnr": value, "lpips_vgg_unscaled": value / 10}
+    return cells_frame(rows)
+
+
+def test_the_main_setting_is_the_studys_number_of_views_where_it_is_there():
+    views = {"nerfstudio/fox": (6, 12), "llff/fern": (6, 9, 3), "colmap/trex": (24, 12), "another/scene": (9, 5)}
+    frame = cells_of({(scene, n, "off"): [20.0] for scene, counts in views.items() for n in counts})
+    main = main_cells(frame)
+    expected = {"nerfstudio/fox": 12, "llff/fern": 3, "colmap/trex": 12, "another/scene": 5}
+    assert dict(zip(main.scene, main.views, strict=True)) == expected
+
+
+SCENES = {
+    ("llff/fern", 3, "off"): [20.0, 21.0],
+    ("llff/fern", 3, MAIN[1]): [21.0, 22.5],
+    ("llff/fern", 3, "auto"): [22.012, 23.0],
+    ("llff/fern", 3, "auto, off"): [21.5, 22.7],
+    ("nerfstudio/fox", 12, "off"): [20.5, 20.1],
+    ("nerfstudio/fox", 12, MAIN[1]): [21.9, 22.3],
+    ("nerfstudio/fox", 12, "auto"): [21.54, 21.7],
+    ("nerfstudio/fox", 6, MAIN[1]): [1.0, 2.0],
+    ("nerfstudio/fox", 6, "auto"): [7.0, 9.0],
+}
+
+
+def test_the_headline_has_both_intervals_of_psnr_and_lpips():
+    lines = {(line[""], line["measure"]): line for line in headline(cells_of(SCENES))}
+    what = "The default (auto) over the paper's rule (progressive 0.2)"
+    differences = np.array([[1.012, 0.5], [-0.36, -0.6]])  # fern, fox
+    means = differences.mean(1)
+    over_scenes = student(1) * means.std(ddof=1) / math.sqrt(2)
+    over_seeds = student(2) * math.sqrt(differences.var(1, ddof=1).mean() / 4)
+    for measure, factor, decimals in (("PSNR [dB]", 1, 2), ("LPIPS (less is better)", 0.1, 3)):
+        line = lines[what, measure]
+        ends = (factor * (means.mean() + sign * half) for half in (over_scenes, over_seeds) for sign in (-1, 1))
+        a, b, c, d = (f"{end:+.{decimals}f}" for end in ends)
+        mean = f"{factor * means.mean():+.{decimals}f}"
+        assert line["mean and 95 % intervals"] == f"{mean} [{a}, {b}] over scenes, [{c}, {d}] over seeds"
+        assert (line["scenes"], line["pairs"]) == ("2", "4")
+        assert line["llff/fern"].startswith(f"{factor * means[0]:+.{decimals}f} [")
+        assert line["nerfstudio/fox"].startswith(f"{factor * means[1]:+.{decimals}f} [")
+        sentence = next(text for text in findings(cells_of(SCENES)) if text.startswith(what))
+        assert f"{measure} {mean} [{a}, {b}] over scenes, [{c}, {d}] over seeds" in sentence
+    only = lines["Dropping in the default (auto over auto, off)", "PSNR [dB]"]
+    half = student(1) * np.std([0.512, 0.3], ddof=1) / math.sqrt(2)
+    assert only["mean and 95 % intervals"] == f"+0.41 [{0.406 - half:+.2f}, {0.406 + half:+.2f}] over seeds"
+    assert (only["scenes"], only["nerfstudio/fox"]) == ("1", "-")
+
+
+def test_regret_is_against_the_best_other_method_of_each_scene():
+    frame = cells_of(SCENES)
+    lines = {(line["scene"], line["measure"]): [*line.values()][2:] for line in regret(frame)}
+    assert lines["llff/fern", "PSNR [dB]"][:2] == ["auto, off", "3"]
+    assert lines["llff/fern", "PSNR [dB]"][2].startswith("+0.41 [")
+    assert lines["nerfstudio/fox", "PSNR [dB]"][:2] == ["progressive 0.2", "2"]
+    assert lines["nerfstudio/fox", "PSNR [dB]"][2].startswith("-0.48 [")
+    assert lines["llff/fern", "LPIPS (less is better)"][0] == "off"  # the least
+    sentence = next(text for text in findings(frame) if "best other method" in text)
+    assert "-0.04 dB in the mean of 2 scenes, at worst -0.48 [" in sentence
+    assert "on nerfstudio/fox (over progressive 0.2)" in sentence
+    assert regret(cells_of({("llff/fern", 3, "off"): [1.0]})) == []
+
+
+def test_the_default_stands_beside_the_others():
+    """On each scene that has it, with what its probes chose; the means are over the scenes that a method has."""
+    settings = [("llff/fern", 3), ("nerfstudio/fox", 12), ("nerfstudio/fox", 6)]
+    cells = [(*setting, method) for setting in settings for method in (*MAIN, "auto", "auto, off")]
+    cells += [("blender/lego", 8, method) for method in MAIN]
+    rows = [made_up(*cell[:2], "dense", cell[2], seed) for cell in cells for seed in range(2)]
+    probed = {"chosen": 3, "by": "probes", "over": 0, "gain": 0.4, "noise": 0.05, "n": 2}
+    for row in rows:
+        if row["cell"]["method"] == "auto":
+            row["result"]["needs"] = {"sh_degree": probed if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
+    tables = sparse_tables(cells_frame(rows))
+    main = next(table for title, table in tables.items() if title.startswith("Test views"))
+    methods = {scene: [*lines.method] for scene, lines in main.groupby("scene")}
+    assert methods["llff/fern, 3 views, dense"] == [*MAIN, "auto", "auto, off"]
+    assert methods["mean of 3 scenes (fern, fox, lego)"] == [*MAIN]
+    assert methods["mean of 2 scenes (fern, fox)"] == ["auto", "auto, off"]
+    default = tables["The default, with and without dropping"].query("method == 'auto'").set_index("scene")
+    assert {f"{scene}, {n} views, dense" for scene, n in settings} | {"mean of 2 scenes (fern, fox)"} == {
+        *default.index
+    }
+    auto, paper = (psnrs(rows, "nerfstudio/fox", method, 6) for method in ("auto", PAPER))
+    gain = np.subtract(auto, paper).mean()
+    assert default[f"over {PAPER} [dB] (pairs)"]["nerfstudio/fox, 6 views, dense"].startswith(f"{gain:+.2f} [")
+    chosen = tables["What the probes chose: the degree of harmonics, by seed"]
+    assert [*chosen.iloc[0]] == ["llff/fern, 3 views", "auto", "rule, probes", "0, 3", "+0.40", "0.05"]
 
 
 def test_numbers_that_are_not_there_are_left_out():

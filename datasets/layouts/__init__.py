@@ -20,7 +20,7 @@ _LAYOUTS = (
 )
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 _UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif", ".jxl", ".exr")
-_NO_POSES = "run COLMAP (its model goes to sparse/0) or nerfstudio's ns-process-data (transforms.json) on them first"
+_NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
 _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
@@ -38,6 +38,16 @@ def _is_scene(folder: Path) -> bool:
     return any(is_there(folder) for is_there, _ in _LAYOUTS)
 
 
+def nearest_scene(root: Path) -> Path | None:
+    """The folder with camera poses that is meant by a folder: itself, or one up to two levels below or above it.
+
+    One whose cameras kgs found, beside its own results (photos.json), is not meant by its photos. None: there is none.
+    """
+    below = sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_dir())
+    others = [path for path in (*below, *list(root.resolve().parents)[:2]) if not (path / "photos.json").exists()]
+    return next((folder for folder in (root, *others) if _is_scene(folder)), None)
+
+
 def _about_file(path: Path) -> str:
     if not path.exists():
         return "expected a folder, there is none"
@@ -48,10 +58,8 @@ def _about_file(path: Path) -> str:
 
 def _about_folder(root: Path) -> str:
     """Why a folder is no scene: what it holds instead, and what to do."""
-    below = sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_dir())
-    for folder in (*below, *list(root.resolve().parents)[:2]):
-        if _is_scene(folder):
-            return f"is no scene, but {folder} is one: give that folder"
+    if folder := nearest_scene(root):
+        return f"is no scene, but {folder} is one: give that folder"
     photos = image_folder(root) or root
     if count := len(list_images(photos)):
         return f"has {count} photos but no camera poses: {_NO_POSES}"

@@ -2,10 +2,14 @@
 
 Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing
 of kgs takes part in making the images. Four rays per pixel are averaged.
-The world, with the axes and the places of `make_world`, depends on `kind` and `seed` only, never on the cameras.
+The world, with the axes and the places of `make_world` or `make_room`, depends on `kind` and `seed` only, never on the
+cameras.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,19 +19,31 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views, pinholes
 
-from .raycast import Array, raycast
-from .world import CENTER, World, make_world, shade
+from . import room
+from .raycast import Array, Index, raycast
+from .world import CENTER, make_world, shade
 
+KINDS = ("forward", "orbit", "room")
 FOCAL = 0.85  # focal length over the longer side of the image, as a phone's
 SUPERSAMPLING = 2  # rays along each side of a pixel
 PATCH = np.array([0.48, 0.27, 0.1])  # half the extent of the forward-facing training cameras: 0.4 of the near depth
 ORBIT = (4.2, 2.6)  # radius and mean height above `CENTER` of the orbit
 
 
+class _Stage(NamedTuple):
+    """A world, and how it is photographed."""
+
+    triangles: Array  # (F, 3, 3)
+    paint: Callable[[Array, Index], Array]  # colours (n, 3) of points (n, 3) on triangles (n,)
+    place: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # eyes of so many training and test cameras
+    center: Array  # (3,), what they look at
+    focal: float  # focal length over the longer side of the image
+
+
 def synthetic_scene(
     kind: str = "forward", train_views: int = 3, test_views: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Scene:
-    """Make a scene of about 20 objects in a second or two, without any file.
+    """Make a scene of 20 to 40 objects in some seconds, without any file.
 
     Convention:
         Kornia's: world-to-camera extrinsics with OpenCV axes, integer pixel centres (cx = (W - 1) / 2). Float32.
@@ -36,9 +52,11 @@ def synthetic_scene(
         kind: "forward": cameras on a small patch of a plane that look into a room, the test views between the
             training views and a little outside of them. "orbit": cameras on a circle around the objects that look
             inwards, on a piece of floor before a black background, the test views between the training views.
+            "room": forward-facing, too, before a table with books, a lamp, a plant and a mug; no noise to look at.
         train_views: at least 1.
         test_views: at least 0.
-        size: (height, width) of all images in pixels. The field of view is 61 degrees along the longer side.
+        size: (height, width) of all images in pixels. The field of view is 61 degrees along the longer side,
+            58 in the room.
         seed: of places, textures and cameras, at least 0. The same seed gives the same scene, without points.
 
     Raises:
@@ -47,11 +65,10 @@ def synthetic_scene(
     for name, value, least in (("train_views", train_views, 1), ("test_views", test_views, 0), ("size", min(size), 1)):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}")
-    world = make_world(kind, seed)
-    place = _patch_eyes if kind == "forward" else _orbit_eyes
-    train_eyes, test_eyes = place(train_views, test_views, np.random.default_rng([seed, 1]))
+    stage = _stage(kind, seed)
+    train_eyes, test_eyes = stage.place(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
-        train, test = (_views(world, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
+        train, test = (_views(stage, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
         none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
         return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
 
@@ -76,48 +93,61 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
-    size, triangles = sizes.pop(), make_world(kind, seed).triangles
+    size, triangles = sizes.pop(), _stage(kind, seed).triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
     return torch.from_numpy(np.stack(depths)[:, None])
 
 
-def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> Views:
+def _stage(kind: str, seed: int) -> _Stage:
+    if kind not in KINDS:
+        raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
+    if kind == "room":
+        made, around = room.make_room(seed), partial(_patch_eyes, middle=room.EYE, patch=room.PATCH)
+        return _Stage(made.triangles, made.shade, around, room.CENTER, room.FOCAL)
+    world = make_world(kind, seed)
+    place = _patch_eyes if kind == "forward" else _orbit_eyes
+    return _Stage(world.triangles, partial(shade, world), place, CENTER, FOCAL)
+
+
+def _views(stage: _Stage, eyes: Array, size: tuple[int, int], split: str) -> Views:
     (height, width), count = size, len(eyes)
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = FOCAL * max(size)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = stage.focal * max(size)
     intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
     extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
     images = np.zeros((count, 3, height, width), dtype=np.float32)
     for i, eye in enumerate(eyes):
         # rounded to float32 first and then drawn: the images show exactly what the cameras say
-        extrinsics[i] = torch.from_numpy(_look_at(eye, CENTER))
-        images[i] = _render(world, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
+        extrinsics[i] = torch.from_numpy(_look_at(eye, stage.center))
+        images[i] = _render(stage, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
     names = tuple(f"{split}_{i:02d}" for i in range(count))
     return Views(pinholes(intrinsics, extrinsics, size), torch.from_numpy(images), names)
 
 
-def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+def _render(stage: _Stage, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
     s, fine = SUPERSAMPLING, intrinsics[:3, :3].copy()
     fine[:2] *= s
     fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
-    depths, faces = raycast(world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
+    depths, faces = raycast(stage.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
     v, u = np.nonzero(faces >= 0)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(fine).T
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
-    colors[v, u] = shade(world, points, faces[v, u])
+    colors[v, u] = stage.paint(points, faces[v, u])
     return np.asarray(colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1))
 
 
-def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
+def _patch_eyes(
+    train: int, test: int, rng: np.random.Generator, middle: float | Array = 0.0, patch: Array = PATCH
+) -> tuple[Array, Array]:
     """Training cameras in a zigzag from left to right, test cameras spread over a patch 1.15 times as large."""
     x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
     # M. Roberts' R2 sequence: evenly spread, however many there are
     spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
     flat = np.concatenate([np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], -1), 1.15 * (2.0 * spread - 1.0)])
-    eyes = PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
+    eyes = middle + patch * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
     return eyes[:train], eyes[train:]
 
 

@@ -19,7 +19,7 @@ BRICK_TABLE = 64  # the shades of bricks repeat after so many
 
 def random_texture(kind: str, rng: np.random.Generator) -> Texture:
     """Draw a texture: from points `(n, 3)` float32 in the object's own frame, in world units, to colours `(n, 3)`."""
-    coarse, fine = _field(rng, 0.32, 1.2), _field(rng, 0.1, 0.32)
+    coarse, fine = field(rng, 0.32, 1.2), field(rng, 0.1, 0.32)
     ramp, other = _ramp(rng), _ramp(rng)
     earthy = rng.uniform(0.0, 0.15)  # a hue between red and yellow
     if kind == "stone":
@@ -42,7 +42,7 @@ def random_texture(kind: str, rng: np.random.Generator) -> Texture:
     raise ValueError(f"kind: expected a kind of texture, got {kind!r}")
 
 
-def _field(rng: np.random.Generator, shortest: float, longest: float) -> Texture:
+def field(rng: np.random.Generator, shortest: float, longest: float) -> Texture:
     """A random field of unit variance with wavelengths between the given ones, the longer ones a little stronger."""
     wavelengths = np.exp(rng.uniform(np.log(shortest), np.log(longest), size=NUM_WAVES))
     directions = rng.normal(size=(3, NUM_WAVES))

@@ -9,7 +9,6 @@ from trimesh.transformations import euler_matrix
 from .raycast import Array, Index
 from .textures import Texture, random_texture
 
-KINDS = ("forward", "orbit")
 FLOOR = 1.2  # y of the floor
 CENTER = np.array([0.0, 0.5, 4.4])  # the middle of the objects
 LIGHT = np.array([-0.48, -0.6, -0.64])  # unit vector towards the light: to the left, above and before the objects
@@ -32,10 +31,8 @@ _Part = tuple[trimesh.Trimesh, Array, Texture]
 def make_world(kind: str, seed: int) -> World:
     """The world: "forward" in a room that fills the view, "orbit" on a square of floor with nothing around it.
 
-    Its axes are OpenCV's; the forward-facing cameras stand around the origin. An unknown kind is a ValueError.
+    Its axes are OpenCV's; the forward-facing cameras stand around the origin.
     """
-    if kind not in KINDS:
-        raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
     rng = np.random.default_rng([seed, 0])
     parts = _objects(rng)
     balls = [[*mesh.bounds.mean(axis=0), 0.5 * np.prod(mesh.extents) ** (1 / 3)] for mesh, _, _ in parts]

@@ -16,8 +16,8 @@ from .output import markdown_table, mean_sd
 from .scenes import SYNTHETIC, check_scenes
 from .study.cells import fit_and_measure
 from .study.grid import Cell, run_grid
+from .study.pairs import grouped
 from .study.plots import panels
-from .study.tables import grouped
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
 KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}

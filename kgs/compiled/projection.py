@@ -1,7 +1,8 @@
 """Projection by pinhole cameras with the colours of harmonics, and its gradient: one Gaussian at a time.
 
-The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; gradients go to the Gaussians alone. A
-camera is a tuple: world to camera `(3, 4)`, intrinsics `(2, 3)`, limits of x / z and y / z `(2, 2)`, centre `(3,)`.
+The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; gradients of cameras are in
+:mod:`.cameras`. A camera is a tuple: world to camera `(3, 4)`, intrinsics `(2, 3)`, limits of x / z and y / z `(2, 2)`,
+centre `(3,)`.
 """
 
 import math
@@ -15,7 +16,7 @@ BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a bloc
 
 
 @inline
-def _rotation(quats, g):
+def rotation(quats, g):
     """Unit quaternion, 1 / norm, rotation matrix by rows; the zero quaternion turns nothing and gets no gradient."""
     qw, qx, qy, qz = np.float64(quats[g, 0]), np.float64(quats[g, 1]), np.float64(quats[g, 2]), np.float64(quats[g, 3])
     norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)  # in float64 no square overflows or vanishes
@@ -29,7 +30,8 @@ def _rotation(quats, g):
 
 
 @inline
-def _camera_point(means, g, v):
+def camera_point(means, g, v):
+    """The centre in camera axes."""
     x, y, z = means[g, 0], means[g, 1], means[g, 2]
     return (
         v[0, 0] * x + v[0, 1] * y + v[0, 2] * z + v[0, 3],
@@ -39,7 +41,7 @@ def _camera_point(means, g, v):
 
 
 @inline
-def _rows(x, y, inverse, v, k, limits):
+def rows(x, y, inverse, v, k, limits):
     """J and J W, each by rows, and the clamped tangents."""
     tx, ty = x * inverse, y * inverse
     tx = limits[0, 0] if tx < limits[0, 0] else limits[0, 1] if tx > limits[0, 1] else tx
@@ -73,6 +75,19 @@ def _turned(a, r):
         a[3] * r[0] + a[4] * r[3] + a[5] * r[6],
         a[3] * r[1] + a[4] * r[4] + a[5] * r[7],
         a[3] * r[2] + a[4] * r[5] + a[5] * r[8],
+    )
+
+
+@inline
+def turned_back(t, r):
+    """The product with the transposed rotation, by rows: from dL/d(J W R) to dL/d(J W)."""
+    return (
+        t[0] * r[0] + t[1] * r[1] + t[2] * r[2],
+        t[0] * r[3] + t[1] * r[4] + t[2] * r[5],
+        t[0] * r[6] + t[1] * r[7] + t[2] * r[8],
+        t[3] * r[0] + t[4] * r[1] + t[5] * r[2],
+        t[3] * r[3] + t[4] * r[4] + t[5] * r[5],
+        t[3] * r[6] + t[4] * r[7] + t[5] * r[8],
     )
 
 
@@ -126,12 +141,12 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, r
             if not _is_finite(g, means, quats, scales, opacities, colors):
                 broken += 1
                 continue
-            x, y, z = _camera_point(means, g, v)
+            x, y, z = camera_point(means, g, v)
             if not z > near:
                 continue
             inverse = ONE / z
-            _, a, _, _ = _rows(x, y, inverse, v, k, limits)
-            f = _turned(a, _rotation(quats, g)[2])
+            _, a, _, _ = rows(x, y, inverse, v, k, limits)
+            f = _turned(a, rotation(quats, g)[2])
             s0, s1, s2 = scales[g, 0], scales[g, 1], scales[g, 2]
             a0, a1, a2, b0, b1, b2 = f[0] * s0, f[1] * s1, f[2] * s2, f[3] * s0, f[4] * s1, f[5] * s2
             px, py = (k[0, 0] * x + k[0, 1] * y) * inverse + k[0, 2], (k[1, 0] * x + k[1, 1] * y) * inverse + k[1, 2]
@@ -161,7 +176,7 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, r
 
 
 @inline
-def _color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors):
+def color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors):
     """Add to the harmonics' gradients; returns what the colour says of the centre."""
     x, y, z, inverse = _direction(means, g, centre)
     harmonics_basis(x, y, z, bands, b)
@@ -206,10 +221,10 @@ def _quaternion_gradient(q, inverse, a, h):
 
 
 @inline
-def _centre_gradient(x, y, z, v, k, limits, u, g_mean, g_depth):
-    """From dL/d(J W), the pixel and the depth to the centre in world axes."""
+def point_gradient(x, y, z, v, k, limits, u, g_mean, g_depth):
+    """From dL/d(J W), the pixel and the depth to the centre in camera axes, and to J by rows."""
     inverse = ONE / z
-    j, _, tx, ty = _rows(x, y, inverse, v, k, limits)
+    j, _, tx, ty = rows(x, y, inverse, v, k, limits)
     j00, j01 = u[0] * v[0, 0] + u[1] * v[0, 1] + u[2] * v[0, 2], u[0] * v[1, 0] + u[1] * v[1, 1] + u[2] * v[1, 2]
     j10, j11 = u[3] * v[0, 0] + u[4] * v[0, 1] + u[5] * v[0, 2], u[3] * v[1, 0] + u[4] * v[1, 1] + u[5] * v[1, 2]
     j02, j12 = u[0] * v[2, 0] + u[1] * v[2, 1] + u[2] * v[2, 2], u[3] * v[2, 0] + u[4] * v[2, 1] + u[5] * v[2, 2]
@@ -225,11 +240,7 @@ def _centre_gradient(x, y, z, v, k, limits, u, g_mean, g_depth):
     if limits[1, 0] <= y * inverse <= limits[1, 1]:
         t = -(k[0, 1] * j02 + k[1, 1] * j12) * inverse * inverse
         gy, gz = gy + t, gz - t * ty
-    return (
-        v[0, 0] * gx + v[1, 0] * gy + v[2, 0] * gz,
-        v[0, 1] * gx + v[1, 1] * gy + v[2, 1] * gz,
-        v[0, 2] * gx + v[1, 2] * gy + v[2, 2] * gz,
-    )
+    return gx, gy, gz, (j00, j01, j02, j10, j11, j12)
 
 
 @jit
@@ -259,9 +270,9 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
         if m == len(ids) or ids[m] != g:
             continue
         d_opacities[row, g] += g_opacities[m]
-        x, y, z = _camera_point(means, g, v)
-        _, a, _, _ = _rows(x, y, ONE / z, v, k, limits)
-        q, inverse, r = _rotation(quats, g)
+        x, y, z = camera_point(means, g, v)
+        _, a, _, _ = rows(x, y, ONE / z, v, k, limits)
+        q, inverse, r = rotation(quats, g)
         s, f = (scales[g, 0], scales[g, 1], scales[g, 2]), _turned(a, r)
         t = (g_factors[m, 0], g_factors[m, 1], g_factors[m, 2], g_factors[m, 3], g_factors[m, 4], g_factors[m, 5])
         d_scales[g, 0] += t[0] * f[0] + t[3] * f[3]
@@ -271,18 +282,13 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
         dw, dx, dy, dz = _quaternion_gradient(q, inverse, a, t)
         d_quats[g, 0], d_quats[g, 1] = d_quats[g, 0] + dw, d_quats[g, 1] + dx
         d_quats[g, 2], d_quats[g, 3] = d_quats[g, 2] + dy, d_quats[g, 3] + dz
-        u = (
-            t[0] * r[0] + t[1] * r[1] + t[2] * r[2],
-            t[0] * r[3] + t[1] * r[4] + t[2] * r[5],
-            t[0] * r[6] + t[1] * r[7] + t[2] * r[8],
-            t[3] * r[0] + t[4] * r[1] + t[5] * r[2],
-            t[3] * r[3] + t[4] * r[4] + t[5] * r[5],
-            t[3] * r[6] + t[4] * r[7] + t[5] * r[8],
-        )
-        gx, gy, gz = _centre_gradient(x, y, z, v, k, limits, u, (g_means2d[m, 0], g_means2d[m, 1]), g_depths[m])
+        u = turned_back(t, r)
+        x, y, z, _ = point_gradient(x, y, z, v, k, limits, u, (g_means2d[m, 0], g_means2d[m, 1]), g_depths[m])
+        gx, gy = v[0, 0] * x + v[1, 0] * y + v[2, 0] * z, v[0, 1] * x + v[1, 1] * y + v[2, 1] * z
+        gz = v[0, 2] * x + v[1, 2] * y + v[2, 2] * z
         if bands:
             gradient = g_rgb[m, 0], g_rgb[m, 1], g_rgb[m, 2]
-            wx, wy, wz = _color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors)
+            wx, wy, wz = color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors)
             gx, gy, gz = gx + wx, gy + wy, gz + wz
         d_means[g, 0], d_means[g, 1], d_means[g, 2] = d_means[g, 0] + gx, d_means[g, 1] + gy, d_means[g, 2] + gz
         m += 1

@@ -21,20 +21,21 @@ def demo(
     *,
     out: Path = Path("demo"),
     steps: int = DEMO.steps,
-    size: tuple[int, int] = (54, 72),
+    size: tuple[int, int] = (189, 252),
     seed: int = 0,
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
-    """Fit three views of a built-in scene without and with DropGaussian, and compare views that were not used.
+    """Fit three photos of a built-in room without and with DropGaussian, and compare views that were not used.
 
     For example:
       kgs demo -o demo
       kgs demo -o demo1 --seed 1
 
     Args:
-        out: folder for demo.png, curve.png, metrics.json and splat.ply.
-        steps: training steps of each of the two fits; the default takes some 3 minutes on 2 cores.
+        out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply and .glb, cameras.json and
+            turntable.webm.
+        steps: training steps of each of the two fits; the default takes a minute on 2 cores, without numba 3.
         size: height and width of the pictures.
         seed: the scene, the first points and both fits derive from it.
         device: cpu, cuda, ...
@@ -43,14 +44,14 @@ def demo(
     from kgs.datasets import synthetic_scene
 
     from .demo import run_demo
-    from .outputs import check_folder
+    from .outputs import EXPORTS, check_folder
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     if min(size) < 12:  # the window of SSIM
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
-    _prepare(device, backend, "matplotlib")
-    check_folder(out, ["demo.png", "curve.png", "metrics.json", "splat.ply"])
-    runs = run_demo(synthetic_scene(train_views=3, size=size, seed=seed), config, out)
+    _prepare(device, backend, "matplotlib", "jinja2")
+    check_folder(out, ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS])
+    runs = run_demo(synthetic_scene("room", train_views=3, test_views=5, size=size, seed=seed), config, out)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
     level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():
@@ -59,7 +60,11 @@ def demo(
     gain = level["with"][0] - level["without"][0]
     say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
     say(f"pictures: {out / 'demo.png'}, {out / 'curve.png'}")
-    _next("kgs fit SCENE -o OUT  # your own photos, with poses", _VIEWER.format(_line(out / "splat.ply")))
+    _next(
+        f"open {_line(out / 'index.html')} in a browser",
+        "kgs fit PHOTOS -o OUT  # three or more photos of your own",
+        _VIEWER.format(_line(out / "splat.ply")),
+    )
 
 
 def fit(
@@ -68,53 +73,72 @@ def fit(
     *,
     out: Path,
     views: int | None = None,
+    hold_out: int | None = None,
     downscale: float | None = None,
     background: _Background = "black",
     preset: Literal["auto", "paper", "plain"] = "auto",
     fast: bool = False,
     resume: bool = False,
+    estimate: bool = False,
     lpips_weights: Path | None = None,
     config: FitConfig,
 ) -> int:
-    """Turn a folder of posed photos into a splat, with test metrics.
+    """Turn a folder of photos into a splat, with test metrics.
 
     For example:
+      kgs fit PHOTOS -o OUT
       kgs fit fern -o fern-3 --views 3 --downscale 2
-      kgs fit fern -o fern-3 --views 3 --downscale 2 --fast
 
     Args:
-        scene: LLFF, COLMAP, Blender or nerfstudio folder.
-        out: folder for splat.ply, metrics.json, test/*.png, curve.png, config.json and the checkpoints.
+        scene: a folder of 3 or more photos, whose cameras are found first (extra sfm); or one with camera poses: LLFF,
+            COLMAP, Blender or nerfstudio.
+        out: folder for index.html, the page to look at, turntable.webm, a film, splat.ply and .glb, cameras.json,
+            metrics.json, test/*.png, curve.png, config.json and the checkpoints.
         views: training views, spread over the views that are not held out; all of them unless given.
-        downscale: shrink the photos by this factor.
+        hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
+            scene's files name, or else every eighth; of fewer than 9 bare photos none.
+        downscale: shrink the photos by this factor; bare ones on a CPU to 504 pixels unless given.
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
             counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
         fast: half the steps, a third of them on small pictures: other defaults, see --fast --help.
         resume: continue from the checkpoint in the output folder.
+        estimate: of 4 or more bare photos: afterwards leave each out once, find cameras and fit anew without it, and
+            measure it; takes a --fast fit for each photo.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
     from .folder import RESULTS
+    from .minutes import expected_minutes
     from .outputs import check_folder
+    from .photos.entry import add_estimate, find_scene, is_bare
     from .run import fit_scene
     from .slim import in_words
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
-    lpips = _prepare(config.device, config.backend, "matplotlib", "safetensors", lpips=lpips_weights)
+    lpips = _prepare(config.device, config.backend, "matplotlib", "safetensors", "jinja2", lpips=lpips_weights)
     check_folder(out, RESULTS, scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
+    request["hold_out"] = hold_out
     request["points"] = config.init if config.init == "model-points" else "none"
-    loaded = _load(request)
+    if bare := is_bare(scene):
+        request = find_scene(scene, out, request, seed=config.seed, device=config.device, estimated=estimate)
+    elif estimate:
+        raise ValueError("estimate: expected a folder of bare photos, got a scene with cameras: see --hold-out")
+    loaded = _load(request, out)
     height, width = loaded.train.images.shape[-2:]
     say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
-    if width * height > 1e6 and config.device == "cpu" and config.minutes is None:
-        megapixels, minutes = width * height / 1e6, width * height * config.steps / 1.5e9
-        say(f"{megapixels:.1f} Mpx on a CPU: expect about {minutes:.0f} minutes; see --downscale")
+    minutes = expected_minutes(width * height, config)
+    if minutes > 2 and config.device == "cpu" and config.minutes is None:
+        say(f"expect about {minutes:.0f} minutes on a CPU; see --fast, --minutes, --downscale")
     metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
+    if bare and estimate and not stopped_by:
+        metrics = add_estimate(scene, out, loaded, config)
     _print_metrics(metrics)
-    splat, renders, shrunk = out / "splat.ply", out / "renders", ("--downscale", downscale) if downscale else ()
+    posed = out if bare else scene
+    splat, renders, by = out / "splat.ply", out / "renders", request["downscale"]
+    shrunk = ("--downscale", f"{by:g}") if by else ()
     say(f"{splat}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if left_out := in_words(metrics["needs"]):
         say(f"left out: {left_out}")
@@ -122,7 +146,8 @@ def fit(
         _next("the same command with --resume goes on where it stopped")
         return 128 + stopped_by
     _next(
-        f"{_line('kgs', 'render', splat, '--cameras', scene, '-o', renders, *shrunk)}  # pictures from every camera",
+        f"open {_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
+        f"{_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
         f"{_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
         _VIEWER.format(_line(splat)),
     )
@@ -136,7 +161,7 @@ def render(
     cameras: Path,
     out: Path,
     downscale: float | None = None,
-    background: _Background = "black",
+    background: Literal[_Background, "transparent"] = "black",
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
@@ -151,7 +176,7 @@ def render(
         cameras: the scene (LLFF, COLMAP, Blender or nerfstudio folder) whose cameras to use.
         out: folder for the PNGs, named like the scene's photos; not where these are.
         downscale: shrink the pictures by this factor.
-        background: behind the splat.
+        background: behind the splat; transparent: PNGs with an alpha channel.
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
@@ -167,7 +192,8 @@ def render(
 
     _prepare(device, backend)
     check_folder(out, (), cameras, make=False)
-    scene = load_scene(cameras, None, downscale, background=background, photos=False)
+    clear = background == "transparent"
+    scene = load_scene(cameras, None, downscale, background="black" if clear else background, photos=False)
     model = load_ply(ply, origin=scene.offset)
     near_plane = Recipe().near_plane * typical_depths(scene.train, model.means)[0]  # from the Gaussians themselves
     posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
@@ -175,10 +201,12 @@ def render(
     check_folder(out, names.values(), scene.root)
     renderer = GaussianRenderer(near_plane=near_plane, backend=backend).eval()
     model, background_color = model.to(device), scene.background.to(device)
+    outputs = ("image", "alpha") if clear else ("image",)
     for name, camera in each(posed, "pictures", "view"):
         with torch.no_grad():
-            image = renderer(model(), move_camera(camera, torch.device(device)), background_color).image[0]
-        write_png(out / names[name], image)
+            seen = renderer(model(), move_camera(camera, torch.device(device)), background_color, outputs)
+        image = torch.cat([seen.image / seen.alpha.clamp_min(1e-6), seen.alpha], 1) if clear else seen.image
+        write_png(out / names[name], image[0])
     say(f"{len(names)} pictures in {out}")
     _next(_VIEWER.format(_line(ply)))
 
@@ -203,16 +231,18 @@ def evaluate(
     from .folder import load_fit
     from .metrics import measure_again
     from .outputs import write_json
+    from .page import PAGE, refresh_page
 
-    lpips = _prepare(device, backend, lpips=lpips_weights)
+    lpips = _prepare(device, backend, "jinja2", lpips=lpips_weights)
     saved, path = load_fit(out, device), out / "metrics.json"
     saved = saved if backend == "auto" else saved._replace(backend=backend)
-    scene = _load(saved.request)
+    scene = _load(saved.request, out)
     metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
     write_json(path, metrics)
+    refresh_page(out, saved, scene, metrics)
     _print_metrics(metrics)
-    say(f"{path} is up to date")
-    without = _line("kgs", "fit", saved.request["scene"], "-o", "OUT", "--drop", "0")
+    say(f"{path} and {out / PAGE} are up to date")
+    without = _line("kgs", "fit", out / saved.request["scene"], "-o", "OUT", "--drop", "0")
     _next(f"{without}  # to compare: without DropGaussian")
 
 
@@ -232,11 +262,12 @@ def _prepare(device: str, backend: str, *packages: str, lpips: Path | None = Non
     return Lpips.load(lpips).to(device)
 
 
-def _load(request: dict[str, Any]) -> Any:
+def _load(request: dict[str, Any], out: Path) -> Any:
+    """The scene; the folder "." is that of the results itself."""
     from kgs.datasets import load_scene
 
-    names = ("train_views", "downscale", "background", "points")
-    scene = load_scene(request["scene"], **{name: request[name] for name in names})
+    names = ("train_views", "downscale", "hold_out", "background", "points")
+    scene = load_scene(out / request["scene"], **{name: request[name] for name in names})
     for note in scene.notes:
         say(note)
     return scene
@@ -249,6 +280,15 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
         shown = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
         if shown:
             say(f"{part:>5}: " + ", ".join(shown))
+    seen = metrics.get("seen") or {}
+    if seen.get("psnr") is not None and seen.get("psnr_rest") is not None:
+        share, level, rest = (seen[name] for name in ("share", "psnr", "psnr_rest"))
+        say(f" test: {100 * share:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
+    if (found := metrics.get("estimate")) and found["psnr"] is not None:
+        spread = "" if found["sd"] is None else f"sd {found['sd']:.2g}, "
+        say(f"estimate: PSNR {found['psnr']:.4g} ({spread}n {found['n']}) of photos that were left out, with --fast")
+    elif not metrics["test"]:
+        say("no photo was held out: how good other views are was not measured (--hold-out N, --estimate)")
 
 
 def _line(*words: object) -> str:

@@ -24,13 +24,13 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import is_number, newest_checkpoint, previous
 from .config import FitConfig
-from .outputs import remove_others, write_json
+from .outputs import EXPORTS, remove_others, write_json
 
 CHECKPOINT = "checkpoint.safetensors"
-RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png")
+RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
 UNFINISHED, _FINISHED = "unfinished", "finished"
 _LIST = "files.json"  # all files of the new result
-_OPTIONAL = (previous(Path(CHECKPOINT)).name, "checkpoint.pt", "checkpoint.previous.pt")  # the latter of older versions
+_OPTIONAL = (previous(Path(CHECKPOINT)).name, "turntable.webm", "checkpoint.pt", "checkpoint.previous.pt")  # old
 
 
 @contextmanager
@@ -99,11 +99,16 @@ def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
     for name in ("request", "fit"):
         if not isinstance(settings.get(name), dict):
             raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
-    request = {"points": "none", **settings["request"]}
+    request = {"points": "none", "hold_out": None, **settings["request"]}  # what older folders do not say
     for name, expected, is_right in (
         ("scene", "a path", lambda v: isinstance(v, str) and v and "\0" not in v),
         ("train_views", "a whole number above 0 or null", lambda v: v is None or is_number(v, 1, whole=True)),
         ("downscale", "a number of at least 1 or null", lambda v: v is None or is_number(v, 1)),
+        (
+            "hold_out",
+            "0, a whole number above 1 or null",
+            lambda v: v is None or (is_number(v, 0, whole=True) and v != 1),
+        ),
         ("background", "one of ['black', 'white']", lambda v: v in ("black", "white")),
         ("points", "one of ['none', 'model-points']", lambda v: v in ("none", "model-points")),
     ):

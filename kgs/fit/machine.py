@@ -1,8 +1,9 @@
-"""What a fit runs on: versions, memory, and whether the device that is asked for is there."""
+"""What a fit runs on: versions, the commit, memory, and whether the device that is asked for is there."""
 
 import contextlib
 import os
 import platform
+import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,6 +36,17 @@ def versions() -> dict[str, str]:
     with contextlib.suppress(PackageNotFoundError):
         found["numba"] = version("numba")
     return found | {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+
+
+def revision(path: Path) -> str | None:
+    """The commit that last changed a file or folder, as "1a2b3c4 of 2026-11-22"; None where git does not know it."""
+    options = (("log", "-1", "--format=%h of %cs"), ("status", "--porcelain"))
+    calls = (["git", "-C", str(path.parent), *arguments, "--", path.name] for arguments in options)
+    try:
+        commit, changes = (subprocess.run(c, capture_output=True, text=True, check=True).stdout.strip() for c in calls)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit + (" and later changes" if changes else "") if commit else None
 
 
 def peak_rss_mb() -> int:

@@ -1,6 +1,7 @@
 """Measures of held-out views: PSNR, SSIM with both borders, LPIPS.
 
-Float renders clamped to [0, 1] are compared, never 8-bit files, over all pixels and channels (masks are not used).
+Float renders clamped to [0, 1] are compared, never 8-bit files, over all pixels and channels (masks are not used);
+a render is seen behind the dark border that the photos have, if any.
 
 Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
 Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.
@@ -44,7 +45,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
     rows = list[dict[str, Any]]()
     for index, name in enumerate(views.names):
-        image, target = render(views.camera(index)), views.images[index : index + 1]
+        image, target = views.shaded(render(views.camera(index))), views.images[index : index + 1]
         if image.shape != target.shape:
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):

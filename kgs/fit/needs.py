@@ -43,17 +43,23 @@ def decide(
         stage: shows how far the probes are.
 
     Returns:
-        The configuration, and for each open entry a dict of "chosen", "by" ("rule" or "probes"), and for probes also
-        "over" (the value that it was compared with), "gain" (of the dearer choice, in dB), "noise" (the standard error
-        of the gain) and "n" (left-out views).
+        The configuration, and for each open entry a dict of "chosen", "by" ("rule" or "probes"), for a rule "why", and
+        for probes "over" (the value that it was compared with), "gain" (of the dearer choice, in dB), "noise" (the
+        standard error of the gain) and "n" (left-out views).
     """
     still_open = [name for name in CHOICES if getattr(config, name) is None]
     by_rule = {name: CHOICES[name].rule for name in still_open}
     views, fits = scene.train, 1 + len(still_open)
     steps = math.floor(SHARE * config.steps / (FOLDS * fits))
-    too_small = len(views) < FEWEST or min(views.images.shape[-2:]) < 2 * SMALLEST
-    if not still_open or too_small or config.minutes is not None or steps < FEWEST_STEPS:
-        return replace(config, **by_rule), {name: {"chosen": by_rule[name], "by": "rule"} for name in still_open}
+    reasons = {
+        "too few views to leave one out": len(views) < FEWEST,
+        "too small pictures for probes": min(views.images.shape[-2:]) < 2 * SMALLEST,
+        "no time for probes": config.minutes is not None,
+        "too few steps for probes": steps < FEWEST_STEPS,
+    }
+    if not still_open or any(reasons.values()):
+        why = {"by": "rule", "why": next((reason for reason, holds in reasons.items() if holds), "")}
+        return replace(config, **by_rule), {name: {"chosen": by_rule[name], **why} for name in still_open}
     settled, needs = replace(config, **{name: CHOICES[name].cheaper for name in still_open}), dict[str, Any]()
     variants = [settled, *(replace(settled, **{name: CHOICES[name].dearer}) for name in still_open)]
     left_out = [round((fold + 0.5) * len(views) / FOLDS - 0.5) for fold in range(FOLDS)]

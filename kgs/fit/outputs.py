@@ -17,10 +17,14 @@ from torch import Tensor
 
 from kgs.datasets.images import list_images
 from kgs.errors import DataError
+from kgs.export.film import MARK as FILM_MARK
 from kgs.json_files import write_whole
 
 PNG_MARK = b"Software\0kgs"
+EXPORTS = ("cameras.json", "splat.glb", "turntable.webm")  # for other programs
 _MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
+_MARKS |= {".html": (b'<meta name="generator" content="kgs ',)}
+_MARKS |= {".glb": (b'"generator":"kgs ',), ".webm": (FILM_MARK,)}
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
 _LONGEST = 120  # bytes of a picture's name
@@ -40,7 +44,8 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
     has_photos = inside and there == out and not all(map(is_own, list_images(out)))
-    if has_photos or any((out / name).exists() for name in _SCENES):
+    of_photos = ("sparse",) if is_own(out / "photos.json") else ()  # cameras that a former run found
+    if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):
         if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(path.parent) and not path.parent.is_dir()):
@@ -50,11 +55,11 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
 
 
 def is_own(path: Path) -> bool:
-    """Whether kgs wrote this PNG, PLY or JSON file."""
+    """Whether kgs wrote this PNG, PLY, JSON, HTML, glTF or WebM file."""
     if not path.is_file():
         return False
     with open(path, "rb") as file:
-        content = file.read(2**26 if path.suffix == ".json" else 2**12)
+        content = file.read(2**26 if path.suffix in (".json", ".webm") else 2**12)
     return any(mark in content for mark in _MARKS.get(path.suffix, ()))
 
 
@@ -81,9 +86,12 @@ def png_names(views: Iterable[str]) -> dict[str, str]:
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write an RGB image `(3, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs."""
+    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs.
+
+    As PNG has it alpha is straight: the colours are not multiplied by it.
+    """
     array = (image.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-    ok, content = cv2.imencode(".png", np.ascontiguousarray(array[:, :, ::-1]))
+    ok, content = cv2.imencode(".png", np.ascontiguousarray(array[:, :, [2, 1, 0, 3][: array.shape[2]]]))
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")
     chunk = b"tEXt" + PNG_MARK

@@ -17,6 +17,7 @@ from kgs.ply import save_ply
 
 from .checkpoint import previous
 from .config import FitConfig
+from .exports import write_exports
 from .figures import write_curve
 from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, locked, publish
 from .lpips import Lpips
@@ -25,7 +26,9 @@ from .metrics import evaluate
 from .minutes import steps_within
 from .needs import decide
 from .outputs import check_folder, is_own, png_names, write_json, write_png
+from .page import PAGE, REPORT, write_fit_page
 from .progress import Stage, each, progress, say, silent
+from .seen import measure_seen
 from .slim import slim
 from .starts import FirstPoints, first_points
 from .trainer import Trainer
@@ -54,7 +57,7 @@ def fit_scene(
     request: dict[str, Any] | None = None,
     say: Callable[[str], None] = say,
 ) -> tuple[dict[str, Any], int]:
-    """Fit a scene and write splat.ply, metrics.json, config.json, curve.png, test/*.png and the checkpoint.
+    """Fit a scene and write `folder.RESULTS`, test/*.png and the checkpoint.
 
     Results in the folder stay whole until all new ones are there, in `unfinished`. A fit that a signal stopped writes
     its results too, but leaves those of a finished one in their place.
@@ -125,11 +128,16 @@ def fit_scene(
             stopped_by = train(trainer, new / CHECKPOINT)
             save_ply(new / "splat.ply", trainer.shown, offset=scene.offset)
             write_curve(new / "curve.png", {"": trainer.curve})
+            write_exports(trainer, new)
             (new / "test").mkdir(exist_ok=True)
             for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
-                write_png(new / "test" / names[name], trainer.render(scene.test.camera(i))[0])
+                write_png(new / "test" / names[name], scene.test.shaded(trainer.render(scene.test.camera(i))[0]))
             metrics = measure(trainer, lpips)
             write_json(new / "metrics.json", metrics)
+            title = (out / (request or {}).get("scene", scene.root)).resolve().name
+            drawn = {"": trainer.render}, {"": metrics}
+            facts: dict[str, Any] = {"settings": settings, "report": out / REPORT}
+            write_fit_page(new / PAGE, title, scene, trainer.shown, trainer.near_plane, *drawn, **facts)
         except BaseException:
             if not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)
@@ -166,6 +174,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     return {
         "test": evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None,
         "train": evaluate(trainer.render, scene.train, lpips),
+        "seen": measure_seen(trainer),
         "curve": trainer.curve,
         "seconds": round(trainer.seconds, 2),
         "peak_rss_mb": peak_rss_mb() or None,

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from kgs.camera import move_camera
+from kgs.datasets.scene import Views
+from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
 from .trainer import Trainer
@@ -28,7 +30,8 @@ def slim(trainer: Trainer) -> None:
     if trainer.config.keep_all:
         return
     model, views = trainer.model, trainer.scene.train
-    weights = contributions(trainer)
+    rules: dict[str, Any] = {"max_bytes": trainer.config.max_bytes, "backend": trainer.backend}
+    weights = contributions(model, views, trainer.near_plane, **rules)
     trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # also where a part was shown, of a fit that was done before
     levels = _levels(trainer)
     for limit in WEIGHTS:
@@ -51,19 +54,17 @@ def _levels(trainer: Trainer) -> list[float]:
     return [min(trainer.psnr(views.select([i])) or _BEST, _BEST) for i in range(len(views))]
 
 
-def contributions(trainer: Trainer) -> Tensor:
-    """The sum of each Gaussian's blending weights over the pixels of all training views, `(N,)`.
+def contributions(model: GaussianModel, views: Views, near_plane: float, **rules: Any) -> Tensor:
+    """The sum of each Gaussian's blending weights over the pixels of all views, `(N,)`.
 
-    It is the gradient of the pictures' sum by a colour of its own.
+    It is the gradient of the pictures' sum by a colour of its own. `rules` are those of the renderer.
     """
-    model, views = trainer.model, trainer.scene.train
-    rules: dict[str, Any] = {"max_bytes": trainer.config.max_bytes, "backend": trainer.backend}
-    renderer = GaussianRenderer(near_plane=trainer.near_plane, **rules).eval()
+    renderer = GaussianRenderer(near_plane=near_plane, **rules).eval()
     with torch.no_grad():
         gaussians = model()
     colors = torch.zeros_like(gaussians.means).requires_grad_()
     for i in range(len(views)):
-        camera = move_camera(views.camera(i), trainer.device)
+        camera = move_camera(views.camera(i), colors.device)
         renderer(replace(gaussians, colors=colors), camera).image[:, 0].sum().backward()
     return torch.zeros_like(colors[:, 0]) if colors.grad is None else colors.grad[:, 0]
 
@@ -72,7 +73,7 @@ def in_words(needs: dict[str, Any]) -> str:
     """What a fit left out, for its last line; "" where that is nothing."""
     parts, harmonics, gaussians = [], needs.get("sh_degree"), needs.get("gaussians")
     if harmonics and harmonics["chosen"] == 0:
-        why = "too few views to leave one out"
+        why = harmonics.get("why", "by rule")
         if harmonics["by"] == "probes":
             why = f"{harmonics['gain']:+.2f} dB in {harmonics['n']} probes, noise {harmonics['noise']:.2f}"
         parts.append(f"harmonics ({why})")

@@ -1,4 +1,4 @@
-"""What a step compares its render with: a photo, what D-SSIM wants of it, and where it is transparent."""
+"""What a step compares its render with: a photo, what D-SSIM wants of it, where it is transparent, and its border."""
 
 from typing import NamedTuple
 
@@ -19,6 +19,12 @@ class Target(NamedTuple):
     moments: TargetMoments
     clear: Tensor | None  # (1, 1, H, W), how much of the background shows; None: nothing
     background: Tensor  # (3,), the one that shows
+    light: Tensor | None  # (H, W), what a border lets through; None: everything
+
+    def seen(self, render: Tensor) -> Tensor:
+        """A render as the photo would show it: with no value above 1, behind the border."""
+        image = render.masked_fill(render > 1, 1.0)  # it is never below 0
+        return image if self.light is None else image * self.light
 
     def before(self, background: Tensor) -> tuple[Tensor, TargetMoments]:
         """The image, and its moments, before another background, `(3,)`."""
@@ -34,4 +40,5 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
     masks = [None] * len(views) if views.masks is None else [1.0 - mask[None].to(images[0]) for mask in views.masks]
     cameras = [move_camera(views.camera(i), device) for i in range(len(views))]
     parts = zip(cameras, images, map(target_moments, images), masks, strict=True)
-    return [Target(*each, background.to(images[0])) for each in parts]
+    light = None if views.light is None else views.light.to(images[0])
+    return [Target(*each, background.to(images[0]), light) for each in parts]

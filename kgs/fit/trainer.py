@@ -162,7 +162,7 @@ class Trainer:
 
     def psnr(self, views: Views) -> float | None:
         """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
-        renders = (self.render(views.camera(i))[0].clamp(0, 1).cpu() for i in range(len(views)))
+        renders = (views.shaded(self.render(views.camera(i))[0].clamp(0, 1).cpu()) for i in range(len(views)))
         values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
         mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
         return round(mean, 4) if math.isfinite(mean) else None
@@ -266,7 +266,7 @@ class Trainer:
                 self.drop.scores = gaussian_scores(config.drop_by, self.densifier, camera)
         gaussians = self.model()
         out = self.renderer(gaussians, camera, background)
-        image = out.image.masked_fill(out.image > 1, 1.0)  # it is never below 0
+        image = view.seen(out.image)
         loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
         if config.opacity_l1:
             low = config.opacity_l1_by == "gradient"

@@ -16,6 +16,7 @@ def study(
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Path | None = None,
+    report_only: bool = False,
 ) -> int:
     """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
 
@@ -28,13 +29,14 @@ def study(
 
     Args:
         out: folder for the results; cells that its sparse.jsonl has are not repeated.
-        preset: quick takes minutes on the built-in scene; cpu hours on the five scenes of KGS_DATA; paper is the
+        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA; paper is the
             paper's 10 000 steps on every scene there in the size it has, for a large machine.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the cells instead; they find scenes and weights under
             the same paths.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out, for good: a cell that
             is there is not measured again.
+        report_only: fit nothing; write the report of the cells that are there.
 
     Raises:
         DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
@@ -47,11 +49,12 @@ def study(
     folder, path = os.environ.get("KGS_DATA"), out / "sparse.jsonl"
     cells = presets.sparse_cells(preset, None if folder is None else Path(folder))
     data, weights = (None if place is None else os.path.abspath(place) for place in (folder, lpips_weights))
-    if read_rows(path) and not finished_rows(cells, path):
-        raise DataError(path, "", f"expected cells of --preset {preset}, got others; give each preset its own folder")
+    if (report_only or read_rows(path)) and not finished_rows(cells, path):
+        raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
     work = partial(sparse_cell, data=data, lpips_weights=weights)
     try:
-        run_grid(cells, work, path, scheduler=scheduler, processes=processes)
+        if not report_only:
+            run_grid(cells, work, path, scheduler=scheduler, processes=processes)
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own

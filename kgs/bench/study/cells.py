@@ -1,6 +1,5 @@
-"""One cell of the study: one fit, everything that the report says of it, and two probes of the fitted model."""
+"""One cell of the study: one fit, and everything that the report says of it."""
 
-import subprocess
 import time
 import warnings
 from dataclasses import replace
@@ -10,29 +9,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 import kgs
 from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
-from kgs.datasets.scene import Scene, Views
+from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.lpips import Lpips
-from kgs.fit.machine import peak_rss_mb
+from kgs.fit.machine import peak_rss_mb, revision
 from kgs.fit.metrics import MEASURES
 from kgs.fit.needs import decide
+from kgs.fit.overfitting import coadaptation, count_over_threshold
 from kgs.fit.run import choose_points, measure
 from kgs.fit.slim import slim
 from kgs.fit.starts import FirstPoints
-from kgs.fit.starts.triangulate import camera_centers
 from kgs.fit.trainer import Trainer
-from kgs.model import GaussianModel
-from kgs.renderer import GaussianRenderer
+from kgs.page.pictures import Picture, encoded
 
 FULL = "full-model"  # a start that no fit may have: the upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
-BINS = 6
 _lpips = lru_cache(maxsize=1)(Lpips.load)
 
 
@@ -52,6 +48,8 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     scene, points, seconds = _start(data, *known, preset)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
     trainer, metrics, result = fit_and_measure(scene, _config(**cell), points, lpips)
+    if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
+        result["pictures"] = _pictures(scene, trainer)
     return result | {
         **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
         "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
@@ -81,15 +79,11 @@ def fit_and_measure(
     return trainer, metrics, stored
 
 
-def revision(path: Path) -> str | None:
-    """The commit that last changed a file or folder, as "1a2b3c4 of 2026-11-22"; None where git does not know it."""
-    options = (("log", "-1", "--format=%h of %cs"), ("status", "--porcelain"))
-    calls = (["git", "-C", str(path.parent), *arguments, "--", path.name] for arguments in options)
-    try:
-        commit, changes = (subprocess.run(c, capture_output=True, text=True, check=True).stdout.strip() for c in calls)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return commit + (" and later changes" if changes else "") if commit else None
+def _pictures(scene: Scene, trainer: Trainer) -> list[str]:
+    """The first test view, its render and their difference, for the page; of other scenes none may be published."""
+    render = trainer.render(scene.test.camera(0))[0]
+    (found,) = encoded([Picture(scene.test.names[0], scene.test.images[0], {"": render})], 2**20)
+    return [found["photo"], *found["renders"][0][1:]]
 
 
 @lru_cache(maxsize=1)  # cells of one start follow each other
@@ -120,45 +114,3 @@ def _full_model(scene: Scene, seed: int) -> FirstPoints:
     chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
     points = everything.points[chosen].double() + (everything.offset - scene.offset)
     return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
-
-
-@torch.no_grad()
-def coadaptation(
-    model: GaussianModel, views: Views, *, near_plane: float = 0.01, subsets: int = 5, seed: int = 0
-) -> float | None:
-    """How much Gaussians rely on each other: the variance of renders of random halves, 0 where all halves look alike.
-
-    Unbiased, of clamped renders whose opacities are not raised; the mean over channels and over the pixels of all views
-    that have an alpha above 0.8 in every one of the `subsets` (at least 2) halves; None where there are no such pixels.
-    Source: "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", arXiv 2508.12720.
-    """
-    if subsets < 2:
-        raise ValueError(f"subsets: expected at least 2, got {subsets}")
-    renderer, generator = GaussianRenderer(near_plane=near_plane), torch.Generator().manual_seed(seed)
-    gaussians, total, pixels = model(), 0.0, 0
-    for view in range(len(views)):
-        kept = [torch.rand(gaussians.opacities.shape, generator=generator) < 0.5 for _ in range(subsets)]
-        halves = (replace(gaussians, opacities=gaussians.opacities * keep) for keep in kept)
-        renders = [renderer(half, views.camera(view), outputs=("image", "alpha")) for half in halves]
-        covered = torch.stack([out.alpha[0, 0] > 0.8 for out in renders]).all(0)
-        images = torch.stack([out.image[0].clamp(0, 1).double() for out in renders])
-        total += float(images.var(0).mean(0)[covered].sum())
-        pixels += int(covered.sum())
-    return total / pixels if pixels else None
-
-
-def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, Any]:
-    """Count Gaussians, and those whose mean gradient since the last densification is over the threshold, by distance.
-
-    The distance is that to the nearest training camera, in medians of the first points' distances. The edges of the
-    bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.
-    """
-    centers = camera_centers(trainer.scene.train.cameras)
-    clouds = (first_points, trainer.model.means)
-    first, now = (torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in clouds)
-    edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
-    bins = torch.bucketize(now, edges[1:-1])
-    over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
-    distance = [round(float(edge / first.median()), 4) for edge in edges]
-    counts = [torch.bincount(chosen, minlength=BINS).tolist() for chosen in (bins, bins[over])]
-    return {"distance": distance, "gaussians": counts[0], "over": counts[1]}

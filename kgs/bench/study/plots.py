@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from .presets import FAMILIES, FIXED, MAIN, OFF, PAPER
-from .tables import KEYS, STARTS, difference, grouped, main_cells
+from .pairs import KEYS, STARTS, difference, grouped, main_cells
+from .presets import AUTO, FAMILIES, FIXED, MAIN, OFF, PAPER
 
 # Colours of Okabe and Ito, told apart by colour-blind people too; those that share one differ in the marker.
 STYLES = {OFF: ("#000000", "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
-for _colour, _names in zip(("#E69F00", "#CC79A7", "#009E73"), FAMILIES.values(), strict=True):
+for _colour, _names in zip(("#CC79A7", "#E69F00", "#F0E442", "#009E73"), FAMILIES.values(), strict=True):
     STYLES = {**{name: (_colour, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
 _FILLS = dict(zip(STARTS, ("none", "left", "bottom", "top", "full", "right"), strict=True))  # of a start's markers
 DPI = 110
@@ -65,13 +65,15 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
 
 def _forest(frame: pd.DataFrame) -> pd.DataFrame:
     main = main_cells(frame)
-    groups = {"mean over scenes": main[main.groupby("method").scene.transform("nunique") > 1]}
+    several = main[main.groupby("method").scene.transform("nunique") > 1]
+    groups = {f"mean, interval over {what}": several for what in ("scenes", "seeds")}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in grouped(frame, *KEYS[:3])}
     lines = [
-        {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": gain.high - gain.mean}
+        {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": high - gain.mean}
         for where, cells in groups.items()
         for method in cells.method.unique()
         if (gain := difference(cells, "method", method, OFF)).pairs
+        for high in [gain.over_scenes[1] if where.endswith("scenes") else gain.high]
     ]
     return pd.DataFrame(lines).assign(panel="", y=range(len(lines)))
 
@@ -83,7 +85,7 @@ def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
 
 
 def _curves(frame: pd.DataFrame) -> pd.DataFrame:
-    cells = main_cells(frame)[lambda main: main.method.isin(MAIN) & (main.curve.str.len() > 0)]
+    cells = main_cells(frame)[lambda main: main.method.isin((*MAIN, AUTO)) & (main.curve.str.len() > 0)]
     steps = cells.curve.map(lambda curve: [point["step"] for point in curve])
     psnr = cells.curve.map(lambda curve: [point["test_psnr"] for point in curve])
     return _over_seeds(cells.assign(place=steps, x=steps, y=psnr))
@@ -122,9 +124,10 @@ _SHARES = f"""Gaussians whose mean gradient is over the densification threshold,
 {OFF} and {PAPER}: {_SEEDS}; each point stands for a sixth of the first points; a fit at its limit of Gaussians keeps \
 those that it could not densify"""
 # What each plot shows, its axes, and its caption.
-_OVER, _PSNR = "test PSNR over off, same first points and views [dB]", "test PSNR [dB]"
-_PLOTS = {"forest": (_forest, _OVER, "", "Paired differences of test PSNR over off, with 95 % intervals; n pairs")}
-_PLOTS["curves"] = (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join(MAIN)}: {_SEEDS}")
+_OVER, _PSNR = "test PSNR over off, same seeds and views [dB]", "test PSNR [dB]"
+_FOREST = "Paired differences of test PSNR over off, with 95 % intervals, of one scene over seeds; n pairs"
+_PLOTS = {"forest": (_forest, _OVER, "", f"{_FOREST}; from the same first points, but for {AUTO}")}
+_PLOTS["curves"] = (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}")
 _SCATTERED = {"gap": "overfitting: PSNR, training less test views [dB]", "cost": "CPU time of the fit [s]"}
 for _name, _x in {**_SCATTERED, "coadaptation": "co-adaptation [1e-3]"}.items():
     _caption = f"Test PSNR against {_x}; one point per cell, filled by its start"

@@ -12,9 +12,11 @@ from .cells import FULL
 from .grid import Cell
 
 OFF, PAPER, FIXED = MAIN = ("off", "progressive 0.2", "fixed 0.1")
-# The settings of each method's fit that are not the default's. Tables and plots keep this order.
+AUTO, AUTO_OFF = ("auto", "auto, off")  # kgs fit as it comes, and the same without dropping
+# The settings of each method's fit that are not those of the preset paper. Tables and plots keep this order.
 METHODS: dict[str, dict[str, Any]] = {
     **{OFF: {"drop": 0.0}, PAPER: {"drop": 0.2}, FIXED: {"drop": 0.1, "drop_schedule": "constant"}},
+    **{AUTO: {"preset": "auto"}, AUTO_OFF: {"preset": "auto", "drop": 0.0}},
     **{f"progressive {rate}": {"drop": rate} for rate in (0.1, 0.3)},
     **{f"fixed {rate}": {"drop": rate, "drop_schedule": "constant"} for rate in (0.05, 0.15, 0.2, 0.3)},
     **{by: {"drop": 0.2, "drop_by": by.replace(" ", "-")} for by in ("high gradient", "low gradient", "near", "far")},
@@ -22,13 +24,15 @@ METHODS: dict[str, dict[str, Any]] = {
 for _by, _weight in product(("gradient", "distance"), (0.001, 0.01)):
     METHODS[f"L1 {_by} {_weight}"] = {"drop": 0.0, "opacity_l1": _weight, "opacity_l1_by": _by}
 FAMILIES = {
+    "The default, with and without dropping": [AUTO, AUTO_OFF],
     "Rates and schedules": ["progressive 0.1", "progressive 0.3", *(f"fixed {r}" for r in (0.05, 0.1, 0.15, 0.2, 0.3))],
     "Selected Gaussians dropped instead of random ones": [name for name, fit in METHODS.items() if "drop_by" in fit],
     "An L1 penalty on opacities instead of dropping": [name for name in METHODS if name.startswith("L1")],
 }
-EQUAL_MEAN_RATE = {"progressive 0.1": "fixed 0.05", "progressive 0.2": "fixed 0.1", "progressive 0.3": "fixed 0.15"}
 # The scenes of the preset "cpu" and how many views each is given; for "paper" the numbers by the scene's folder.
 SCENES = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3, "blender/lego": 8, "nerfstudio/fox": 12}
+SCENES["colmap/monstree"] = 8
+MORE_VIEWS = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
 _FITS = {"quick": {"steps": 200, "max_gaussians": 12_000}, "cpu": {"steps": 2000}, "paper": {"steps": 10_000}}
 Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]  # seeds, scenes, starts, methods
@@ -38,8 +42,9 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     """The cells of a preset, the most telling ones first, those of one start together.
 
     Args:
-        preset: "quick": the synthetic scene, minutes. "cpu": the five scenes of `SCENES` in a quarter of the pixels of
-            504x378, 2000 steps; hours. "paper": 10 000 steps in full size on every scene below `data`; days on a CPU.
+        preset: "quick": the synthetic scene, minutes. "cpu": the six scenes of `SCENES` in a quarter of the pixels of
+            504x378, 2000 steps, and the synthetic one to be shown; hours. "paper": 10 000 steps in full size on every
+            scene below `data`; days on a CPU.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -47,7 +52,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     if preset == "quick":
         scene, few = [(SYNTHETIC, 3)], ("fixed 0.2", "far", "L1 distance 0.01")
         blocks: list[Block] = [(range(3), scene, ["dense"], MAIN), ([0], scene, ["dense"], few)]
-        blocks += [([0], scene, ["sift", "random"], [PAPER])]
+        blocks += [([0], scene, ["dense"], (AUTO, AUTO_OFF)), ([0], scene, ["sift", "random"], [PAPER])]
     elif data is None:
         raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
     else:
@@ -63,11 +68,15 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
 def _cpu(data: Path) -> list[Block]:
     check_scenes(data, SCENES)
     fern, flower, bounds = "llff/fern", "llff/flower", ("random", "model-points", FULL)  # no fit may have the last two
-    main = [*(([scene], _starts(scene[0]), MAIN) for scene in SCENES.items()), (SCENES.items(), ["sift"], [PAPER])]
+    every, auto = SCENES.items(), (AUTO, AUTO_OFF)
+    main: list[Any] = [*(([scene], ["dense"], names) for names in (MAIN, auto) for scene in every)]
     blocks: list[Block] = [([seed], *block) for seed in range(3) for block in main]
-    blocks += [([0], [*product((fern, flower), (6, 9))], ["dense"], (OFF, PAPER))]
-    blocks += [(range(3), [(fern, 3)], ["dense"], [name for name in METHODS if name not in MAIN])]
+    blocks += [([seed], MORE_VIEWS, ["dense"], names) for seed in range(3) for names in ((OFF, PAPER), [AUTO])]
+    blocks += [([seed], every, ["sift"], [PAPER]) for seed in range(3)]
+    blocks += [(range(3), [("blender/lego", 8)], ["scene"], MAIN)]
+    blocks += [(range(3), [(fern, 3)], ["dense"], [name for name in METHODS if name not in (*MAIN, *auto)])]
     blocks += [(range(3), [(fern, 3)], [start], [PAPER]) for start in bounds]
+    blocks += [([0], [(SYNTHETIC, 3)], ["dense"], names) for names in (MAIN, auto)]  # pictures for the page
     return [*blocks, ([0], [(flower, 3)], bounds, [PAPER])]
 
 
@@ -77,10 +86,7 @@ def _paper(data: Path) -> list[Block]:
         raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
     scenes = [(str(path.relative_to(data)), views) for path in folders for views in VIEWS[path.parent.name]]
     every = [METHODS if scene.startswith("llff/") and views == 3 else MAIN for scene, views in scenes]
-    main = [([scene], _starts(scene[0]), methods) for scene, methods in zip(scenes, every, strict=True)]
+    # Blender scenes also from the layout's random points, as published.
+    starts = [["dense", "scene"] if scene.startswith("blender") else ["dense"] for scene, _ in scenes]
+    main = [([scene], start, methods) for scene, start, methods in zip(scenes, starts, every, strict=True)]
     return [([seed], *block) for seed in range(5) for block in main]
-
-
-def _starts(scene: str) -> tuple[str, ...]:
-    """Where the main methods begin: at dense points; Blender scenes also at the layout's random ones, as published."""
-    return ("dense", "scene") if scene.startswith("blender") else ("dense",)

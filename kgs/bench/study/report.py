@@ -3,18 +3,22 @@
 import json
 import re
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader
+from jinja2 import ChoiceLoader, Environment, PackageLoader
 
 from kgs import __version__
 from kgs.bench.output import markdown_table
+from kgs.bench.scenes import SYNTHETIC
+from kgs.fit.machine import revision
 
-from .cells import revision
+from .findings import findings
+from .pairs import COLUMNS, KEYS, ORIGIN, cells_frame
 from .plots import write_plots
-from .tables import COLUMNS, KEYS, cells_frame, findings, sparse_tables
+from .tables import sparse_tables
 
 TITLE = "Sparse views: DropGaussian on and off at equal first points"
 
@@ -33,18 +37,20 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     frame = cells_frame(rows)
     out.mkdir(parents=True, exist_ok=True)
     lines = frame.sort_index().assign(fit=frame.fit.map(lambda fit: json.dumps(fit, sort_keys=True)))
-    lines = lines[[*KEYS, "seed", *COLUMNS, "init.kind", "fit"]]
+    lines = lines[[*KEYS, "seed", *COLUMNS, "init.kind", *ORIGIN, "fit"]]
     lines.rename(columns=lambda name: name.replace(".", "_")).to_csv(out / "sparse.csv", index=False)
-    tables, plots, results = sparse_tables(frame), write_plots(frame, out), findings(frame)
-    done = [row["result"] for row in rows]
-    dates, code = (sorted({result[key] for result in done if result.get(key)}) for key in ("date", "revision"))
-    versions = {", ".join(f"{k} {v}" for k, v in sorted(result.get("versions", {}).items())): None for result in done}
-    made = [f"{len(done)} of {planned} cells"]
+    real = frame[frame.scene != SYNTHETIC]
+    told = real if len(real) else frame
+    tables, plots, results = sparse_tables(told), write_plots(told, out), findings(told)
+    versions = [", ".join(f"{k} {v}" for k, v in sorted(row["result"].get("versions", {}).items())) for row in rows]
+    made = [f"{len(rows)} of {planned} cells"]
     made += [f"sparse.jsonl at commit {commit}"] if (commit := revision(out / "sparse.jsonl")) else []
-    made += [f"cells that say when they ran: {dates[0]} to {dates[-1]}"] if dates else []
-    made += [f"cells that say of which code: {', '.join(code)}"] if code else []
-    origin = [f"Command: {command}.", f"Figures: {'; '.join(made)}.", f"Versions: {'; '.join(versions)}."]
-    page = Environment(loader=PackageLoader("kgs.bench.study", ""), autoescape=True, trim_blocks=True)
+    made += [f"from {dates.min()} to {dates.max()}"] if len(dates := frame.date.dropna()) else []
+    code = [row["result"].get("revision") or "of no known commit" for row in rows]
+    origin = [f"Command: {command}.", f"Figures: {'; '.join(made)}.", f"Cells by commit of kgs: {_counts(code)}."]
+    origin += [f"Cells by versions and machine: {_counts(versions)}."]
+    folders = ChoiceLoader([PackageLoader("kgs.bench.study", ""), PackageLoader("kgs.page", "")])
+    page = Environment(loader=folders, autoescape=True, trim_blocks=True)
     page.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
     notes = page.get_template("notes.txt").render().splitlines()
     text = "\n".join([f"# {TITLE}", "", *(f"- {finding}" for finding in (*results, *origin)), "", ""])
@@ -52,8 +58,14 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
         text += markdown_table(title, table.columns[1:], table.to_numpy().tolist(), table.columns[0])
     text += "\n".join(f"- {note}" for note in notes) + "\n"
     content: dict[str, Any] = {"title": TITLE, "findings": results, "origin": origin, "notes": notes, "tables": tables}
+    content["shown"] = [row for row in rows if "pictures" in row["result"]]
     content["pictures"] = {caption: b64encode((out / name).read_bytes()).decode() for name, caption in plots.items()}
     html = page.get_template("page.html.jinja").render(**content, version=__version__)
     (out / "sparse.md").write_text(text, encoding="utf-8")
     (out / "index.html").write_text(html, encoding="utf-8")
     return text
+
+
+def _counts(values: Iterable[str]) -> str:
+    """As "200 a; 25 b", the most frequent first."""
+    return "; ".join(f"{count} {value}" for value, count in Counter(values).most_common())

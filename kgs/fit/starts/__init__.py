@@ -10,6 +10,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.camera import meeting_point
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 from kgs.neighbours import log_spacing
@@ -160,13 +161,9 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
         least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
         return 0.8 * least, 1.25 * most
     centers, axes = camera_centers(cameras), cameras.extrinsics[:, 2, :3].double().cpu()
-    # The point nearest to all optical axes; near-parallel axes (within some 5 degrees) do not tell where they meet.
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    if torch.linalg.eigvalsh(across.mean(0))[0] > 0.005:
-        meeting = torch.linalg.solve(across.sum(0), (across @ centers[..., None]).sum(0)[:, 0])
+    if (meeting := meeting_point(cameras.extrinsics)) is not None:
         depths = ((meeting - centers) * axes).sum(1)
-        if bool((depths > 0).all()):
-            return 0.3 * float(depths.min()), 2.0 * float(depths.max())
+        return 0.3 * float(depths.min()), 2.0 * float(depths.max())
     baseline = float(torch.cdist(centers, centers).max()) or 1.0
     return baseline, 20.0 * baseline
 

@@ -30,8 +30,8 @@ def dense_points(
 ) -> tuple[Tensor, Tensor]:
     """At most `count` points between two depths that two views agree on, drawn at random, and RGB, both `(P, 3)`.
 
-    The draw is "uniform", or "spread" evenly over the pictures: one point from each of as many cells. Where the views
-    have masks, points lie where both are above 0.5. Large pictures, and many, and such as move by more pixels than a
+    The draw is "uniform", or "spread" evenly over the pictures: one point from each of as many cells. Points
+    lie where the pixels of both views are usable. Large pictures, and many, and such as move by more pixels than a
     sweep has planes, are swept at half the width and height, or a quarter: enough points, in bounded time and memory.
     """
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
@@ -40,8 +40,8 @@ def dense_points(
         views = views.halved()
     maps = sweep_depths(views, near, far, stage, backend)
     certain = [there.is_inner & (there.scores > SCORE) for there in maps]
-    if views.masks is not None:
-        certain = [good & (mask[0] > 0.5).cpu() for good, mask in zip(certain, views.masks, strict=True)]
+    if (usable := views.usable) is not None:
+        certain = [good & there for good, there in zip(certain, usable.cpu(), strict=True)]
     found = [_agreed(views, maps, certain, view) for view in range(len(views))]
     points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
     chosen = torch.randperm(len(points), generator=generator)

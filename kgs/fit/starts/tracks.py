@@ -39,7 +39,7 @@ class Tracks:
 
 
 def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> Tracks:
-    """Find points that at least two of the views see, where the views' masks, if any, are above 0.5.
+    """Find points that at least two of the views see, where their pixels are usable.
 
     Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
     poses), clearly nearer than the second nearest, and alike in itself. The best matches are joined first; one that
@@ -47,7 +47,7 @@ def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> T
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
     limit = min(max(48_000 // len(views), 1500), 12_000)
-    features = [_detect(views, view, limit) for view in stage(range(len(views)), "keypoints", "view")]
+    features = [detect(views, view, limit) for view in stage(range(len(views)), "keypoints", "view")]
     projections = (views.cameras.intrinsics.double() @ views.cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
     links = list[tuple[float, int, int]]()
@@ -67,11 +67,11 @@ def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> T
     return Tracks(table, seen)
 
 
-def _detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
+def detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
     """Places `(N, 2)` in float64 and RootSIFT descriptors `(N, 128)` of the strongest keypoints of one view."""
     image = views.images[index].permute(1, 2, 0).cpu().numpy()
     grey = cv2.cvtColor((image.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    mask = None if views.masks is None else (views.masks[index, 0] > 0.5).cpu().numpy().astype(np.uint8)
+    mask = None if (usable := views.usable) is None else usable[index].cpu().numpy().astype(np.uint8)
     if (factor := 2 if grey.size < SMALL_IMAGE else 1) > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
         mask = None if mask is None else mask.repeat(factor, 0).repeat(factor, 1)

@@ -1,0 +1,81 @@
+"""Soft daylight on a mesh: many distant lamps, each with a depth map of what it sees first (a shadow map).
+
+Source: L. Williams, "Casting Curved Shadows on Curved Surfaces", SIGGRAPH 1978. A close bundle of lamps is the sun,
+with penumbras; lamps spread over half a sphere are the sky, which leaves corners and the room under a table darker.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .raycast import Array, raycast
+
+MAP_SIZE = 288  # pixels along each side of a depth map
+DISTANCE = 30.0  # m from the middle of the casters to each lamp
+LIFT = 0.012  # m off its surface from where a point looks at the lamps: over the steps of the depth maps
+AMBIENT = np.float32(0.16)  # what reaches every point
+SUN_COLOR, SKY_COLOR = (0.74, 0.68, 0.58), (0.5, 0.54, 0.6)
+CHUNK = 4096  # points at a time, so that their numbers stay in the cache
+
+
+class Lights(NamedTuple):
+    """L lamps, float32."""
+
+    directions: NDArray[np.float32]  # (L, 3), unit, towards the lamps
+    colors: NDArray[np.float32]  # (L, 3), what a surface that faces the lamp gets
+    rows: NDArray[np.float32]  # (3, 4, L): to u z, v z and z in the lamps' depth maps
+    depths: NDArray[np.float32]  # (L, S, S), infinite where nothing is hit
+
+
+def daylight(casters: Array, sun: Array, sky: Array, num_sun: int = 6, num_sky: int = 18) -> Lights:
+    """Lamps around triangles `(F, 3, 3)`: a sun, and a sky that is half a sphere.
+
+    `sun` and `sky` `(3,)` are unit vectors from the scene towards the sun and towards the middle of the sky.
+    """
+    low, high = casters.min(axis=(0, 1)), casters.max(axis=(0, 1))
+    middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
+    directions = np.concatenate([_cap(sun, num_sun, 0.9985), _cap(sky, num_sky, 0.0)])
+    colors = np.repeat([SUN_COLOR, SKY_COLOR], [num_sun, num_sky], axis=0)
+    colors /= np.repeat([num_sun, 0.5 * num_sky], [num_sun, num_sky])[:, None]  # 0.5: the mean cosine
+    focal, center = 0.5 * (MAP_SIZE - 2) * np.sqrt(DISTANCE**2 - radius**2) / radius, (MAP_SIZE - 1) / 2
+    intrinsics = np.array([[focal, 0, center], [0, focal, center], [0, 0, 1.0]])
+    rows, depths = [], []
+    for direction in directions:
+        extrinsics = np.eye(4)
+        extrinsics[:3, :3] = _frame(-direction).T
+        extrinsics[:3, 3] = -extrinsics[:3, :3] @ (middle + DISTANCE * direction)
+        depth, faces = raycast(casters, intrinsics, extrinsics, (MAP_SIZE, MAP_SIZE))
+        rows.append(intrinsics @ extrinsics[:3])
+        depths.append(np.where(faces < 0, np.inf, depth))
+    return Lights(*(np.asarray(x, np.float32) for x in (directions, colors, np.stack(rows, axis=-1), depths)))
+
+
+def received(lights: Lights, points: Array, normals: Array) -> NDArray[np.float32]:
+    """The light `(n, 3)` on points `(n, 3)` with unit normals `(n, 3)`: Lambert's cosine of each lamp in sight."""
+    lifted = np.concatenate([points + LIFT * normals, np.ones((len(points), 1))], axis=1).astype(np.float32)
+    normals, light = normals.astype(np.float32), np.empty(points.shape, np.float32)
+    size, first = lights.depths.shape[1], np.arange(len(lights.depths)) * lights.depths[0].size
+    for start in range(0, len(points), CHUNK):
+        rows = slice(start, start + CHUNK)
+        u, v, z = (lifted[rows] @ matrix for matrix in lights.rows)
+        column, line = ((x / z + np.float32(0.5)).clip(0, size - 1).astype(np.int32) for x in (u, v))
+        nearest = lights.depths.take(first + line * size + column)
+        cosines = (normals[rows] @ lights.directions.T).clip(0)
+        light[rows] = AMBIENT + (cosines * (z < nearest + LIFT / 2)) @ lights.colors
+    return light
+
+
+def _cap(axis: Array, count: int, least: float) -> Array:
+    """Directions `(count, 3)` spread evenly over the cap whose angle to the axis has at least that cosine."""
+    k = np.arange(count) + 0.5
+    cosine = 1 - (1 - least) * k / count
+    turn, sine = k * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - cosine**2)
+    return np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1) @ _frame(axis).T
+
+
+def _frame(axis: Array) -> Array:
+    """A rotation whose third column is the axis."""
+    right = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(axis, right), axis], axis=-1)

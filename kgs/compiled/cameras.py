@@ -1,0 +1,42 @@
+"""The gradient of projection that goes to pinhole cameras: what each Gaussian says of a pose and of intrinsics."""
+
+import numpy as np
+
+from .kernel import ONE, ZERO, jit
+from .projection import camera_point, color_gradients, point_gradient, rotation, rows, turned_back
+
+
+@jit
+def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, gradients, found):
+    """From gradients of what a camera sees, a range of its list, to those of its matrices, one row for each Gaussian.
+
+    `ids` and `gradients` are those of :func:`.projection.footprint_gradients`. Written are `found` `(M, 21)`: world to
+    camera `(3, 4)`, then the intrinsics `(3, 3)`. The 3x3 block of the pose is a rotation.
+    """
+    v, k, limits, centre = camera
+    g_means2d, g_factors, g_depths, _, g_rgb = gradients
+    bands = colors.shape[1] // 3 if g_rgb.shape[1] else 0
+    b, h, none = np.empty(16, np.float32), np.empty(16, np.float32), np.empty((0, 0), np.float32)
+    for m in range(begin, end):
+        g, out = ids[m], found[m]
+        x, y, z = local = camera_point(means, g, v)
+        world, inverse = (means[g, 0], means[g, 1], means[g, 2]), ONE / z
+        j, _, tx, ty = rows(x, y, inverse, v, k, limits)
+        s, f = scales[g], g_factors[m]
+        t = (f[0] * s[0], f[1] * s[1], f[2] * s[2], f[3] * s[0], f[4] * s[1], f[5] * s[2])
+        u = turned_back(t, rotation(quats, g)[2])
+        g_mean = g_means2d[m, 0], g_means2d[m, 1]
+        gx, gy, gz, by_j = point_gradient(x, y, z, v, k, limits, u, g_mean, g_depths[m])
+        moved, w = (gx, gy, gz), (ZERO, ZERO, ZERO)
+        if bands > 1:
+            w = color_gradients(g, means, colors, centre, bands, g_rgb[m], b, h, none)
+        px, py = (k[0, 0] * x + k[0, 1] * y) * inverse + k[0, 2], (k[1, 0] * x + k[1, 1] * y) * inverse + k[1, 2]
+        across = g_mean[0] * inverse, g_mean[1] * inverse, -(g_mean[0] * px + g_mean[1] * py) * inverse
+        for i in range(3):
+            for c in range(3):
+                out[4 * i + c] = moved[i] * world[c] + j[i] * u[c] + j[3 + i] * u[3 + c] + v[i, 3] * w[c]
+                out[12 + 3 * i + c] = across[i] * local[c]
+            out[4 * i + 3] = moved[i] + v[i, 0] * w[0] + v[i, 1] * w[1] + v[i, 2] * w[2]
+        for i in range(2):
+            out[12 + 3 * i] += (by_j[3 * i] - by_j[3 * i + 2] * tx) * inverse
+            out[13 + 3 * i] += (by_j[3 * i + 1] - by_j[3 * i + 2] * ty) * inverse

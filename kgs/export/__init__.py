@@ -1,0 +1,1 @@
+"""Splats for other programs: glTF, the list of cameras that viewers read, a film."""

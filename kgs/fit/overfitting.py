@@ -1,0 +1,58 @@
+"""Two signs of overfitting in a fitted model: how much its Gaussians rely on each other, and where they would split."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kgs.datasets.scene import Views
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
+
+from .starts.triangulate import camera_centers
+from .trainer import Trainer
+
+BINS = 6
+
+
+@torch.no_grad()
+def coadaptation(
+    model: GaussianModel, views: Views, *, near_plane: float = 0.01, subsets: int = 5, seed: int = 0
+) -> float | None:
+    """How much Gaussians rely on each other: the variance of renders of random halves, 0 where all halves look alike.
+
+    Unbiased, of clamped renders whose opacities are not raised; the mean over channels and over the pixels of all views
+    that have an alpha above 0.8 in every one of the `subsets` (at least 2) halves; None where there are no such pixels.
+    Source: "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", arXiv 2508.12720.
+    """
+    if subsets < 2:
+        raise ValueError(f"subsets: expected at least 2, got {subsets}")
+    renderer, generator = GaussianRenderer(near_plane=near_plane), torch.Generator().manual_seed(seed)
+    gaussians, total, pixels = model(), 0.0, 0
+    for view in range(len(views)):
+        kept = [torch.rand(gaussians.opacities.shape, generator=generator) < 0.5 for _ in range(subsets)]
+        halves = (replace(gaussians, opacities=gaussians.opacities * keep) for keep in kept)
+        renders = [renderer(half, views.camera(view), outputs=("image", "alpha")) for half in halves]
+        covered = torch.stack([out.alpha[0, 0] > 0.8 for out in renders]).all(0)
+        images = torch.stack([out.image[0].clamp(0, 1).double() for out in renders])
+        total += float(images.var(0).mean(0)[covered].sum())
+        pixels += int(covered.sum())
+    return total / pixels if pixels else None
+
+
+def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, Any]:
+    """Count Gaussians, and those whose mean gradient since the last densification is over the threshold, by distance.
+
+    The distance is that to the nearest training camera, in medians of the first points' distances. The edges of the
+    bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.
+    """
+    centers = camera_centers(trainer.scene.train.cameras)
+    clouds = (first_points, trainer.model.means)
+    first, now = (torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in clouds)
+    edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
+    bins = torch.bucketize(now, edges[1:-1])
+    over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
+    distance = [round(float(edge / first.median()), 4) for edge in edges]
+    counts = [torch.bincount(chosen, minlength=BINS).tolist() for chosen in (bins, bins[over])]
+    return {"distance": distance, "gaussians": counts[0], "over": counts[1]}

@@ -1,0 +1,154 @@
+"""The page of a fit, index.html: what the fit knows, for :mod:`kgs.page`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.datasets.scene import Scene, Views
+from kgs.errors import DataError
+from kgs.json_files import read_json
+from kgs.model import GaussianModel
+from kgs.page import Picture, write_page
+
+from .folder import SavedFit
+from .outputs import is_own
+from .progress import each, say
+from .slim import contributions, in_words
+
+PAGE = "index.html"
+REPORT = "photos.json"  # how cameras were found, where they were
+MOST_PICTURES = 6
+
+Render = Callable[[PinholeCamera], Tensor]
+
+
+def write_fit_page(
+    path: Path,
+    title: str,
+    scene: Scene,
+    model: GaussianModel,
+    near_plane: float,
+    renders: Mapping[str, Render],
+    runs: Mapping[str, Mapping[str, Any]],
+    *,
+    words: tuple[str, str] = ("training", "test"),
+    notes: Sequence[str] = (),
+    settings: Mapping[str, Any] | None = None,
+    report: Path | None = None,
+) -> None:
+    """Write the page of one or more fits of a scene; the viewer shows one of them.
+
+    Args:
+        path: of the page.
+        title: of the page.
+        scene: photos and cameras.
+        model: what the viewer shows.
+        near_plane: of its renderer.
+        renders: from a camera to `(1, 3, H, W)`, by the name of the run.
+        runs: what metrics.json holds, by the name of the run.
+        words: what training and test views are called.
+        notes: sentences for the reader.
+        settings: config.json.
+        report: a JSON file about how the cameras were found; left aside where it is not there.
+    """
+    views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
+    known = {run: _levels(metrics) for run, metrics in runs.items()}
+    chosen, pictures = spread(len(views), MOST_PICTURES), list[Picture]()
+    for i in each(chosen, "page", "view"):
+        name, seen = views.names[i], {run: views.shaded(draw(views.camera(i))[0]) for run, draw in renders.items()}
+        level = [f"{run} {known[run][name]:.2f} dB".strip() for run in renders if name in known.get(run, {})]
+        pictures.append(Picture(name, views.images[i], seen, ": ".join([name, *([", ".join(level)] if level else [])])))
+    found: dict[str, Any] = {}
+    with suppress(DataError):
+        found = read_json(report) if report is not None and report.is_file() else {}
+    with torch.no_grad():
+        gaussians = model()
+    write_page(
+        path,
+        title,
+        gaussians,
+        _all_cameras(scene.train, scene.test),
+        [*scene.train.names, *scene.test.names],
+        [words[0]] * len(scene.train) + [words[1]] * len(scene.test),
+        near_plane=near_plane,
+        background=scene.background,
+        pictures=pictures,
+        pictures_note=_note(len(chosen), len(views), word),
+        runs=runs,
+        left_out=in_words(next(iter(runs.values()), {}).get("needs") or {}),
+        notes=[*notes, *(line for run, metrics in runs.items() for line in _seen(metrics, run))],
+        settings=_settings(settings or {}),
+        report=_report(found),
+        weights=lambda: contributions(model, scene.train, near_plane),
+    )
+
+
+def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:
+    """Write the page of a fit that is in a folder again, with other measures; not in place of a user's own file."""
+    path = out / PAGE
+    if path.exists() and not is_own(path):
+        say(f"{path} was not written by kgs, and is left as it is")
+        return
+    settings, title = read_json(out / "config.json"), (out / saved.request["scene"]).resolve().name
+    drawn = {"": lambda camera: saved.render(camera, scene.background)}, {"": metrics}
+    facts: dict[str, Any] = {"settings": settings, "report": out / REPORT}
+    write_fit_page(path, title, scene, saved.model, saved.near_plane, *drawn, **facts)
+
+
+def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What config.json says, without the steps at which things happened."""
+    parts = {name: value for name, value in config.items() if name != "timetable"}
+    return {**parts.pop("request", {}), **parts.pop("fit", {}), **parts}
+
+
+def _report(found: Mapping[str, Any]) -> dict[str, Any]:
+    """What photos.json says of the cameras, without hashes and settings, its lists in a number or two."""
+    report = {name: value for name, value in found.items() if name not in ("seed", "settings", "sha256", "versions")}
+    photos, matches = report.pop("photos", None), report.pop("matches", None)
+    with suppress(AttributeError, KeyError, TypeError, ValueError):
+        points = [photo["points"] for photo in photos.values()]
+        report["points in a photo"] = f"{min(points)} to {max(points)}"
+        report["blurred"] = [name for name, photo in photos.items() if photo["blurred"]]
+    with suppress(AttributeError, TypeError):
+        report["time"] = f"{sum(report.pop('seconds', {}).values()):.0f} s"
+    with suppress(IndexError, TypeError, ValueError):
+        counts = [row[2] for row in matches]
+        report["matches of a pair"] = f"{min(counts)} to {max(counts)}"
+    return report
+
+
+def _note(shown: int, count: int, word: str) -> str:
+    photos = f"{word} photos".removeprefix("photo ")
+    return f"{shown} of {count} {photos}." if shown < count else f"The {photos}."
+
+
+def _seen(metrics: Mapping[str, Any], run: str) -> list[str]:
+    """How good held-out views are where training views show the scene, in words."""
+    seen = metrics.get("seen") or {}
+    if seen.get("psnr") is None or seen.get("psnr_rest") is None:
+        return []
+    share, level = f"{100 * seen['share']:.0f} %", f"{seen['psnr']:.2f} dB there, {seen['psnr_rest']:.2f} dB elsewhere"
+    sentence = f"two training views or more show {share} of what the held-out photos do: PSNR {level}."
+    sentence = f"{run}: {sentence}" if run else sentence
+    return [sentence[0].upper() + sentence[1:]]
+
+
+def _levels(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The PSNR of each view that was measured and has one."""
+    parts = [metrics.get(part) or {} for part in ("test", "train", "views")]
+    return {row["name"]: row["psnr"] for part in parts for row in part.get("views", []) if row["psnr"] is not None}
+
+
+def _all_cameras(*parts: Views) -> PinholeCamera:
+    names = ("intrinsics", "extrinsics", "height", "width")
+    return PinholeCamera(*(torch.cat([getattr(views.cameras, name) for views in parts]) for name in names))
+
+
+def spread(count: int, most: int) -> list[int]:
+    """At most so many of the positions, spread evenly, the first and the last among them."""
+    return [round(i * (count - 1) / (most - 1)) for i in range(most)] if count > most else list(range(count))

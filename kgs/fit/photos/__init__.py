@@ -1,0 +1,73 @@
+"""Cameras from bare photos: what a phone wrote goes in, a scene that kgs and other programs read comes out.
+
+Two solvers have to agree, and gates refuse what cannot be believed: see :mod:`kgs.fit.photos.gates`.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from kgs.fit.folder import locked
+from kgs.fit.progress import Stage, say, silent
+
+from .find import find_photos
+from .mapping import quiet_pycolmap
+from .pose import find_cameras
+from .read import hash_photos
+from .write import UNFINISHED, check_place, end_move, kept_report, publish
+
+__all__ = ["pose_photos"]
+
+SETTINGS = 1  # grows with every change after which the same photos give other files
+
+
+def pose_photos(
+    folder: Path, out: Path, *, seed: int = 0, stage: Stage = silent, say: Callable[[str], None] = say
+) -> dict[str, Any]:
+    """Find the cameras of bare photos, and write a scene that `kgs.datasets.load_scene` reads.
+
+    The folder `out` gets `images` (upright PNGs of one size, at most 1600 pixels long, without metadata), `sparse/0`
+    (COLMAP's binary model: one SIMPLE_RADIAL lens, poses, points with tracks) and `photos.json` (the report). If the
+    photos are those of a former run, what is there is used again.
+
+    Convention:
+        COLMAP's: world-to-camera poses with OpenCV axes, the first pixel's centre at (0.5, 0.5). Up in the world is
+        -y: the cameras' common up. The median depth of a point in the photos that see it is 1.
+
+    Args:
+        folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into.
+        out: the folder for the results, made if it is not there.
+        seed: of what the solvers draw. The same photos and seed give the same files.
+        stage: shows how far each part is, as `kgs.fit.progress.each` does.
+        say: where lines for the user go.
+
+    Returns:
+        What photos.json holds, and "reused": whether it is a former run's.
+
+    Raises:
+        DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
+            what to do, with the number of matches of each pair.
+        ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
+        OSError: a result cannot be written.
+    """
+    with quiet_pycolmap():  # a missing package is told before any work
+        pass
+    paths = find_photos(folder)
+    check_place(out, folder)
+    hashes = hash_photos(paths)
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        end_move(out)
+        same = {"settings": SETTINGS, "seed": seed, "sha256": hashes}
+        if report := kept_report(out, same):
+            say(f"cameras: those in {out} are of the same {len(paths)} photos and are used again")
+            return report | {"reused": True}
+        new = out / UNFINISHED
+        shutil.rmtree(new, ignore_errors=True)
+        try:
+            report = same | find_cameras(paths, new, seed, stage, say)
+            publish(out, report)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+    return report | {"reused": False}

@@ -1,0 +1,71 @@
+"""The photos of a user's folder, or what the folder holds instead and what to do about it."""
+
+from pathlib import Path
+
+from kgs.datasets.images import IMAGE_SUFFIXES, list_images
+from kgs.errors import DataError
+
+FEWEST = 3
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
+_HEIC = (".heic", ".heif", ".hif")
+_OTHERS = (*_HEIC, ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".jxl", ".gif", ".jp2")
+_LISTED = 10
+CONVERT = (
+    "kgs reads PNG, JPEG, WebP, TIFF and BMP. Make JPEGs of them first: on a Mac `sips -s format jpeg *.HEIC --out "
+    "jpeg`, elsewhere `magick mogrify -format jpg *.HEIC` (ImageMagick) or `heif-convert` (libheif); on an iPhone "
+    "Settings > Camera > Formats > Most Compatible takes JPEGs from the start"
+)
+ADVICE = "Take 3 to 12 photos of one scene that does not move, a small step between them, so that neighbours overlap"
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """The photos of a folder, sorted by name.
+
+    Raises:
+        DataError: there is no such folder, it holds fewer than 3 photos, or photos of a kind that cannot be read.
+    """
+    if folder.is_file() and folder.suffix.lower() in _VIDEOS:
+        raise DataError(folder, "", _from_video(folder))
+    if not folder.is_dir():
+        raise DataError(folder, "", "expected a folder of photos, found no such folder")
+    paths = [path for path in list_images(folder) if path.is_file()]
+    kinds = {"others": _OTHERS, "videos": _VIDEOS}
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
+    found = {kind: [path for path in files if path.suffix.lower() in kinds[kind]] for kind in kinds}
+    if others := found["others"]:
+        wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed(others)}). "
+        raise DataError(folder, "", wrong + CONVERT)
+    if not paths and found["videos"]:
+        raise DataError(folder, "", _from_video(found["videos"][0]))
+    if not paths:
+        deeper = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds_photos(path)]
+        if deeper:
+            reason = f"holds no photos itself, but these folders in it do: {listed(deeper)}. Name one of them"
+        else:
+            reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
+        raise DataError(folder, "", reason)
+    if len(paths) < FEWEST:
+        reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed(paths)}). {ADVICE}"
+        raise DataError(folder, "", reason)
+    return paths
+
+
+def listed(paths: list[Path]) -> str:
+    """The names of files, the first ten of them."""
+    names = ", ".join(path.name for path in paths[:_LISTED])
+    return names + (f" and {len(paths) - _LISTED} more" if paths[_LISTED:] else "")
+
+
+def _holds_photos(folder: Path) -> bool:
+    try:
+        return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *_OTHERS) for path in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _from_video(path: Path) -> str:
+    line = f'ffmpeg -i "{path.name}" -vf fps=1 frames/%03d.jpg'
+    return (
+        f"{path.name} is a video, not photos. Take frames from it (`mkdir frames && {line}` takes one a second), "
+        "keep 3 to 12 sharp ones that overlap, and name their folder"
+    )

@@ -1,0 +1,140 @@
+"""Whether cameras can be believed, and what to tell who took the photos where they cannot.
+
+A low reprojection error proves nothing: few matches fit wrong cameras as well. So the focal length has to be one that
+lenses have, each photo has to see many points, and a second solver, from other keypoints, has to find the same poses.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .mapping import FEWEST_MATCHES, Cameras, Look
+
+FOCAL_RANGE = 0.4, 3.0  # of the longer side
+FEWEST_POINTS = 50  # that each photo sees
+MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
+_SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
+_FLAT = 0.97  # share of matches that one homography explains; of a scene with depth in some pair fewer
+_WITHOUT = "A fit without some photos: take them out of the folder"
+Pairs = Mapping[tuple[str, str], int]  # verified matches of each pair
+
+
+def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> list[str]:
+    """What speaks against one solver's cameras, a sentence each; none if nothing does.
+
+    Args:
+        cameras: what the solver found.
+        names: of all photos.
+        longest: the longer side of the photos in pixels.
+    """
+    if cameras is None:
+        return ["no pair of photos gave a first guess of the cameras"]
+    found, ratio = [], cameras.focal / longest
+    if missing := [name for name in names if name not in cameras.points]:
+        found.append(f"{len(missing)} of {len(names)} photos could not be placed: {', '.join(missing)}")
+    if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]:
+        limits = f"{FOCAL_RANGE[0]:g} to {FOCAL_RANGE[1]:g}"
+        found.append(f"the focal length came out at {ratio:.3g} times the longer side, where lenses have {limits}")
+    if few := [f"{name} ({count})" for name, count in cameras.points.items() if count < FEWEST_POINTS]:
+        found.append(f"fewer than {FEWEST_POINTS} points are seen in {', '.join(few)}")
+    return found
+
+
+def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str]]:
+    """The largest angle, in degrees, between two solvers' relative rotations of a pair, and that pair.
+
+    Of photos that one of them did not place it is 180.
+    """
+    worst = (0.0, ("", ""))
+    for pair in combinations(sorted({*first.rotations, *second.rotations}), 2):
+        known = all(name in cameras.rotations for name in pair for cameras in (first, second))
+        angle = _degrees(*(_relative(cameras, pair) for cameras in (first, second))) if known else 180.0
+        worst = max(worst, (angle, pair))
+    return worst
+
+
+def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
+    """The photos in groups that overlap with each other, in the order of their names, the largest first."""
+    groups = [{name} for name in names]
+    for pair, count in pairs.items():
+        if count >= FEWEST_MATCHES:
+            joined = [group for group in groups if group & set(pair)]
+            groups = [group for group in groups if group not in joined] + [set().union(*joined)]
+    return sorted((sorted(group, key=list(names).index) for group in groups), key=lambda g: (-len(g), g))
+
+
+def weakest_link(names: Sequence[str], pairs: Pairs) -> tuple[str, str]:
+    """The pair with the fewest matches among those that hold the photos together (a maximum spanning tree)."""
+    group, weakest = {name: {name} for name in names}, (names[0], names[1])
+    for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
+        if group[pair[0]] is not group[pair[1]]:
+            weakest = pair
+            joined = group[pair[0]] | group[pair[1]]
+            group |= dict.fromkeys(joined, joined)
+    return weakest
+
+
+def table(names: Sequence[str], pairs: Pairs) -> str:
+    """Verified matches of each pair, a row and a column for each photo."""
+    width = max(4, *(len(str(count)) for count in pairs.values()))
+    long = max(len(name) for name in names)
+    head = " " * (4 + long) + "".join(f" {i + 1:>{width}}" for i in range(len(names)))
+    rows = [f"{i + 1:>3} {name:<{long}}" + _row(name, names, pairs, width) for i, name in enumerate(names)]
+    return "\n".join(["Matches of each pair:", head, *rows])
+
+
+def unfit(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Look]) -> str:
+    """What to say of photos whose matches can give no cameras, and what to photograph next; "" of others.
+
+    Args:
+        names: of all photos.
+        pairs: verified matches of each pair.
+        looks: how they lie, of the pairs that overlap.
+    """
+    if twins := [pair for pair, look in looks.items() if look.shift < _SAME_PLACE]:
+        return f"{' and '.join(twins[0])} show the same from the same place: remove one of them"
+    groups = groups_of(names, pairs)
+    if len(groups) == 1 and min(look.flat for look in looks.values()) < _FLAT:
+        return ""
+    if len(groups) == 1:
+        reason = "in every pair one plane, or a camera that only turned on the spot, explains all matches"
+        advice = "Take a step to the side or up between photos, and show things that are nearer and farther"
+    elif len(groups[0]) == 1:
+        reason = f"no two of the {len(names)} photos show enough of the same things"
+        advice = "Take them again with a smaller step between neighbours: two thirds of a photo should be in the next"
+    else:
+        shown = "; ".join(f"{i}: {', '.join(group)}" for i, group in enumerate(groups, 1))
+        reason = f"the photos fall into {len(groups)} groups that do not overlap ({shown})"
+        between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
+        advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
+    return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
+
+
+def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs) -> str:
+    """What to say of cameras that cannot be believed, and what to photograph next."""
+    between = " and ".join(weakest_link(names, pairs))
+    return (
+        f"no cameras that can be trusted: {'; '.join(reasons)}. What helps most: photos from places between {between}, "
+        "with steps to the side or up (turning on the spot shows no depth), so that neighbours share two thirds of the "
+        f"scene; a scene with texture; all with one lens, without zoom. {_WITHOUT}. With cameras of your own: a folder "
+        f"with images/ and sparse/0 from COLMAP.\n{table(names, pairs)}"
+    )
+
+
+def _row(name: str, names: Sequence[str], pairs: Pairs, width: int) -> str:
+    cells = ("." if name == other else pairs.get((name, other), pairs.get((other, name), 0)) for other in names)
+    return "".join(f" {cell:>{width}}" for cell in cells)
+
+
+def _relative(cameras: Cameras, pair: tuple[str, str]) -> NDArray[np.float64]:
+    return np.asarray(cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T)
+
+
+def _degrees(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """The angle between two rotations, exact for small ones as well."""
+    difference = first @ second.T
+    sine = np.linalg.norm(difference - difference.T) / math.sqrt(8)
+    return math.degrees(math.atan2(float(sine), (float(np.trace(difference)) - 1) / 2))

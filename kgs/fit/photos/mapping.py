@@ -1,0 +1,185 @@
+"""Cameras and points from matches, by COLMAP's incremental mapper with settings for few photos.
+
+Source: J. Schoenberger and J.-M. Frahm, Structure-from-motion revisited, CVPR 2016. Settings that differ from COLMAP's
+were measured (docs/photos.md). Everything runs on one thread, so that the same photos give the same bits.
+"""
+
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
+_PEAKS = 0.25  # of COLMAP's threshold for keypoints
+_MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
+_LONGEST = (
+    1000  # pixels of the longer side; COLMAP's own keypoints are as good in smaller photos, and take a minute less
+)
+
+
+class Cameras(NamedTuple):
+    """What one solver says. Poses are world-to-camera with OpenCV axes, by the photos' names."""
+
+    focal: float  # pixels
+    rotations: dict[str, NDArray[np.float64]]  # (3, 3) each
+    centers: dict[str, NDArray[np.float64]]  # (3,) each, in the world
+    points: dict[str, int]  # how many points a photo sees
+    reconstruction: Any  # pycolmap's
+
+
+class Look(NamedTuple):
+    """How the matches of two photos lie."""
+
+    shift: float  # pixels that half of them move
+    flat: float  # share that one homography explains: 1 where the camera only turned, or saw one plane
+
+
+@contextmanager
+def quiet_pycolmap() -> Iterator[Any]:
+    """pycolmap, without its log and without its handler of SIGTERM."""
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    if main and before is not None:
+        signal.signal(signal.SIGTERM, before)
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.FATAL)
+    try:
+        yield pycolmap
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def verify(database: Path, seed: int, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
+    """Find the matches of each pair that one motion of the camera explains.
+
+    Args:
+        database: with matches.
+        seed: of what is drawn.
+        names: what each image of the database is called.
+
+    Returns:
+        How many there are, by the names of every pair.
+    """
+    with quiet_pycolmap() as pycolmap:
+        verifier = pycolmap.GeometricVerifierOptions()
+        verifier.num_threads = 1
+        pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_views(pycolmap, seed))
+        with pycolmap.Database.open(database) as file:
+            images = {image.image_id: names[image.name] for image in file.read_all_images()}
+            pairs = list(combinations(sorted(images), 2))
+            return {(images[i], images[j]): len(_inliers(file, i, j)) for i, j in pairs}
+
+
+def looks(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], Look]:
+    """How the verified matches of each pair that overlaps lie, by the names of the pair in `names`."""
+    found = {}
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
+        images = {image.image_id: names[image.name] for image in file.read_all_images()}
+        places = {i: file.read_keypoints(i)[:, :2] for i in images}
+        for i, j in combinations(sorted(images), 2):
+            rows = _inliers(file, i, j)
+            if len(rows) >= FEWEST_MATCHES:
+                first, second = places[i][rows[:, 0]], places[j][rows[:, 1]]
+                _, flat = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
+                shift = float(np.median(np.linalg.norm(first - second, axis=1)))
+                found[images[i], images[j]] = Look(shift, 0.0 if flat is None else float(np.mean(flat)))
+    return found
+
+
+def write_own_matches(database: Path, images: Path, like: Path, seed: int) -> None:
+    """Make a second database of the same photos, with COLMAP's own keypoints and matches, verified.
+
+    Args:
+        database: the file to write.
+        images: the folder of the photos.
+        like: the first database, which has the photos' names and what is known of their lens.
+        seed: of the verification.
+    """
+    with quiet_pycolmap() as pycolmap:
+        with pycolmap.Database.open(like) as file:
+            names, camera = [image.name for image in file.read_all_images()], file.read_all_cameras()[0]
+        reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+        reader.camera_model = "SIMPLE_RADIAL"
+        if camera.has_prior_focal_length:
+            reader.camera_params = camera.params_to_string()
+        extraction.num_threads, extraction.use_gpu, extraction.max_image_size = 1, False, _LONGEST
+        extraction.sift.peak_threshold *= _PEAKS
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.num_threads, matching.use_gpu = 1, False
+        cpu, one = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=names,
+            camera_mode=one,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=cpu,
+        )
+        rules = {"matching_options": matching, "verification_options": _two_views(pycolmap, seed)}
+        pycolmap.match_exhaustive(database, **rules, device=cpu)
+
+
+def solve(database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str]) -> Cameras | None:
+    """Cameras and points from verified matches, of as many photos as can be placed; None where no pair can be.
+
+    Args:
+        database: with verified matches.
+        images: the folder of the photos.
+        work: a folder for what the mapper writes.
+        seed: of its random choices.
+        names: what each image of the database is called.
+    """
+    with quiet_pycolmap() as pycolmap:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = options.mapper.num_threads = 1
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+        options.multiple_models, options.min_model_size, options.extract_colors = False, 2, False
+        options.min_num_matches = 10
+        options.mapper.init_min_tri_angle = 2.0  # degrees; the default, 16, fails on photos that face one way
+        options.mapper.init_min_num_inliers = 20
+        options.mapper.abs_pose_min_num_inliers = 12
+        options.mapper.filter_max_reproj_error = _MAX_ERROR
+        options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = _MAX_ERROR
+        options.mapper.init_max_error, options.mapper.abs_pose_max_error = 2.0, 4.0
+        options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
+        with suppress(RuntimeError, ValueError):  # the mapper gives up
+            found = pycolmap.incremental_mapping(database, images, work, options)
+            best = max(found.values(), key=lambda scene: scene.num_reg_images(), default=None)
+            return None if best is None else cameras_of(best, names)
+    return None
+
+
+def cameras_of(reconstruction: Any, names: Mapping[str, str]) -> Cameras:
+    """The cameras of a reconstruction by the names that `names` gives its images, in their order there."""
+    images = {image.name: image for image in reconstruction.images.values() if image.has_pose}
+    placed = {name: images[image] for image, name in names.items() if image in images}
+    poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
+    return Cameras(
+        float(next(iter(reconstruction.cameras.values())).focal_length),
+        {name: pose[:, :3] for name, pose in poses.items()},
+        {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
+        {name: int(image.num_points3D) for name, image in placed.items()},
+        reconstruction,
+    )
+
+
+def _two_views(pycolmap: Any, seed: int) -> Any:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed, options.detect_watermark = seed, False
+    return options
+
+
+def _inliers(file: Any, i: int, j: int) -> NDArray[np.int64]:
+    """Numbers of keypoints `(M, 2)` of the verified matches of two images."""
+    if not file.exists_two_view_geometry(i, j):
+        return np.zeros((0, 2), np.int64)
+    return np.asarray(file.read_two_view_geometry(i, j).inlier_matches, np.int64)

@@ -1,0 +1,161 @@
+"""From photos to cameras that two solvers agree on, in a folder, and what is said of them in the report."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+
+from kgs.errors import DataError
+from kgs.fit.machine import versions
+from kgs.fit.outputs import png_names
+from kgs.fit.progress import Stage
+
+from .exif import FILM_DIAGONAL
+from .gates import (
+    FEWEST_POINTS,
+    FOCAL_RANGE,
+    MOST_DEGREES,
+    Pairs,
+    disagreement,
+    objections,
+    refusal,
+    unfit,
+)
+from .mapping import Cameras, looks, solve, verify, write_own_matches
+from .matching import write_matches
+from .read import Photo, blurred, read_photos
+from .write import IMAGES, MODEL, level_and_scale, write_images, write_model
+
+SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
+
+
+def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Callable[[str], None]) -> dict[str, Any]:
+    """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
+
+    Raises:
+        DataError: the photos do not fit together, or their cameras cannot be believed.
+    """
+    seconds, lap = dict[str, float](), _clock()
+    folder, names, work, images = paths[0].parent, [path.name for path in paths], new / "work", new / IMAGES
+    for path in (images, work):
+        path.mkdir(parents=True)
+    with _one_thread():
+        photos = read_photos(paths, stage)
+        unsharp = [photo.path.name for photo in blurred(photos)]
+        if unsharp:
+            say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
+        png = png_names(names)
+        write_images(images, photos, list(png.values()))
+        seconds["photos"] = lap()
+        first, second, known = work / "first.db", work / "second.db", {image: name for name, image in png.items()}
+        write_matches(first, photos, list(png.values()), stage)
+        pairs = verify(first, seed, known)
+        seconds["matches"] = lap()
+        if against := unfit(names, pairs, looks(first, known)):
+            raise DataError(folder, "", against)
+        found = [solve(first, images, work / "model", seed, known)]
+        seconds["cameras"] = lap()
+        write_own_matches(second, images, first, seed)
+        found.append(solve(second, images, work / "model", seed, known))
+        seconds["second solver"] = lap()
+        chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
+        level_and_scale(chosen)
+        write_model(new / MODEL, chosen, images)
+        shutil.rmtree(work)
+        seconds["files"] = lap()
+    error = float(chosen.reconstruction.compute_mean_reprojection_error())
+    say(f"cameras: {len(photos)} photos placed, {chosen.reconstruction.num_points3D()} points, {error:.2f} pixels off")
+    return {
+        **_lens(chosen, photos),
+        "photos": {
+            photo.path.name: {
+                "image": png[photo.path.name],
+                "points": chosen.points[photo.path.name],
+                "blurred": photo.path.name in unsharp,
+                "exif_focal_35mm": photo.exif.focal_35mm,
+            }
+            for photo in photos
+        },
+        "matches": [[*pair, count] for pair, count in pairs.items()],
+        "points": chosen.reconstruction.num_points3D(),
+        "reprojection_error_px": error,
+        "solver": SOLVERS[found.index(chosen)],
+        "agreement_degrees": degrees,
+        "gates": {
+            "focal_over_longer_side": list(FOCAL_RANGE),
+            "least_points_of_a_photo": FEWEST_POINTS,
+            "most_degrees": MOST_DEGREES,
+            "passed": True,
+        },
+        "seconds": seconds,
+        "versions": versions() | {"pycolmap": version("pycolmap")},
+    }
+
+
+def judge(
+    folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs
+) -> tuple[Cameras, float]:
+    """The cameras that pass the gates, and how far the two solvers are apart in degrees; a DataError if none do.
+
+    If both pass, those whose worst photo sees more points are taken.
+    """
+    against = [objections(cameras, names, longest) for cameras in found]
+    good = [cameras for cameras, reasons in zip(found, against, strict=True) if cameras and not reasons]
+    if not good:
+        raise DataError(folder, "", refusal(against[0], names, pairs))
+    for cameras in found:  # what one of them did not place nothing confirms
+        if missing := [name for name in names if cameras is None or name not in cameras.points]:
+            reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
+            raise DataError(folder, "", refusal([reason], names, pairs))
+    degrees, pair = disagreement(*[cameras for cameras in found if cameras])
+    if degrees > MOST_DEGREES:
+        reason = (
+            f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
+        )
+        raise DataError(folder, "", refusal([reason], names, pairs))
+    return max(good, key=lambda cameras: min(cameras.points.values())), degrees
+
+
+def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
+    """What the report says of size and lens."""
+    camera = next(iter(cameras.reconstruction.cameras.values()))
+    (width, height), known = photos[0].size, [photo.focal for photo in photos if photo.focal]
+    film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
+    return {
+        "size": [width, height],
+        "focal_px": cameras.focal,
+        "focal_35mm": film,
+        "exif_focal_px": sorted(known)[len(known) // 2] if known else None,
+        "radial_distortion": float(camera.params[3]),
+    }
+
+
+def _clock() -> Callable[[], float]:
+    """A function that gives the seconds since its last call."""
+    last = time.perf_counter()
+
+    def lap() -> float:
+        nonlocal last
+        before, last = last, time.perf_counter()
+        return round(last - before, 2)
+
+    return lap
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread for torch and OpenCV: sums of several are rounded in another order."""
+    threads, cores = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(cores)

@@ -1,0 +1,116 @@
+"""Photos and cameras in a folder, as COLMAP has them: `images`, `sparse/0` and `photos.json`, all three or none.
+
+What is new is written to `unfinished-photos`. When all is there that folder is renamed to `finished-photos`, and its
+parts are moved to their places. Whoever opens the folder after a kill in between ends the move first.
+"""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kgs.datasets.images import list_images
+from kgs.errors import DataError
+from kgs.fit.outputs import is_own, write_json, write_png
+from kgs.json_files import read_json
+
+from .mapping import Cameras, quiet_pycolmap
+from .read import Photo
+
+REPORT, IMAGES, MODEL = "photos.json", "images", "sparse/0"
+UNFINISHED, _FINISHED = "unfinished-photos", "finished-photos"
+
+
+def check_place(out: Path, folder: Path) -> None:
+    """A DataError where the results would lie among the user's photos or in place of files of another program."""
+    if out.resolve() == folder.resolve():
+        raise DataError(out, "", "holds the photos themselves: choose another folder with -o")
+    foreign = (out / "sparse").exists() and not is_own(out / REPORT)
+    if foreign or ((out / IMAGES).is_dir() and not all(map(is_own, list_images(out / IMAGES)))):
+        raise DataError(out, "", "holds files of a scene that kgs did not write: choose another folder with -o")
+
+
+def kept_report(out: Path, same: dict[str, Any]) -> dict[str, Any] | None:
+    """The report of a former run, if it has the same values and all of its files are there; else None."""
+    try:
+        report = read_json(out / REPORT)
+        images = [out / IMAGES / str(photo["image"]) for photo in report["photos"].values()]
+    except (DataError, KeyError, TypeError, AttributeError):
+        return None
+    files = [*images, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]
+    unchanged = all(report.get(key) == value for key, value in same.items())
+    return report if unchanged and all(path.is_file() for path in files) else None
+
+
+def write_images(folder: Path, photos: list[Photo], names: list[str]) -> None:
+    """Write the photos as PNGs without metadata: what was decoded once is not compressed with loss again."""
+    for photo, name in zip(photos, names, strict=True):
+        write_png(folder / name, torch.from_numpy(photo.pixels).permute(2, 0, 1) / 255)
+
+
+def level_and_scale(cameras: Cameras) -> None:
+    """Turn, scale and move the world: up is the cameras' common up, the median depth of a seen point is 1.
+
+    Convention:
+        OpenCV's axes: afterwards y points down and, for the first photo, z forward as far as that is level. The origin
+        is the mean of the cameras' centres.
+    """
+    scene, names = cameras.reconstruction, list(cameras.rotations)
+    first, up = cameras.rotations[names[0]], -sum(rotation[1] for rotation in cameras.rotations.values())
+    turned = _onto(first @ up, np.array([0.0, -1.0, 0.0])) @ first
+    depths = np.concatenate([_depths(scene, image) for image in scene.images.values()])
+    scale = 1.0 / float(np.median(depths))
+    center = np.mean([cameras.centers[name] for name in names], axis=0)
+    with quiet_pycolmap() as pycolmap:
+        scene.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turned), -scale * turned @ center))
+
+
+def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
+    """Write cameras, images and points with tracks and colours, as COLMAP's binary files."""
+    folder.mkdir(parents=True)
+    cameras.reconstruction.extract_colors_for_all_images(images)
+    cameras.reconstruction.write_binary(folder)
+
+
+def publish(out: Path, report: dict[str, Any]) -> None:
+    """Put what is in `unfinished-photos` in its place; what fails to move, the next `end_move` moves."""
+    write_json(out / UNFINISHED / REPORT, report)
+    shutil.rmtree(out / _FINISHED, ignore_errors=True)
+    os.replace(out / UNFINISHED, out / _FINISHED)
+    end_move(out)
+
+
+def end_move(out: Path) -> None:
+    """What is left of a move goes to its place."""
+    done = out / _FINISHED
+    if not done.is_dir():
+        return
+    for name in (IMAGES, "sparse"):
+        if (done / name).is_dir():
+            shutil.rmtree(out / name, ignore_errors=True)
+            os.replace(done / name, out / name)
+    if (done / REPORT).exists():
+        os.replace(done / REPORT, out / REPORT)
+    shutil.rmtree(done)
+
+
+def _depths(scene: Any, image: Any) -> NDArray[np.float64]:
+    """Depths of the points that a photo sees."""
+    pose = image.cam_from_world().matrix()
+    points = [scene.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+    return np.asarray(np.array(points).reshape(-1, 3) @ pose[2, :3] + pose[2, 3])
+
+
+def _onto(vector: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The least rotation that turns a vector into the direction of a unit vector; none where they are opposite or 0."""
+    length = float(np.linalg.norm(vector))
+    cosine = float(vector @ target) / length if length else -1.0
+    if cosine < -0.99:
+        return np.eye(3)
+    x, y, z = np.cross(vector / length, target)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))

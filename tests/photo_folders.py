@@ -1,0 +1,56 @@
+"""Folders of photos as a user has them: three views of two painted planes, and what phones and people do to files."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+from start_scenes import cameras, painted_planes
+
+NAMES = ("IMG_1.png", "IMG_2.png", "IMG_3.png")
+
+
+def planes() -> np.ndarray:
+    """The three views, `(3, H, W, 3)` BGR."""
+    images = painted_planes().images.permute(0, 2, 3, 1).numpy()
+    return np.ascontiguousarray((images * 255).round().astype(np.uint8)[..., ::-1])
+
+
+def poses() -> np.ndarray:
+    """Their world-to-camera matrices, `(3, 4, 4)`."""
+    return cameras().extrinsics.numpy()
+
+
+def write_planes(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in zip(NAMES, planes(), strict=True):
+        cv2.imwrite(str(folder / name), image)
+    return folder
+
+
+def exif(order: str = "<", orientation: int = 1, film: int = 0, focal: float = 0, density: float = 0, width: int = 0):
+    """A TIFF block with these tags: what a camera writes into a photo."""
+    shorts = [(0x0112, orientation)]
+    inner = [(0xA405, 3, film), (0x920A, 5, focal), (0xA20E, 5, density), (0xA210, 3, 3), (0xA002, 4, width)]
+    inner = [row for row in inner if row[2]]
+    start = 8 + 2 + 12 * (len(shorts) + 1) + 4
+    far = start + 2 + 12 * len(inner) + 4
+    head = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(order + "I", 8)
+    head += struct.pack(order + "H", len(shorts) + 1)
+    head += b"".join(struct.pack(order + "HHIHH", tag, 3, 1, value, 0) for tag, value in shorts)
+    head += struct.pack(order + "HHII", 0x8769, 4, 1, start) + bytes(4) + struct.pack(order + "H", len(inner))
+    values = b""
+    for tag, kind, value in inner:
+        if kind == 5:
+            head += struct.pack(order + "HHII", tag, 5, 1, far + len(values))
+            values += struct.pack(order + "II", round(value * 100), 100)
+        else:
+            head += struct.pack(order + ("HHIHH" if kind == 3 else "HHII"), tag, kind, 1, value, *[0] * (kind == 3))
+    return head + bytes(4) + values
+
+
+def with_exif(jpeg: bytes, block: bytes) -> bytes:
+    body = b"Exif\0\0" + block
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]

@@ -1,0 +1,143 @@
+"""The dark border that undistortion leaves around photos: found where there is one, and nowhere else."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from start_scenes import as_views
+
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.border import border_light
+from kgs.fit.config import FitConfig
+from kgs.fit.metrics import evaluate
+from kgs.fit.run import choose_points
+from kgs.fit.targets import targets
+from kgs.fit.trainer import Trainer
+from kgs.losses import photometric_loss
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic_scene(train_views=3, test_views=1, size=(144, 192))
+
+
+def behind(left=1.0, top=2.0, right=0.5, bottom=0.0):
+    """What borders of these widths, in pixels with a fraction, let through."""
+    rows, columns = torch.arange(1.0, 145.0)[:, None], torch.arange(1.0, 193.0)
+    sides = columns - left, columns.flip(0) - right, rows - top, rows.flip(0) - bottom
+    return math.prod(side.clamp(0, 1) for side in sides)
+
+
+def test_a_border_is_found_as_it_is(scene):
+    light = behind()
+    found = border_light(scene.train.images * light)
+    assert bool((found[4:-4, 4:-4] == 1).all())
+    torch.testing.assert_close(found, light, atol=0.4, rtol=0)  # at corners of a textured scene
+    assert float((found - light).abs()[light < 1].mean()) < 0.05
+
+    assert border_light(scene.train.images[:2] * light) is not None
+
+
+def test_a_border_of_changing_thickness_is_followed(scene):
+    thickness = torch.linspace(2.0, 0.6, 192)  # of the upper side, as distortion leaves it
+    light = (torch.arange(1, 145)[:, None] - thickness).clamp(0, 1)
+    found = border_light(scene.train.images * light)
+    torch.testing.assert_close(found, light, atol=0.4, rtol=0)
+    assert float((found - light).abs()[light < 1].mean()) < 0.1
+
+
+def test_photos_without_a_border_have_none(scene):
+    assert border_light(scene.train.images) is None
+
+
+def test_the_scene_is_not_taken_for_a_border(scene):
+    photos = scene.train.images.clone()
+    assert border_light(photos * behind() * 0.02) is None  # too dark to tell
+    photos[0, :, :2] = 0.0  # in one photo alone
+    assert border_light(photos) is None
+    assert border_light(scene.train.images[:1] * behind()) is None  # one photo tells nothing
+    assert border_light(torch.zeros(3, 3, 144, 192)) is None
+
+
+def test_a_dark_edge_that_is_too_wide_is_the_scene(scene):
+    assert border_light(scene.train.images * behind(left=0, top=8.0, right=0)) is None
+
+
+def test_small_pictures_have_none():
+    assert border_light(torch.rand(2, 3, 5, 5)) is None
+
+
+def with_border(scene, light):
+    def put(views):
+        return replace(views, images=views.images * light, light=light)
+
+    return replace(scene, train=put(scene.train), test=put(scene.test))
+
+
+def ignored(scene):
+    return replace(scene, train=replace(scene.train, light=None), test=replace(scene.test, light=None))
+
+
+def test_a_render_is_measured_behind_the_border(scene):
+    light = behind()
+    views = with_border(scene, light).test
+    photos = iter(scene.test.images)
+    assert evaluate(lambda _: next(photos)[None], views)["psnr"] is None  # infinite
+    photos = iter(scene.test.images)
+    assert evaluate(lambda _: next(photos)[None], replace(views, light=None))["psnr"] < 30
+
+
+def test_a_border_has_no_part_in_a_fit(scene):
+    light = behind(left=2.0, top=2.0, right=0.0)
+    target = targets(with_border(scene, light).train, torch.zeros(3), torch.device("cpu"))[0]
+    render = torch.full_like(target.image, 0.5).requires_grad_()
+    photometric_loss(target.seen(render), target.image, 0.2, moments=target.moments).backward()
+    assert bool((render.grad[0, :, light == 0] == 0).all())
+    assert bool((render.grad[0, :, light == 1] != 0).any())
+
+
+def test_a_fit_renders_the_scene_without_the_border(scene):
+    """A fit that knows of the border is as bright at the edge as one of photos without; else it is dark there."""
+    light, points = behind(left=3.0, top=0.0, right=0.0), choose_points(scene, FitConfig(init="sift"))
+    edges = []
+    for views in (scene, with_border(scene, light), ignored(with_border(scene, light))):
+        trainer = Trainer(views, FitConfig(steps=60, evaluations=1, training_background="scene"), points)
+        trainer.fit()
+        edges.append(float(trainer.render(scene.train.camera(0))[..., :2].mean()))
+    assert edges[1] == pytest.approx(edges[0], abs=0.1)
+    assert edges[2] < edges[1] - 0.1
+
+
+def test_halving_and_choosing_keep_the_border(scene):
+    light = behind(left=2.0, top=1.0, right=0.0)
+    views = with_border(scene, light).train
+    assert views.select([1]).light is light
+    halved = views.halved().light
+    assert float(halved[20, 0]) == 0.0
+    assert float(halved[0, 20]) == 0.5
+
+
+def test_pixels_of_the_border_are_not_usable(scene):
+    light = behind(left=1.0, top=0.0, right=0.0)
+    masks = torch.ones(3, 1, 144, 192)
+    masks[1, 0, 5, 5] = 0.2
+    views = replace(as_views(scene.train.cameras, scene.train.images, masks), light=light)
+    assert not bool(views.usable[:, :, 0].any())
+    assert views.usable[:, 5, 5].tolist() == [True, False, True]
+    assert bool(views.usable[:, 6:, 6:].all())
+    assert replace(views, masks=None, light=None).usable is None
+    with pytest.raises(ValueError, match=r"light: expected shape \(144, 192\)"):
+        replace(views, light=light[1:])
+
+
+def test_a_scene_is_loaded_with_its_border(kgs_data):
+    loaded = load_scene(kgs_data / "nerfstudio" / "fox", 3, 2)
+    assert loaded.train.light is not None
+    assert loaded.finer is not None
+    assert loaded.finer.light is not None
+    assert torch.equal(loaded.test.light, loaded.train.light)
+    assert 0.4 < float(loaded.train.light[120, 0]) < 0.6  # half a pixel of black on the left
+    assert bool((loaded.train.light[3:-3, 3:-3] == 1).all())
+    assert any("border" in note for note in loaded.notes)
+    assert load_scene(kgs_data / "llff" / "fern", 3, 2).train.light is None

@@ -1,0 +1,101 @@
+"""What other programs get beside the PLY file: the list of cameras, the world upright, PNGs with alpha."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from factories import random_model, random_views
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+import kgs
+from kgs.export import film
+from kgs.export.cameras import camera_list, upright
+from kgs.fit import exports
+from kgs.fit.commands import render
+from kgs.fit.outputs import EXPORTS, is_own, write_json
+
+
+def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:
+    """With the reader of the reference viewers in mind: pixel = f R^T (x - position) + the middle."""
+    views, offset = random_views(3), torch.tensor([1e6, 2e6, -5.0]).double()
+    write_json(tmp_path / "cameras.json", camera_list([views.select([2, 0]), views.select([1])], offset))
+    assert is_own(tmp_path / "cameras.json")
+    listed = json.loads((tmp_path / "cameras.json").read_text())
+    assert [(each["id"], each["img_name"]) for each in listed] == [
+        (0, views.names[2]),
+        (1, views.names[0]),
+        (2, views.names[1]),
+    ]
+    point = torch.tensor([0.3, -0.2, 4.0])
+    for entry, index in zip(listed, (2, 0, 1), strict=True):
+        ours: PinholeCamera = views.camera(index)
+        pixel = ours.project(point[None, None])[0, 0] - torch.stack([ours.cx, ours.cy])[:, 0]
+        x, y, z = np.array(entry["rotation"]).T @ (point.double() + offset - torch.tensor(entry["position"])).numpy()
+        assert (entry["fx"] * x / z, entry["fy"] * y / z) == pytest.approx(pixel.tolist(), abs=1e-3)
+        assert (entry["width"], entry["height"]) == (int(ours.width), int(ours.height))
+
+
+def test_upright() -> None:
+    torch.manual_seed(1)
+    turn = torch.linalg.qr(torch.randn(3, 3).double()).Q
+    turn *= turn.det().sign()
+    tilts = 0.2 * torch.randn(6, 3).double()
+    poses = torch.eye(4).double().repeat(6, 1, 1)
+    poses[:, :3, :3] = axis_angle_to_rotation_matrix(tilts) @ turn
+    found = upright(poses)
+    torch.testing.assert_close(found @ found.T, torch.eye(3).double())
+    assert found.det() > 0
+    up, ahead = found @ -poses[:, 1, :3].mean(0), found @ poses[:, 2, :3].mean(0)
+    assert up[1] / up.norm() > 1 - 1e-9
+    assert ahead[2] / ahead.norm() < -0.95
+    for some in (poses[:1], torch.cat([poses[:1], torch.diag(torch.tensor([-1.0, -1, 1, 1])).double() @ poses[:1]])):
+        found = upright(some)  # one camera; two of opposite ups
+        torch.testing.assert_close(found @ found.T, torch.eye(3).double())
+
+
+def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> None:
+    class Fitted:
+        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        shown, notes = random_model(), list[str]()
+
+        def render(self, camera: PinholeCamera) -> torch.Tensor:
+            return torch.zeros(1, 3, int(camera.height), int(camera.width))
+
+    monkeypatch.setattr(film, "FRAMES", 3)
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert {path.name for path in tmp_path.iterdir()} == set(EXPORTS)
+    assert all(is_own(path) for path in tmp_path.iterdir())
+    (tmp_path / "turntable.webm").unlink()
+    monkeypatch.setattr(exports, "write_film", lambda *_: "no turntable.webm: a reason")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert Fitted.notes == ["no turntable.webm: a reason"]
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_path: Path, background: Any) -> None:
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -0.5, 3.9])
+    model = kgs.GaussianModel.from_points(points, torch.rand(300, 3), 0)
+    with torch.no_grad():
+        model.opacity_logits += 1.0
+    kgs.save_ply(tmp_path / "splat.ply", model)
+    render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "clear", background="transparent")
+    render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "opaque", background=background)
+    names = sorted(path.name for path in (tmp_path / "opaque").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "clear").iterdir())
+    for name in names:
+        clear = cv2.imread(str(tmp_path / "clear" / name), cv2.IMREAD_UNCHANGED).astype(float)
+        opaque = cv2.imread(str(tmp_path / "opaque" / name)).astype(float)
+        assert clear.shape[2] == 4
+        share = clear[:, :, 3:] / 255
+        assert share.min() == 0
+        assert share.max() > 0.5
+        composed = share * clear[:, :, :3] + (1 - share) * (255 if background == "white" else 0)
+        assert np.abs(composed - opaque).max() <= 1.6  # three values, each rounded to 8 bits
+        assert is_own(tmp_path / "clear" / name)

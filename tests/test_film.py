@@ -1,0 +1,197 @@
+"""The film: its path through the cameras, its frames, and that a browser plays it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from browser import Browser
+from torch import Tensor
+
+from kgs.datasets.scene import Views, pinholes
+from kgs.export import film
+from kgs.export.film import tour, write_film
+from kgs.fit.outputs import is_own
+
+
+def looking_at(target: Tensor, places: Tensor) -> Tensor:
+    """World-to-camera matrices of cameras at `places` that look at the target; the world's z is up."""
+    poses = []
+    for place in places.double():
+        ahead = (target - place) / (target - place).norm()
+        right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]).double())
+        right = right / right.norm()
+        turn = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
+        pose = torch.eye(4).double()
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ place
+        poses.append(pose)
+    return torch.stack(poses)
+
+
+def ring(count: int, radius: float = 3.0) -> Tensor:
+    """Cameras around the z axis in a scrambled order, at several heights."""
+    angles = 2 * math.pi * torch.arange(count).double() / count
+    places = torch.stack([radius * angles.cos(), radius * angles.sin(), 1 + 0.3 * (3 * angles).sin()], 1)
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(count))
+    return looking_at(torch.zeros(3).double(), places[order])
+
+
+def facing(count: int) -> Tensor:
+    """Cameras side by side that look ahead."""
+    poses = torch.eye(4).double().repeat(count, 1, 1)
+    poses[:, :3, 3] = -torch.rand(count, 3, generator=torch.Generator().manual_seed(count)).double() * torch.tensor(
+        [2.0, 1.0, 0.1]
+    )
+    return poses
+
+
+def centers(poses: Tensor) -> Tensor:
+    return torch.linalg.inv(poses)[:, :3, 3]
+
+
+def angles(a: Tensor, b: Tensor) -> Tensor:
+    """Degrees between the rotations of poses."""
+    cosine = ((a[:, :3, :3] * b[:, :3, :3]).sum((1, 2)) - 1) / 2
+    return cosine.clamp(-1, 1).acos().rad2deg()
+
+
+PATHS = {
+    "ring of 3": ring(3),
+    "ring of 8": ring(8),
+    "2 facing": facing(2),
+    "3 facing": facing(3),
+    "6 facing": facing(6),
+}
+
+
+@pytest.mark.parametrize("poses", PATHS.values(), ids=PATHS)
+def test_the_path_passes_each_camera_and_is_smooth(poses: Tensor) -> None:
+    path = tour(poses, 2000, 1.0)
+    for pose in poses:
+        nearest = int((path - pose).abs().amax((1, 2)).argmin())
+        assert (centers(path)[nearest] - centers(pose[None])[0]).norm() < 0.02
+        assert angles(path[nearest, None], pose[None]) < 0.5
+    assert torch.allclose(path[:, :3, :3] @ path[:, :3, :3].mT, torch.eye(3).double(), atol=1e-12)
+    moves = centers(path).diff(dim=0, append=centers(path)[:1])  # the first frame follows the last
+    turns = angles(path, path.roll(-1, 0))
+    assert moves.norm(dim=1).max() < 4 * moves.norm(dim=1).mean()
+    assert turns.max() <= 4 * turns.mean() + 1e-3
+    assert (moves.diff(dim=0).norm(dim=1) < 0.2 * moves.norm(dim=1).max()).all()  # no corner
+
+
+def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
+    poses = ring(5)
+    path = tour(poses, 100, 1.0)
+    places = centers(path)
+    radii, lengths = places.norm(dim=1), centers(poses).norm(dim=1)
+    assert (lengths.min() - 0.05 < radii).all()  # a chord of the ring would come to 2.4
+    assert (radii < lengths.max() + 0.05).all()
+    assert (-(path[:, 2, :3] * places).sum(1) / radii > 0.999).all()
+    turned = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
+    assert min(turned.sum(), (2 * math.pi - turned).sum()) < 2 * math.pi  # once around
+
+
+def test_cameras_side_by_side_are_never_left() -> None:
+    poses = facing(6)
+    places = centers(tour(poses, 300, 1.0))
+    assert (places >= centers(poses).amin(0) - 1e-9).all()
+    assert (places <= centers(poses).amax(0) + 1e-9).all()
+
+
+def test_the_round_trip_is_short() -> None:
+    assert centers(tour(ring(12), 120, 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.2
+    assert centers(tour(ring(40), 120, 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.3
+
+
+def test_a_single_camera_sways_and_keeps_its_target() -> None:
+    pose = ring(7)[2]
+    path = tour(pose[None], 60, depth=4.0)
+    torch.testing.assert_close(path[0], pose)
+    target = torch.linalg.inv(pose) @ torch.tensor([0.0, 0.0, 4.0, 1.0]).double()
+    seen = path @ target
+    torch.testing.assert_close(seen[:, :2], torch.zeros(60, 2).double(), atol=1e-9, rtol=0)
+    moved = (centers(path) - centers(pose[None])).norm(dim=1)
+    assert 0.05 < moved.max() < 0.5
+
+
+def test_cameras_at_one_place_are_no_trouble() -> None:
+    assert tour(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
+
+
+def views_of(size: tuple[int, int]) -> Views:
+    lens = torch.eye(4).repeat(3, 1, 1)
+    lens[:, 0, 0] = lens[:, 1, 1] = 0.9 * size[1]
+    lens[:, 0, 2], lens[:, 1, 2] = (size[1] - 1) / 2, (size[0] - 1) / 2
+    names = ("a", "b", "c")
+    return Views(pinholes(lens, facing(3).float(), size), torch.zeros(3, 3, *size), names)
+
+
+def render(camera: Any) -> Tensor:
+    """A picture that says from where it was taken: a bright bar where a point 2 before the origin is."""
+    height, width = int(camera.height), int(camera.width)
+    column = float(camera.project(torch.tensor([[[1.0, 0.5, 2.0]]]))[0, 0, 0])
+    bar = torch.exp(-(((torch.arange(width) - column) / (0.05 * width)) ** 2))
+    return torch.stack([bar, 0.8 * bar, 0.6 * bar])[None, :, None].expand(1, 3, height, width)
+
+
+@pytest.mark.parametrize(("size", "expected"), [((33, 45), (32, 44)), ((1000, 1500), (426, 640))])
+def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, size: Any, expected: Any) -> None:
+    monkeypatch.setattr(film, "FRAMES", 8)
+    rendered = []
+
+    def kept(camera: Any) -> Tensor:
+        rendered.append(render(camera)[0])
+        return rendered[-1][None]
+
+    views, path = views_of(size), tmp_path / "film.webm"
+    assert write_film(path, kept, views, 1.0) == ""
+    assert [file.name for file in tmp_path.iterdir()] == ["film.webm"]
+    assert is_own(path)
+    video, frames = cv2.VideoCapture(str(path)), []
+    while (found := video.read())[0]:
+        frames.append(torch.from_numpy(np.ascontiguousarray(found[1][:, :, ::-1])).permute(2, 0, 1) / 255)
+    assert len(frames) == 8
+    assert tuple(frames[0].shape[1:]) == expected
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(30)
+    for frame, image in zip(frames, rendered, strict=True):
+        assert (frame - image).square().mean() < 2e-3  # 27 dB; another frame's bar is at another place
+    small, photo = rendered[0][0, 0], render(views.camera(0))[0, 0, 0]  # of the first camera, in two sizes
+    centre = [float((row * (torch.arange(len(row)) + 0.5)).sum() / row.sum()) / len(row) for row in (small, photo)]
+    assert centre[0] == pytest.approx(centre[1], abs=1e-3)
+
+
+def test_without_a_codec_there_is_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(film.cv2.VideoWriter, "fourcc", lambda *_: 0)
+    assert "this OpenCV writes no WebM" in write_film(tmp_path / "film.webm", render, views_of((12, 16)), 1.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_render_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "film.webm").write_bytes(b"before")
+
+    def failing(_: Any) -> Tensor:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_film(tmp_path / "film.webm", failing, views_of((12, 16)), 1.0)
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("film.webm", b"before")]
+    assert not is_own(tmp_path / "film.webm")
+
+
+def test_a_browser_plays_it(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(film, "FRAMES", 15)
+    (tmp_path / "page.html").write_text('<video id="v" src="film.webm" preload="auto" muted></video>')
+    with Browser(tmp_path / "profile") as page:
+        assert write_film(tmp_path / "film.webm", render, views_of((48, 64)), 1.0) == ""
+        page.open(tmp_path / "page.html", ready="v.error || v.readyState == 4")
+        assert page.run("v.error && v.error.message") is None
+        assert page.run("[v.videoWidth, v.videoHeight]") == [64, 48]
+        assert page.run("v.duration") == pytest.approx(0.5, abs=0.05)
+        page.run("v.play()")
+        page.run("new Promise(done => { v.onended = done })")
+        assert page.problems == []

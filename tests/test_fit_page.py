@@ -1,0 +1,103 @@
+"""The page that a fit leaves: what it says of the fit, of its cameras, and of what was not measured."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kgs.datasets.synthetic import synthetic_scene
+from kgs.fit import run
+from kgs.fit.commands import evaluate
+from kgs.fit.config import FitConfig
+from kgs.fit.folder import load_fit
+from kgs.fit.page import refresh_page, spread
+from kgs.fit.starts import FirstPoints
+
+CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
+REPORT = {
+    "photos": {"a.jpg": {"points": 70, "blurred": True}, "b.jpg": {"points": 90, "blurred": False}},
+    "matches": [["a.jpg", "b.jpg", 123]],
+    "focal_px": 123.456,
+    "gates": {"most_degrees": 2.0, "passed": True},
+    "seconds": {"matches": 3.0, "cameras": 1.5},
+    "sha256": ["0123abcd"],
+}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: Any) -> Any:
+    out, scene = tmp_path_factory.mktemp("fitted"), synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0)
+    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
+    (out / "photos.json").write_text(json.dumps(REPORT))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "choose_points", lambda *_: FirstPoints(points, torch.full((150, 3), 0.5), "random"))
+        request = {"scene": "/photos/mine/room", "train_views": 3, "downscale": None, "background": "black"}
+        run.fit_scene(scene, CONFIG, out, request=request, say=lambda line: None)
+    return out, scene
+
+
+def test_it_says_what_the_fit_knows(fitted: Any) -> None:
+    out, _ = fitted
+    text = (out / "index.html").read_text()
+    assert "<h1>room</h1>" in text
+    assert "mine" not in text
+    assert "3 training and 8 test photos of 32 × 24 pixels" in text
+    assert "6 of 8 test photos." in text
+    assert text.count('class="render"') == 6
+    assert f"{json.loads((out / 'metrics.json').read_text())['test']['psnr']:.2f}" in text
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
+    assert facts["points in a photo"] == "70 to 90"
+    assert facts["blurred"] == "a.jpg"
+    assert facts["matches of a pair"] == "123 to 123"
+    assert facts["gates: passed"] == "yes"
+    assert facts["time"] == "4 s"
+    assert facts["scene"] == "room"
+    assert facts["steps"] == "3"
+    assert "0123abcd" not in text
+
+
+def test_measures_that_come_later_are_on_it(fitted: Any, tmp_path: Path) -> None:
+    out, scene = fitted
+    metrics = json.loads((out / "metrics.json").read_text())
+    for view in (metrics["test"], *metrics["test"]["views"]):
+        view["lpips_vgg"] = 0.4321
+    refresh_page(out, load_fit(out), scene, metrics)
+    assert "LPIPS, held out (8 views)" in (out / "index.html").read_text()
+    own = (out / "index.html").read_bytes()
+    (out / "index.html").write_text("mine")
+    refresh_page(out, load_fit(out), scene, metrics)
+    assert (out / "index.html").read_text() == "mine"
+    (out / "index.html").write_bytes(own)
+
+
+def test_without_a_photo_held_out_training_views_are_shown(fitted: Any) -> None:
+    out, scene = fitted
+    metrics = json.loads((out / "metrics.json").read_text()) | {"test": None, "seen": None}
+    refresh_page(out, load_fit(out), replace(scene, test=scene.test.select([])), metrics)
+    text = (out / "index.html").read_text()
+    assert "No photo was held out" in text
+    assert "The training photos." in text
+    assert text.count('class="render"') == 3
+
+
+def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    from kgs.cli import main
+
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", str(folder), "-o", str(tmp_path), "--init", "random", "--init-points", "50", "--steps", "3"])
+    assert stop.value.code == 0
+    assert f"open {tmp_path / 'index.html'} in a browser" in capsys.readouterr().out
+    (tmp_path / "index.html").unlink()
+    evaluate(tmp_path)
+    assert (tmp_path / "index.html").stat().st_size > 50_000
+
+
+def test_pictures_are_spread_over_the_views() -> None:
+    assert spread(3, 6) == [0, 1, 2]
+    assert spread(25, 6) == [0, 5, 10, 14, 19, 24]

@@ -1,0 +1,137 @@
+"""The HTML of a page: whole, small, without a path of a disk, and honest about what was not measured."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from factories import batch, random_camera, random_gaussians
+
+from kgs.page import Picture, write_page
+from kgs.page.figures import facts, levels, measures, plot, shareable
+
+SIZE = (24, 32)
+GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)
+CAMERAS = batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(3)))
+NAMES = ["a.jpg", "<b>&amp;.jpg", "c.jpg"]
+
+
+def views(*values: float) -> dict[str, Any]:
+    rows = [{"name": NAMES[i], "psnr": value, "ssim": 0.5, "lpips_vgg": None} for i, value in enumerate(values)]
+    return {"psnr": sum(values) / len(values), "ssim": 0.5, "lpips_vgg": None, "views": rows}
+
+
+def write(path: Path, **options: Any) -> str:
+    options = {"near_plane": 0.01, "background": torch.zeros(3)} | options
+    write_page(path, "a title", GAUSSIANS, CAMERAS, NAMES, ["training", "training", "test"], **options)
+    return path.read_text(encoding="utf-8")
+
+
+class Links(HTMLParser):
+    """All that a page loads."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.loaded += [str(given[name]) for name in ("src", "srcset", "data", "poster") if name in given]
+        self.loaded += [str(given["href"])] if tag == "link" and "href" in given else []
+
+
+def test_a_page_loads_nothing_and_names_no_place_on_a_disk(tmp_path: Path) -> None:
+    settings = {"scene": "/photos/mine/fern", "init_file": "C:\\photos\\mine\\points.ply", "steps": 3}
+    report = {"note": "made from /photos/mine/a.jpg and others", "focal": 1.25, "inside": {"left out": ["b.jpg"]}}
+    pictures = [Picture(NAMES[1], torch.rand(3, *SIZE), {"": torch.rand(3, *SIZE)})]
+    text = write(tmp_path / "index.html", settings=settings, report=report, pictures=pictures, notes=["/photos/x/y"])
+    assert all(source.startswith("data:image/jpeg;base64,") for source in Links(text).loaded)
+    assert len(Links(text).loaded) == 3
+    assert not re.search(r"url\(|@import|https?://(?!www\.w3\.org/2000/svg)", text)
+    assert "mine" not in text
+    assert "points.ply" in text
+    assert "&lt;b&gt;&amp;amp;.jpg" in text
+    assert "<b>" not in text
+    assert str(tmp_path) not in text
+
+
+def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
+    path = tmp_path / "index.html"
+    text = write(path)
+    assert f"This page has {len(path.read_bytes()) / 1e6:.2f} MB" in text
+    smaller = len(path.read_bytes()) - 10_000
+    text = write(path, most_bytes=smaller)
+    assert len(path.read_bytes()) <= smaller
+    assert "To keep this page small it shows numbers of 8 bits" in text
+    with pytest.raises(ValueError, match="expected room for a Gaussian"):
+        write(path, most_bytes=10_000)
+
+
+def test_a_page_says_where_no_photo_was_held_out(tmp_path: Path) -> None:
+    text = write(tmp_path / "index.html", runs={"": {"train": views(30.0, 31.0), "test": None}})
+    assert "No photo was held out" in text
+    text = write(tmp_path / "index.html", runs={"": {"train": views(30.0, 31.0), "test": views(20.0)}})
+    assert "No photo was held out" not in text
+
+
+def test_measures_have_their_spread(tmp_path: Path) -> None:
+    runs = {"off": {"test": views(20.0, 24.0), "train": views(30.0)}, "on": {"test": views(21.0, 24.5), "train": None}}
+    head, rows = measures(runs)
+    assert head == ["", "held out (2), off", "training (1), off", "held out (2), on"]
+    assert rows[0] == ["PSNR [dB]", "22.00 (20.00 to 24.00)", "30.00", "22.75 (21.00 to 24.50)"]
+    assert [row[0] for row in rows] == ["PSNR [dB]", "SSIM"]  # none of what nobody measured
+    assert levels(runs)["PSNR [dB], held out (2 views), on"] == "22.75"
+
+
+def test_curves_stay_in_their_picture() -> None:
+    curve = [{"seconds": 9.0 * i, "test_psnr": None if i == 1 else 20 - i, "train_psnr": 25.0 + i} for i in range(4)]
+    drawn = plot({"": {"curve": curve}})
+    assert drawn is not None
+    points = [[tuple(map(float, p.split(","))) for p in line["points"].split()] for line in drawn["lines"]]
+    assert [len(line) for line in points] == [3, 4]
+    for x, y in (point for line in points for point in line):
+        assert drawn["left"] <= x <= drawn["right"]
+        assert drawn["top"] <= y <= drawn["bottom"]
+    assert points[0][0][1] < points[0][-1][1]  # it falls
+    assert plot({"": {"curve": curve[:1]}}) is None
+
+
+@pytest.mark.parametrize(
+    ("first", "last"),
+    [(0.05, 0.09), (3.0, 43.0 - 1e-14), (1e-3, 1e3), (7.0, 7.0), (7.0, 7.0 + 1e-15), (7.0, 7.0 + 1e-9)],
+)
+def test_any_two_moments_can_be_drawn(first: float, last: float) -> None:
+    """Also where the quarter of a span is a last bit below a power of ten: 0.09 - 0.05 is."""
+    for seconds, psnr in (((first, last), (20.0, 21.0)), ((0.0, 9.0), (first, last))):
+        moments = zip(seconds, psnr, strict=True)
+        drawn = plot({"": {"curve": [{"seconds": s, "test_psnr": None, "train_psnr": p} for s, p in moments]}})
+        assert drawn is not None
+        marks = [float(text) for _, text in drawn["across"]]
+        assert marks[0] <= seconds[0]
+        assert seconds[1] <= marks[-1] + 1e-6
+        for x, y in (map(float, p.split(",")) for p in drawn["lines"][0]["points"].split()):
+            assert drawn["left"] <= x <= drawn["right"]
+            assert drawn["top"] <= y <= drawn["bottom"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("/photos/my fern", "my fern"),
+        ("D:\\photos\\fern", "fern"),
+        ("see /photos/mine/a.jpg.", "see a.jpg."),
+        ("PSNR/SSIM of a/b.png", "PSNR/SSIM of a/b.png"),
+    ],
+)
+def test_of_absolute_paths_the_last_name_is_shown(text: str, expected: str) -> None:
+    assert shareable(text) == expected
+
+
+def test_facts_are_simple_values_in_words() -> None:
+    given = {"a_name": 1.23456789, "yes": True, "none": None, "deep": {"list": [1, 2]}, "rows": [{"x": 1}]}
+    assert facts(given) == {"a name": "1.23457", "yes": "yes", "none": "none", "deep: list": "1, 2"}

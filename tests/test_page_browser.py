@@ -1,0 +1,141 @@
+"""The page in a real Chromium: it needs nothing else, draws what kgs draws, and is readable on a phone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browser import Browser
+from factories import batch, random_camera, random_gaussians
+
+import kgs
+from kgs.page import Picture, write_page
+
+SIZE = (150, 200)  # height, width
+BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
+READY = "document.querySelector('.viewer').dataset.state === 'ready'"
+SHOW = f"""(index) => {{
+  const canvas = document.querySelector("canvas");
+  Object.assign(canvas.style, {{ width: "{SIZE[1]}px", height: "{SIZE[0]}px" }});
+  viewer.place(index);
+  viewer.draw();
+  return canvas.toDataURL();
+}}"""
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    """Anisotropic Gaussians with harmonics of degree 3, some of them faint, and cameras off their centres."""
+    gaussians = random_gaussians(400, 0, torch.float32, sh_degree=3, image_size=max(SIZE), opacities=(0.001, 0.999))
+    return gaussians, batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(3)))
+
+
+@pytest.fixture(scope="module")
+def renders(scene: Any) -> Any:
+    gaussians, cameras = scene
+    with torch.no_grad():
+        return kgs.GaussianRenderer(backend="torch").eval()(gaussians, cameras, background=BACKGROUND).image.clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: Any) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("chromium")) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
+    gaussians, cameras = scene
+    path: Path = tmp_path_factory.mktemp("page") / "index.html"
+    names = [f"a photo with a rather long name that someone gave it {i}.jpg" for i in range(3)]
+    pictures = [Picture(names[2], 1 - renders[2], {"": renders[2]})]
+    views = [{"name": names[2], "psnr": 20.0, "ssim": 0.5, "ssim_zero_padded": 0.5, "lpips_vgg": 0.25}]
+    curve = [{"step": i, "seconds": 1.0 * i, "test_psnr": 20 + i / 9, "train_psnr": 25.0 + i} for i in range(4)]
+    metrics = {"test": {**views[0], "views": views}, "train": None, "curve": curve, "seconds": 3.0, "steps": 3}
+    rules: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "pictures": pictures}
+    settings = {"init_file": "/photos/someone/points.ply", "a_setting_with_a_long_name": "x" * 60}
+    write_page(
+        path, "A test", gaussians, cameras, names, ["training", "training", "test"], runs={"": metrics},
+        settings=settings, **rules,
+    )  # fmt: skip
+    return path
+
+
+def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    assert [url for url in browser.requests if not url.startswith("data:")] == [page.as_uri()]
+    assert browser.problems == []
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_the_canvas_shows_what_kgs_renders(browser: Browser, page: Path, renders: Any, index: int) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    shown = browser.picture(browser.run(f"({SHOW})({index})"))
+    expected = renders[index].permute(1, 2, 0).double().numpy()
+    assert shown.shape == expected.shape
+    level = -10 * math.log10(np.mean((shown - expected) ** 2))
+    print(f"camera {index}: {level:.1f} dB")
+    assert level >= 38
+    assert np.abs(shown - expected).max() < 0.05
+
+
+def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    eye = "JSON.stringify([viewer.eye.position, viewer.eye.rotation])"
+    views = [browser.run(eye)]
+    middle = browser.run(
+        "(() => { const b = viewer.canvas.getBoundingClientRect(); return [b.x + 300, b.y + 200]; })()"
+    )
+
+    def mouse(kind: str, x: float, **more: Any) -> None:
+        browser.call("Input.dispatchMouseEvent", type=kind, x=middle[0] + x, y=middle[1], button="left", **more)
+
+    browser.run("viewer.overlay.toggleAttribute('hidden')")  # it would catch the pointer where a pyramid is
+    mouse("mousePressed", 0, clickCount=1, buttons=1)
+    mouse("mouseMoved", 40, buttons=1)
+    mouse("mouseReleased", 40, clickCount=1)
+    views.append(browser.run(eye))
+    browser.run("viewer.canvas.focus()")
+    for key in ("ArrowUp", "+"):
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key=key)
+        views.append(browser.run(eye))
+    browser.run("viewer.overlay.toggleAttribute('hidden')")
+    assert len(set(views)) == 4
+    browser.run("viewer.pyramids[1].dispatchEvent(new Event('click'))")
+    there = "JSON.stringify([viewer.scene.cameras[1].position, viewer.scene.cameras[1].rotation])"
+    browser.wait(f"{eye} === {there}")
+
+
+def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    over = "document.querySelector('.over')"
+    assert browser.run(f"{over}.src === document.querySelector('img.render').src")
+    clips = [browser.run(f"{over}.style.clipPath")]
+    browser.run("document.querySelector('.wipe input').focus()")
+    for _ in range(30):
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", windowsVirtualKeyCode=37)
+    clips.append(browser.run(f"{over}.style.clipPath"))
+    assert clips == ["inset(0px 0px 0px 100%)", "inset(0px 0px 0px 70%)"]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: str) -> None:
+    browser.size(400, 800, scheme)
+    browser.open(page, READY)
+    assert browser.run("document.documentElement.scrollWidth") <= 400
+    cut = """[...document.querySelectorAll("body *")].filter((one) => !one.closest(".scroll, pre, svg, details")
+      && one.getBoundingClientRect().right > innerWidth + 0.5).map((one) => one.outerHTML.slice(0, 99))"""
+    assert browser.run(cut) == []
+    browser.run("document.querySelector('details').open = true")
+    assert browser.run("document.documentElement.scrollWidth") <= 400
+    channels = browser.run("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
+    assert (max(channels) < 64) if scheme == "dark" else (min(channels) > 240)

@@ -1,0 +1,80 @@
+"""What is not believed of a solver's cameras, and what is said of it."""
+
+import cv2
+import numpy as np
+import pytest
+
+from kgs.errors import DataError
+from kgs.fit.photos.gates import disagreement, groups_of, objections, table, unfit, weakest_link
+from kgs.fit.photos.mapping import Cameras, Look
+from kgs.fit.photos.pose import judge
+
+NAMES = ["a", "b", "c"]
+PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}
+
+
+def cameras(focal=800.0, points=(90, 80, 70), turn=0.0, missing=()):
+    """Three cameras in a row that look along z, the last turned by so many degrees about y."""
+    turns = dict(zip(NAMES, (0.0, 0.0, turn), strict=True))
+    rotations = {n: cv2.Rodrigues(np.array([0.0, np.radians(t), 0.0]))[0] for n, t in turns.items()}
+    centers = {n: np.array([float(i), 0, 0]) for i, n in enumerate(NAMES)}
+    counts = {n: count for n, count in zip(NAMES, points, strict=True) if n not in missing}
+    rows = ({n: v for n, v in kind.items() if n not in missing} for kind in (rotations, centers))
+    return Cameras(focal, *rows, counts, None)
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (cameras(focal=399), "0.399 times the longer side"),
+        (cameras(focal=3001), "3 times the longer side"),
+        (cameras(points=(90, 49, 50)), "fewer than 50 points are seen in b (49)"),
+        (cameras(missing=("b",)), "1 of 3 photos could not be placed: b"),
+        (None, "no pair of photos"),
+    ],
+)
+def test_what_speaks_against_one_solver(found, said):
+    (reason,) = objections(found, NAMES, 1000)
+    assert said in reason
+    assert objections(cameras(), NAMES, 1000) == []
+    assert objections(cameras(focal=400, points=(50, 50, 50)), NAMES, 1000) == []
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.1, 1.9, 60.0, 179.0])
+def test_disagreement_is_the_angle_between_relative_rotations(angle):
+    degrees, pair = disagreement(cameras(), cameras(turn=angle))
+    assert degrees == pytest.approx(angle, rel=1e-6)
+    assert pair == ("b", "c")
+
+
+def test_two_solvers_have_to_agree(tmp_path):
+    first, second = cameras(), cameras(turn=1.9, points=(99, 99, 99))
+    assert judge(tmp_path, [first, second], NAMES, 1000, PAIRS) == (second, pytest.approx(1.9))  # it sees more points
+    with pytest.raises(DataError, match="two solvers are 2.1 degrees apart for b and c"):
+        judge(tmp_path, [first, cameras(turn=2.1)], NAMES, 1000, PAIRS)
+    for other in (None, cameras(missing=("c",))):
+        with pytest.raises(DataError, match=r"one could not place .*c, so that nothing confirms the other"):
+            judge(tmp_path, [first, other], NAMES, 1000, PAIRS)
+    few = cameras(points=(90, 20, 90))  # enough to confirm the other
+    assert judge(tmp_path, [few, first], NAMES, 1000, PAIRS)[0] is first
+    with pytest.raises(DataError, match="places between b and c"):  # the weakest link of the strongest tree
+        judge(tmp_path, [few, few], NAMES, 1000, PAIRS)
+
+
+def test_groups_links_and_the_table():
+    assert groups_of(NAMES, PAIRS) == [["a", "b", "c"]]
+    assert groups_of(NAMES, PAIRS | {("a", "c"): 29, ("b", "c"): 29}) == [["a", "b"], ["c"]]
+    assert weakest_link(NAMES, PAIRS) == ("b", "c")
+    assert [line.split() for line in table(NAMES, PAIRS).splitlines()[2:]] == [
+        ["1", "a", ".", "200", "40"],
+        ["2", "b", "200", ".", "90"],
+        ["3", "c", "40", "90", "."],
+    ]
+
+
+def test_photos_that_can_give_no_cameras():
+    deep, flat, same = Look(30.0, 0.5), Look(30.0, 0.99), Look(0.1, 1.0)
+    assert unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, flat) | {("a", "c"): deep}) == ""
+    assert "only turned on the spot" in unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, flat))
+    assert "a and b show the same" in unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, deep) | {("a", "b"): same})
+    assert "no two of the 3" in unfit(NAMES, dict.fromkeys(PAIRS, 0), {})
