@@ -52,6 +52,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         result["pictures"] = _pictures(scene, trainer)
     return result | {
         **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
+        "seen": metrics["seen"],
         "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
         "init": {**trainer.init, "seconds": round(seconds, 2)},
         "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
