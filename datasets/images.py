@@ -15,6 +15,9 @@ from kgs.errors import DataError
 from .image_size import image_size, plain_jpeg, plain_tiff
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
+UNREADABLE_SUFFIXES = (*_RAW, ".heic", ".heif", ".hif", ".avif", ".gif", ".jxl", ".jp2", ".exr")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
 Image = NDArray[np.float32]
 Maps = tuple[Image, Image]
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}

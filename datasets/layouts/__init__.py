@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from kgs.datasets.frames import FrameSet
-from kgs.datasets.images import image_folder, list_images
+from kgs.datasets.images import UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, image_folder, list_images
 from kgs.errors import DataError
 
 from .blender import load_blender
@@ -18,9 +18,9 @@ _LAYOUTS = (
     (lambda root: (root / "transforms_train.json").is_file(), load_blender),
     (lambda root: (root / "transforms.json").is_file(), load_nerfstudio),
 )
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
-_UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif", ".jxl", ".exr")
+CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
+_TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
 _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
@@ -41,17 +41,19 @@ def _is_scene(folder: Path) -> bool:
 def nearest_scene(root: Path) -> Path | None:
     """The folder with camera poses that is meant by a folder: itself, or one up to two levels below or above it.
 
-    One whose cameras kgs found, beside its own results (photos.json), is not meant by its photos. None: there is none.
+    One whose cameras kgs found (beside `CAMERAS_REPORT`) is not meant by its photos. None: there is none.
     """
+    if _is_scene(root):
+        return root
     below = sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_dir())
-    others = [path for path in (*below, *list(root.resolve().parents)[:2]) if not (path / "photos.json").exists()]
-    return next((folder for folder in (root, *others) if _is_scene(folder)), None)
+    others = (path for path in (*below, *root.resolve().parents[:2]) if not (path / CAMERAS_REPORT).exists())
+    return next(filter(_is_scene, others), None)
 
 
 def _about_file(path: Path) -> str:
     if not path.exists():
         return "expected a folder, there is none"
-    if path.suffix.lower() in _VIDEOS:
+    if path.suffix.lower() in VIDEO_SUFFIXES:
         return f"expected a folder, got a video: {_NO_PHOTOS}"
     return "expected a folder, got a file" + (f": the scene is {path.parent}" if _is_scene(path.parent) else "")
 
@@ -64,8 +66,7 @@ def _about_folder(root: Path) -> str:
     if count := len(list_images(photos)):
         return f"has {count} photos but no camera poses: {_NO_POSES}"
     endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
-    advices = {_UNREADABLE: "photos that cannot be read: convert them to JPEG or PNG", _VIDEOS: f"videos: {_NO_PHOTOS}"}
-    for suffixes, advice in advices.items():
+    for suffixes, advice in ((UNREADABLE_SUFFIXES, _TO_CONVERT), (VIDEO_SUFFIXES, f"videos: {_NO_PHOTOS}")):
         if found := [ending[1:].upper() for ending in endings if ending in suffixes]:
             return f"is no scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
     return (

@@ -16,6 +16,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from kgs.datasets.scene import Scene
+from kgs.datasets.splits import select_evenly
 
 from .config import CHOICES, FitConfig, Recipe
 from .progress import Stage, silent
@@ -88,7 +89,7 @@ def decide(
 def _without(scene: Scene, view: int) -> Scene:
     """The scene at half its width, with a training view in the place of the test views, and at most `MOST` others."""
     rest = [i for i in range(len(scene.train)) if i != view]
-    rest = [rest[round(i * (len(rest) - 1) / (MOST - 1))] for i in range(MOST)] if len(rest) > MOST else rest
+    rest = [rest[i] for i in select_evenly(len(rest), min(len(rest), MOST))]
     finer = None if scene.finer is None else scene.finer.select(rest).halved()
     train, test = (scene.train.select(some).halved() for some in (rest, [view]))
     return replace(scene, train=train, test=test, finer=finer)

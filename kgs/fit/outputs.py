@@ -16,6 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from kgs.datasets.images import list_images
+from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.errors import DataError
 from kgs.export.film import MARK as FILM_MARK
 from kgs.json_files import write_whole
@@ -44,7 +45,7 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
     has_photos = inside and there == out and not all(map(is_own, list_images(out)))
-    of_photos = ("sparse",) if is_own(out / "photos.json") else ()  # cameras that a former run found
+    of_photos = ("sparse",) if is_own(out / CAMERAS_REPORT) else ()  # cameras that a former run found
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):

@@ -9,7 +9,9 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.datasets.scene import Scene, Views
+from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
 from kgs.json_files import read_json
 from kgs.model import GaussianModel
@@ -21,7 +23,6 @@ from .progress import each, say
 from .slim import contributions, in_words
 
 PAGE = "index.html"
-REPORT = "photos.json"  # how cameras were found, where they were
 MOST_PICTURES = 6
 
 Render = Callable[[PinholeCamera], Tensor]
@@ -88,16 +89,34 @@ def write_fit_page(
     )
 
 
+def write_own_page(
+    path: Path,
+    out: Path,
+    scene: Scene,
+    model: GaussianModel,
+    near_plane: float,
+    render: Render,
+    metrics: Mapping[str, Any],
+    settings: Mapping[str, Any],
+) -> None:
+    """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
+    title = (out / settings["request"].get("scene", scene.root)).resolve().name
+    one: dict[str, Any] = {"settings": settings, "report": out / CAMERAS_REPORT}
+    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **one)
+
+
 def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:
     """Write the page of a fit that is in a folder again, with other measures; not in place of a user's own file."""
     path = out / PAGE
     if path.exists() and not is_own(path):
         say(f"{path} was not written by kgs, and is left as it is")
         return
-    settings, title = read_json(out / "config.json"), (out / saved.request["scene"]).resolve().name
-    drawn = {"": lambda camera: saved.render(camera, scene.background)}, {"": metrics}
-    facts: dict[str, Any] = {"settings": settings, "report": out / REPORT}
-    write_fit_page(path, title, scene, saved.model, saved.near_plane, *drawn, **facts)
+
+    def render(camera: PinholeCamera) -> Tensor:
+        return saved.render(camera, scene.background)
+
+    settings = read_json(out / "config.json")
+    write_own_page(path, out, scene, saved.model, saved.near_plane, render, metrics, settings)
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -151,4 +170,4 @@ def _all_cameras(*parts: Views) -> PinholeCamera:
 
 def spread(count: int, most: int) -> list[int]:
     """At most so many of the positions, spread evenly, the first and the last among them."""
-    return [round(i * (count - 1) / (most - 1)) for i in range(most)] if count > most else list(range(count))
+    return select_evenly(count, min(count, most)) if count else []

@@ -26,7 +26,7 @@ from .metrics import evaluate
 from .minutes import steps_within
 from .needs import decide
 from .outputs import check_folder, is_own, png_names, write_json, write_png
-from .page import PAGE, REPORT, write_fit_page
+from .page import PAGE, write_own_page
 from .progress import Stage, each, progress, say, silent
 from .seen import measure_seen
 from .slim import slim
@@ -134,10 +134,8 @@ def fit_scene(
                 write_png(new / "test" / names[name], scene.test.shaded(trainer.render(scene.test.camera(i))[0]))
             metrics = measure(trainer, lpips)
             write_json(new / "metrics.json", metrics)
-            title = (out / (request or {}).get("scene", scene.root)).resolve().name
-            drawn = {"": trainer.render}, {"": metrics}
-            facts: dict[str, Any] = {"settings": settings, "report": out / REPORT}
-            write_fit_page(new / PAGE, title, scene, trainer.shown, trainer.near_plane, *drawn, **facts)
+            fitted = trainer.shown, trainer.near_plane, trainer.render
+            write_own_page(new / PAGE, out, scene, *fitted, metrics, settings)
         except BaseException:
             if not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)

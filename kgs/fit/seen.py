@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 
-from .starts.triangulate import project_all, unproject
+from .starts.triangulate import picture_places, project_all, unproject
 from .trainer import Trainer
 
 LEAST = 2  # training views that show a place
@@ -70,9 +70,7 @@ def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: 
     places, distances = project_all(points, cameras)
     count = torch.zeros(len(pixels), dtype=torch.int64)
     for view, there in enumerate(depths):
-        place, distance = places[:, view].round(), distances[:, view]
-        limits = torch.tensor([there.shape[1], there.shape[0]])
-        inside = (values > 0) & (distance > 0) & ((place >= 0) & (place < limits)).all(dim=1)
-        x, y = torch.where(inside[:, None], place, 0.0).long().unbind(1)
-        count += inside & (distance <= BEHIND * there[y, x])
+        distance = distances[:, view]
+        x, y, inside = picture_places(places[:, view], distance, *there.mT.shape)
+        count += (values > 0) & inside & (distance <= BEHIND * there[y, x])
     return (count >= LEAST).reshape(height, width)

@@ -52,7 +52,6 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         result["pictures"] = _pictures(scene, trainer)
     return result | {
         **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
-        "seen": metrics["seen"],
         "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
         "init": {**trainer.init, "seconds": round(seconds, 2)},
         "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
@@ -74,7 +73,7 @@ def fit_and_measure(
     stored: dict[str, Any] = {"cpu_seconds": round(time.process_time() - start, 2)}
     metrics = measure(trainer, lpips)
     stored |= {"curve": trainer.curve, "gaussians": len(trainer.shown), "needs": trainer.needs}
-    stored |= {"config": trainer.config.to_dict()}
+    stored |= {"config": trainer.config.to_dict(), "seen": metrics["seen"]}
     stored |= {"wall_seconds": round(trainer.seconds, 2), "peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
     stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
     return trainer, metrics, stored

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.datasets.images import list_images
-from kgs.datasets.layouts import nearest_scene
+from kgs.datasets.layouts import CAMERAS_REPORT, nearest_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import FAST, FitConfig
@@ -17,7 +17,6 @@ from kgs.json_files import read_json
 
 LONGEST = 504  # pixels of the longer side in a fit on a CPU
 FEW = 9  # photos: of fewer none is held out
-HOLD_OUT = 8
 
 
 def is_bare(scene: Path) -> bool:
@@ -50,8 +49,8 @@ def find_scene(
         )
     report = pose_photos(photos, out, seed=seed, stage=each, say=say)
     count, longest = len(report["photos"]), max(report["size"])
-    if request["hold_out"] is None:
-        request = request | {"hold_out": 0 if count < FEW else HOLD_OUT}
+    if request["hold_out"] is None and count < FEW:
+        request = request | {"hold_out": 0}
     if request["downscale"] is None and device == "cpu":
         request = request | {"downscale": max(1.0, longest / LONGEST)}
     return request | {"scene": "."}
@@ -61,7 +60,7 @@ def add_estimate(photos: Path, out: Path, scene: Scene, config: FitConfig) -> di
     """Estimate how good views are that no photo shows, and add it to metrics.json and to the page of a finished fit."""
     from .estimate import estimate
 
-    known = read_json(out / "photos.json")["photos"]
+    known = read_json(out / CAMERAS_REPORT)["photos"]
     fast = replace(FAST, seed=config.seed, backend=config.backend, device=config.device)
     found = estimate(photos, list(known), fast, max(scene.train.images.shape[-2:]), stage=each)
     metrics = read_json(out / "metrics.json") | {"estimate": found}

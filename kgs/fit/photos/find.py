@@ -2,13 +2,10 @@
 
 from pathlib import Path
 
-from kgs.datasets.images import IMAGE_SUFFIXES, list_images
+from kgs.datasets.images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, list_images
 from kgs.errors import DataError
 
 FEWEST = 3
-_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
-_HEIC = (".heic", ".heif", ".hif")
-_OTHERS = (*_HEIC, ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".jxl", ".gif", ".jp2")
 _LISTED = 10
 CONVERT = (
     "kgs reads PNG, JPEG, WebP, TIFF and BMP. Make JPEGs of them first: on a Mac `sips -s format jpeg *.HEIC --out "
@@ -24,12 +21,12 @@ def find_photos(folder: Path) -> list[Path]:
     Raises:
         DataError: there is no such folder, it holds fewer than 3 photos, or photos of a kind that cannot be read.
     """
-    if folder.is_file() and folder.suffix.lower() in _VIDEOS:
+    if folder.is_file() and folder.suffix.lower() in VIDEO_SUFFIXES:
         raise DataError(folder, "", _from_video(folder))
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = [path for path in list_images(folder) if path.is_file()]
-    kinds = {"others": _OTHERS, "videos": _VIDEOS}
+    kinds = {"others": UNREADABLE_SUFFIXES, "videos": VIDEO_SUFFIXES}
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     found = {kind: [path for path in files if path.suffix.lower() in kinds[kind]] for kind in kinds}
     if others := found["others"]:
@@ -58,7 +55,7 @@ def listed(paths: list[Path]) -> str:
 
 def _holds_photos(folder: Path) -> bool:
     try:
-        return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *_OTHERS) for path in folder.iterdir())
+        return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES) for path in folder.iterdir())
     except OSError:
         return False
 

@@ -1,19 +1,17 @@
 """Keypoints of photos and their matches, written into a COLMAP database and verified there.
 
-Sources: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004; R. Arandjelovic and
-A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012 (RootSIFT); L. Cavalli et al.,
-AdaLAM, ECCV 2020 (matches that agree with their neighbours).
+Source: L. Cavalli et al., AdaLAM, ECCV 2020 (matches that agree with their neighbours).
 """
 
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import torch
 from kornia.feature import laf_from_center_scale_ori, match_adalam
 from torch import Tensor
 
+from kgs.fit.keypoints import root_sift
 from kgs.fit.progress import Stage
 
 from .read import Photo
@@ -26,30 +24,21 @@ _FEWEST = 8  # matches of a pair that are worth verifying
 DEFAULT_FOCAL = 1.2  # of the longer side, where the files do not say it: COLMAP's
 
 
-class Keypoints(NamedTuple):
-    """Keypoints of one photo."""
+class Framed(NamedTuple):
+    """Keypoints of one photo, as COLMAP and Kornia take them."""
 
     places: Tensor  # `(N, 2)` float32, the first pixel's centre is (0.5, 0.5)
     descriptors: Tensor  # `(N, 128)` float32, RootSIFT
     frames: Tensor  # `(1, N, 2, 3)`, Kornia's local affine frames
 
 
-def find_keypoints(photo: Photo, most: int) -> Keypoints:
+def find_keypoints(photo: Photo, most: int) -> Framed:
     """The strongest SIFT keypoints of a photo, up to `most`; nothing is random."""
-    grey, factor = photo.grey(), 2 if max(photo.size) < SMALL else 1
-    if factor > 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)  # type: ignore[assignment]
-    # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # not in the stubs
-        nfeatures=most, contrastThreshold=_CONTRAST, enable_precise_upscale=True
-    )
-    found, descriptors = sift.detectAndCompute(grey, None)
-    if not found:
-        return Keypoints(torch.zeros(0, 2), torch.zeros(0, 128), torch.zeros(1, 0, 2, 3))
-    rows = torch.tensor([(*point.pt, point.size, point.angle) for point in found])
-    places = (rows[:, :2] + 0.5) / factor
-    frames = laf_from_center_scale_ori(places[None], rows[None, :, 2, None, None] / factor, rows[None, :, 3, None])
-    return Keypoints(places, torch.nn.functional.normalize(torch.from_numpy(descriptors), p=1.0, dim=1).sqrt(), frames)
+    factor = 2 if max(photo.size) < SMALL else 1
+    found = root_sift(photo.grey(), most, factor, contrastThreshold=_CONTRAST)
+    places, sizes, angles = (found.places + 0.5).float(), found.sizes.float(), found.angles.float()
+    frames = laf_from_center_scale_ori(places[None], sizes[None, :, None, None], angles[None, :, None])
+    return Framed(places, found.descriptors, frames)
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], stage: Stage) -> None:
@@ -75,7 +64,7 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], stage: 
                 file.write_matches(ids[i], ids[j], pairs.numpy().astype("uint32"))
 
 
-def _match(first: Keypoints, second: Keypoints, area: tuple[int, ...]) -> Tensor:
+def _match(first: Framed, second: Framed, area: tuple[int, ...]) -> Tensor:
     """Numbers of keypoints that match, `(M, 2)`: each other's nearest in descriptors, as AdaLAM finds them to agree."""
     if min(len(first.places), len(second.places)) < _FEWEST:
         return torch.zeros(0, 2, dtype=torch.int64)

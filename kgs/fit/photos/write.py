@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from kgs.datasets.images import list_images
+from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.errors import DataError
 from kgs.fit.outputs import is_own, write_json, write_png
 from kgs.json_files import read_json
@@ -21,7 +22,7 @@ from kgs.json_files import read_json
 from .mapping import Cameras, quiet_pycolmap
 from .read import Photo
 
-REPORT, IMAGES, MODEL = "photos.json", "images", "sparse/0"
+REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
 UNFINISHED, _FINISHED = "unfinished-photos", "finished-photos"
 
 

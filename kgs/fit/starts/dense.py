@@ -9,7 +9,7 @@ from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
-from .triangulate import project_all, unproject
+from .triangulate import picture_places, project_all, unproject
 
 SCORE = 0.6  # a patch of a point has to match at least so well
 MOST_PIXELS, MOST_PIXELS_OF_ALL, SMALLEST = 250_000, 1_600_000, 64
@@ -72,9 +72,8 @@ def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int
     pixels, depths = project_all(points, views.cameras)
     agreed = torch.zeros(len(points), dtype=torch.bool)
     for other in set(range(len(views))) - {view}:
-        places, depth = pixels[:, other].round(), depths[:, other]
-        inside = ((places >= 0) & (places < torch.tensor(here.mT.shape))).all(1) & (depth > 0)
-        x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
+        depth = depths[:, other]
+        x, y, inside = picture_places(pixels[:, other], depth, *here.mT.shape)
         there = maps[other].depths[y, x].double()
         rays = torch.stack([x, y], 1), torch.full_like(x, other)
         back = [project_all(unproject(rays[0], z, rays[1], views.cameras), camera)[0][:, 0] for z in (there, depth)]

@@ -1,7 +1,6 @@
 """Feature tracks of posed images: SIFT keypoints, matched along the epipolar lines, joined over the views.
 
-Sources: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004 (keypoints, ratio test);
-R. Arandjelovic and A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012 (RootSIFT).
+Source: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004 (the ratio test).
 """
 
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from kgs.backends import choose, compiled_covers, register
 from kgs.datasets.scene import Views
+from kgs.fit.keypoints import root_sift
 from kgs.fit.progress import Stage, silent
 
 SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
@@ -72,19 +72,9 @@ def detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
     image = views.images[index].permute(1, 2, 0).cpu().numpy()
     grey = cv2.cvtColor((image.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
     mask = None if (usable := views.usable) is None else usable[index].cpu().numpy().astype(np.uint8)
-    if (factor := 2 if grey.size < SMALL_IMAGE else 1) > 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
-        mask = None if mask is None else mask.repeat(factor, 0).repeat(factor, 1)
-    # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # not in the stubs
-        nfeatures=limit, nOctaveLayers=4, contrastThreshold=0.005, enable_precise_upscale=True
-    )
-    keypoints, descriptors = sift.detectAndCompute(grey, mask)
-    if not keypoints:
-        return torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128)
-    places = torch.tensor([keypoint.pt for keypoint in keypoints], dtype=torch.float64)
-    descriptors = torch.nn.functional.normalize(torch.from_numpy(descriptors), p=1.0, dim=1).sqrt()
-    return (places + 0.5) / factor - 0.5, descriptors
+    factor = 2 if grey.size < SMALL_IMAGE else 1
+    found = root_sift(grey, limit, factor, mask, nOctaveLayers=4, contrastThreshold=0.005)
+    return found.places, found.descriptors
 
 
 def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:

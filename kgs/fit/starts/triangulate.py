@@ -57,6 +57,18 @@ def project_all(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]
     return image[..., :2] / image[..., 2:], local[..., 2]
 
 
+def picture_places(pixels: Tensor, depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Whole pixels x and y `(P,)` of a picture, and whether they are in it, before the camera; x and y are 0 outside.
+
+    Convention:
+        Integer pixel centres, rounded half to even.
+    """
+    places = pixels.round()
+    inside = ((places >= 0) & (places < torch.tensor([width, height]))).all(1) & (depths > 0)
+    x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
+    return x, y, inside
+
+
 def unproject(pixels: Tensor, depths: Tensor, views: Tensor, cameras: PinholeCamera) -> Tensor:
     """The places in the world `(P, 3)` of pixels `(P, 2)` at depths `(P,)`, each in the camera of its view, float64."""
     intrinsics, extrinsics = matrices(cameras)

@@ -1,0 +1,46 @@
+"""Keypoints with RootSIFT descriptors, of small pictures too.
+
+Sources: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004; R. Arandjelovic and
+A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012 (RootSIFT).
+"""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+class Keypoints(NamedTuple):
+    """N keypoints of one picture."""
+
+    places: Tensor  # `(N, 2)` float64, pixels; the first pixel's centre is (0, 0)
+    sizes: Tensor  # `(N,)` float64, pixels
+    angles: Tensor  # `(N,)` float64, degrees
+    descriptors: Tensor  # `(N, 128)` float32, of length 1
+
+
+def root_sift(
+    grey: NDArray[Any], most: int, factor: int = 1, mask: NDArray[np.uint8] | None = None, **rules: Any
+) -> Keypoints:
+    """The strongest SIFT keypoints of a picture, up to `most`; nothing is random.
+
+    Args:
+        grey: `(H, W)`, 8 bits.
+        most: so many at the most.
+        factor: the picture is enlarged by this whole number first.
+        mask: `(H, W)`, keypoints lie where it is not 0; None: everywhere.
+        rules: thresholds, as `cv2.SIFT_create` names them.
+    """
+    if factor > 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+        mask = None if mask is None else mask.repeat(factor, 0).repeat(factor, 1)
+    # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
+    sift = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True, **rules)  # type: ignore[attr-defined]  # no stub
+    found, descriptors = sift.detectAndCompute(grey, mask)
+    rows = torch.tensor([(*point.pt, point.size, point.angle) for point in found], dtype=torch.float64).reshape(-1, 4)
+    numbers = torch.zeros(0, 128) if descriptors is None else torch.from_numpy(descriptors)
+    unit = torch.nn.functional.normalize(numbers, p=1.0, dim=1).sqrt()
+    return Keypoints((rows[:, :2] + 0.5) / factor - 0.5, rows[:, 2] / factor, rows[:, 3], unit)
