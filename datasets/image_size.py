@@ -26,15 +26,19 @@ def image_size(path: Path, data: Buffer) -> tuple[int, int]:
         width, height, *tile = read(data)
     except (struct.error, IndexError, ValueError) as error:
         raise DataError(path, "header", "cannot be decoded: the image's header is damaged or cut short") from error
+    for wide, high in [(width, height), *([tile] if tile and all(tile) else [])]:
+        check_size(path, wide, high, len(data))
+    return width, height
+
+
+def check_size(path: Path, width: int, height: int, size: int) -> None:
+    """A DataError about `path`, a file of `size` bytes, where so many pixels should not be decoded."""
     if width < 1 or height < 1:
         raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
     # Photos have fewer than 20 pixels per byte, a plain PNG 1032. Any file may have 2^21 (48 MiB while decoded), plain
     # images 2^24 (384 MiB); more, up to 2^28, need a byte for every 32.
-    most = min(2**28, max(2**21, min(2**24, 2048 * len(data)), 32 * len(data)))
-    for wide, high in ((width, height), tile or (1, 1)):
-        if wide * high > most:
-            raise DataError(path, "header", f"claims {wide}x{high} pixels in {len(data)} bytes: a decompression bomb")
-    return width, height
+    if width * height > min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size)):
+        raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
 
 
 def plain_jpeg(data: bytes) -> bytes:

@@ -65,9 +65,9 @@ def image_folder(root: Path) -> Path | None:
     return min(reduced, key=lambda p: int(p.name.removeprefix("images_")), default=None)
 
 
-def list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
     """The photos of a folder, sorted by name; hidden files and other kinds of files are passed over."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     return sorted(files, key=lambda p: p.name)
 
 

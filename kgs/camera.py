@@ -128,6 +128,12 @@ def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
 
 
+def camera_centers(extrinsics: Tensor) -> Tensor:
+    """The centres of cameras in the world, `(C, 3)` float64 on the CPU, from world-to-camera matrices `(C, 4, 4)`."""
+    poses = extrinsics.detach().double().cpu()
+    return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
+
+
 def meeting_point(extrinsics: Tensor) -> Tensor | None:
     """The point nearest to all optical axes, `(3,)` float64; None where axes are near-parallel, or it is behind one.
 

@@ -34,6 +34,7 @@ _BENCHES = {
 }
 _EXTRAS = {
     "numba": "fast",
+    "pi_heif": "heic",
     "pycolmap": "sfm",
     "distributed": "study",
     "pandas": "study",

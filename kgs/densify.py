@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from .camera import camera_centers
 from .covariance import rotation_matrices
 from .model import GaussianModel
 from .types import ProjectedGaussians
@@ -255,6 +256,5 @@ def camera_extent(extrinsics: Tensor) -> float:
     """
     if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
         raise ValueError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
-    poses = extrinsics.detach().double()
-    centres = -(poses[:, :3, :3].mT @ poses[:, :3, 3:]).squeeze(-1)
+    centres = camera_centers(extrinsics)
     return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())

@@ -48,7 +48,7 @@ def test_metrics_have_the_agreed_keys(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
         "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "needs", "steps", "seed", "drop", "init",
-        "backend", "protocol", "versions", "seen",
+        "backend", "protocol", "versions", "seen", "poses",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None

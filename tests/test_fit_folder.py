@@ -107,7 +107,7 @@ def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkey
 
 
 @pytest.mark.parametrize(
-    "failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json", "write_fit_page"]
+    "failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json", "write_own_page"]
 )
 def test_results_that_cannot_be_written_leave_the_old_ones(
     scene: Any, done: Path, monkeypatch: Any, failing: str

@@ -6,11 +6,11 @@ import pytest
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
+from kgs.camera import camera_centers
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.photos.locate import locate
 from kgs.fit.run import choose_points
-from kgs.fit.starts.triangulate import camera_centers
 from kgs.fit.trainer import Trainer
 
 
@@ -29,8 +29,8 @@ def test_a_camera_is_found_where_it_was(trainer):
     camera = locate(trainer, elsewhere)
     turn = camera.extrinsics[:, :3, :3] @ scene.test.cameras.extrinsics[:, :3, :3].mT
     assert float(rotation_matrix_to_axis_angle(turn).norm().rad2deg()) < 0.5
-    centers = camera_centers(scene.train.cameras)
-    apart = float((camera_centers(camera) - camera_centers(scene.test.cameras)).norm())
+    centers = camera_centers(scene.train.cameras.extrinsics)
+    apart = float((camera_centers(camera.extrinsics) - camera_centers(scene.test.cameras.extrinsics)).norm())
     assert apart < 0.05 * float((centers[0] - centers[-1]).norm())
     again = locate(trainer, elsewhere)
     assert torch.equal(camera.extrinsics, again.extrinsics)

@@ -12,6 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.run import most_bytes
 from kgs.fit.trainer import Trainer
 from kgs.renderer import GaussianRenderer
 
@@ -190,7 +191,7 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
 
 def test_the_memory_budget_reaches_the_renderer(scene, points):
     small = Trainer(scene, replace(CONFIG, max_bytes=1000), points)
-    assert small.most_bytes < Trainer(scene, CONFIG, points).most_bytes
+    assert most_bytes(small) < most_bytes(Trainer(scene, CONFIG, points))
     with pytest.raises(ValueError, match="max_bytes"):
         small.fit()
 

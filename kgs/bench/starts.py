@@ -10,11 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs.camera import camera_centers
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit.starts import first_points
-from kgs.fit.starts.triangulate import camera_centers, project_all
+from kgs.fit.starts.triangulate import project_all
 
 from .output import Row, markdown_table, mean_sd, write_results
 from .scenes import check_scenes
@@ -50,8 +51,7 @@ def starts(*, out: Path, quick: bool = False) -> None:
         out: folder for the results, made if it is not there.
         quick: one small synthetic scene of three views with one seed.
     """
-    data = None if quick else os.environ.get("KGS_DATA")
-    if data is not None:
+    if (data := None if quick else os.environ.get("KGS_DATA")) is not None:
         check_scenes(Path(data), [name for name, _ in REAL])
     else:
         print("the synthetic scene alone" + ("" if quick else ": KGS_DATA is not set"))
@@ -129,7 +129,7 @@ def depth_errors(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     inside = ~errors.isnan()
     seen = inside & (errors <= HIDDEN)
     usable = torch.where(seen.any(1, keepdim=True), seen, inside)
-    distances = torch.cdist(points.double(), camera_centers(views.cameras)).masked_fill(~usable, torch.inf)
+    distances = torch.cdist(points.double(), camera_centers(views.cameras.extrinsics)).masked_fill(~usable, torch.inf)
     return torch.where(inside.any(1), errors.gather(1, distances.argmin(1, keepdim=True))[:, 0], torch.inf)
 
 

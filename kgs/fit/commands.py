@@ -236,7 +236,7 @@ def evaluate(
     lpips = _prepare(device, backend, "jinja2", lpips=lpips_weights)
     saved, path = load_fit(out, device), out / "metrics.json"
     saved = saved if backend == "auto" else saved._replace(backend=backend)
-    scene = _load(saved.request, out)
+    scene = saved.placed(_load(saved.request, out))
     metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
     write_json(path, metrics)
     refresh_page(out, saved, scene, metrics)

@@ -111,6 +111,8 @@ class FitConfig:
         opacity_l1_by: the penalty is heavier on Gaussians with a low mean gradient, or at a great distance.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, what the training
             views need, see :mod:`kgs.fit.needs`.
+        refine_poses: move the training cameras too, for poses that are half a degree or more off: good ones lose a
+            little. What all cameras have in common stays; test cameras stay as given.
         coarse: share of the steps, the first ones, that see the training views at half their width; in [0, 1].
         seed: everything random derives from it: first points, order of views, splits and masks.
         init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
@@ -146,6 +148,7 @@ class FitConfig:
     opacity_l1: _Weight = 0.0
     opacity_l1_by: Literal["gradient", "distance"] = "gradient"
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
+    refine_poses: bool = False
     coarse: _Share = 0.0
     seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed is one of torch's
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"

@@ -19,6 +19,12 @@ def parameter_fault(model: GaussianModel) -> str:
     return ""
 
 
+def step_fault(model: GaussianModel, num_nonfinite: Tensor, loss: float) -> str:
+    """What is wrong with a render that left Gaussians out because they are not finite, or with its loss, or ""."""
+    fault = parameter_fault(model) if int(num_nonfinite) else ""
+    return fault or ("" if math.isfinite(loss) else f"expected a finite loss, got {loss}")
+
+
 def gradient_fault(model: GaussianModel) -> str:
     """The first gradient whose square, which Adam keeps, is not finite (from 1e19 on); "" where there is none."""
     for name, parameter in model.named_parameters():

@@ -17,6 +17,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.camera import move_camera
+from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.json_files import read_json
 from kgs.model import GaussianModel
@@ -25,6 +26,7 @@ from kgs.renderer import GaussianRenderer
 from .checkpoint import is_number, newest_checkpoint, previous
 from .config import FitConfig
 from .outputs import EXPORTS, remove_others, write_json
+from .poses import place_cameras
 
 CHECKPOINT = "checkpoint.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
@@ -130,6 +132,11 @@ class SavedFit(NamedTuple):
     near_plane: float  # in world units
     step: int  # steps that are done
     backend: str  # of the fit; on a GPU "auto"
+    poses: Tensor | None  # `(V, 4, 4)` of the training cameras, where the fit moved them
+
+    def placed(self, scene: Scene) -> Scene:
+        """The fit's scene, with the training cameras where the fit has them."""
+        return scene if self.poses is None else place_cameras(scene, self.poses)
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
@@ -152,6 +159,7 @@ def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
         model = GaussianModel(**state["model"])
         model = (model.select(**part) if (part := state.get("shown")) else model).to(device)
         backend = str(state.get("backend", "torch")) if model.means.device.type == "cpu" else "auto"
-        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend)
+        poses = (state.get("poses") or {}).get("extrinsics")
+        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend, poses)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error

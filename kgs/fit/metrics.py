@@ -56,6 +56,14 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
+def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float | None:
+    """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
+    renders = (views.shaded(render(views.camera(i))[0].clamp(0, 1).cpu()) for i in range(len(views)))
+    values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
+    mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
+    return round(mean, 4) if math.isfinite(mean) else None
+
+
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:

@@ -100,4 +100,4 @@ def _hasty(config: FitConfig, steps: int) -> FitConfig:
     recipe = config.recipe
     rates = {name: HASTE * getattr(recipe, name) for name in Recipe.__annotations__ if name.startswith("lr_")}
     recipe = replace(recipe, opacity_decay=recipe.opacity_decay**HASTE, **rates)
-    return replace(config, steps=steps, evaluations=1, recipe=recipe)
+    return replace(config, steps=steps, evaluations=1, refine_poses=False, recipe=recipe)

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs.camera import camera_centers
 from kgs.datasets.scene import Views
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .starts.triangulate import camera_centers
 from .trainer import Trainer
 
 BINS = 6
@@ -47,7 +47,7 @@ def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, An
     The distance is that to the nearest training camera, in medians of the first points' distances. The edges of the
     bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.
     """
-    centers = camera_centers(trainer.scene.train.cameras)
+    centers = camera_centers(trainer.scene.train.cameras.extrinsics)
     clouds = (first_points, trainer.model.means)
     first, now = (torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in clouds)
     edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))

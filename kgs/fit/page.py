@@ -82,7 +82,7 @@ def write_fit_page(
         pictures_note=_note(len(chosen), len(views), word),
         runs=runs,
         left_out=in_words(next(iter(runs.values()), {}).get("needs") or {}),
-        notes=[*notes, *(line for run, metrics in runs.items() for line in _seen(metrics, run))],
+        notes=[*notes, *(line for run, metrics in runs.items() for line in (*_seen(metrics, run), *_moved(metrics)))],
         settings=_settings(settings or {}),
         report=_report(found),
         weights=lambda: contributions(model, scene.train, near_plane),
@@ -116,7 +116,7 @@ def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str,
         return saved.render(camera, scene.background)
 
     settings = read_json(out / "config.json")
-    write_own_page(path, out, scene, saved.model, saved.near_plane, render, metrics, settings)
+    write_own_page(path, out, saved.placed(scene), saved.model, saved.near_plane, render, metrics, settings)
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -155,6 +155,15 @@ def _seen(metrics: Mapping[str, Any], run: str) -> list[str]:
     sentence = f"two training views or more show {share} of what the held-out photos do: PSNR {level}."
     sentence = f"{run}: {sentence}" if run else sentence
     return [sentence[0].upper() + sentence[1:]]
+
+
+def _moved(metrics: Mapping[str, Any]) -> list[str]:
+    """How far a fit moved its training cameras, in words."""
+    if (found := metrics.get("poses")) is None:
+        return []
+    turned, shifted = f"{found['degrees']:.2f} degrees", f"{100 * found['depths']:.2f} % of the median depth"
+    most = f"at most {found['most_degrees']:.2f} degrees and {100 * found['most_depths']:.2f} %"
+    return [f"The fit moved the training cameras by {turned} and {shifted} in the mean, {most}."]
 
 
 def _levels(metrics: Mapping[str, Any]) -> dict[str, float]:

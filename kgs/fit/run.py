@@ -21,7 +21,7 @@ from .exports import write_exports
 from .figures import write_curve
 from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, locked, publish
 from .lpips import Lpips
-from .machine import check_device, peak_rss_mb, versions
+from .machine import bytes_of, check_device, peak_rss_mb, versions
 from .metrics import evaluate
 from .minutes import steps_within
 from .needs import decide
@@ -112,7 +112,7 @@ def fit_scene(
                 say(f"{config.minutes:g} minutes: {config.steps} steps")
             trainer = Trainer(scene, config, points)
             trainer.needs |= needs
-            say(f"memory: at most {trainer.most_bytes / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
+            say(f"memory: at most {most_bytes(trainer) / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
         told, saved = len(trainer.notes), trainer.saved
@@ -135,7 +135,7 @@ def fit_scene(
             metrics = measure(trainer, lpips)
             write_json(new / "metrics.json", metrics)
             fitted = trainer.shown, trainer.near_plane, trainer.render
-            write_own_page(new / PAGE, out, scene, *fitted, metrics, settings)
+            write_own_page(new / PAGE, out, trainer.scene, *fitted, metrics, settings)
         except BaseException:
             if not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)
@@ -164,6 +164,11 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
     return None, out
 
 
+def most_bytes(trainer: Trainer) -> int:
+    """A bound for the bytes that a fit takes beyond what there is now, known before it begins."""
+    return trainer.config.max_bytes + bytes_of(trainer.max_gaussians, trainer.scene.train.images)
+
+
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     """What metrics.json holds of one run; None stands for what was not measured."""
     scene, config = trainer.scene, trainer.config
@@ -178,6 +183,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
         "peak_rss_mb": peak_rss_mb() or None,
         "gaussians": len(trainer.shown),
         "needs": trainer.needs,
+        "poses": None if trainer.poses is None else trainer.poses.moved(),
         "steps": trainer.step,
         "seed": config.seed,
         "drop": config.drop,

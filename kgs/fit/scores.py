@@ -8,10 +8,9 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.camera import camera_centers
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
-
-from .starts.triangulate import camera_centers
 
 
 class SelectiveDrop(DropGaussian):
@@ -48,5 +47,5 @@ def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Ten
     """
     scores, means = densifier.mean_gradients, densifier.model.means.detach()
     if not by.endswith("gradient"):
-        scores = (means - camera_centers(camera).to(means)).norm(dim=1)
+        scores = (means - camera_centers(camera.extrinsics).to(means)).norm(dim=1)
     return scores if by in ("high-gradient", "far") else -scores

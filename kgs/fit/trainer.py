@@ -5,7 +5,6 @@ in one order.
 """
 
 import copy
-import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,6 @@ from typing import Any, Self
 
 import torch
 from kornia.geometry.camera import PinholeCamera
-from kornia.metrics import psnr
 from torch import Tensor
 
 from kgs.backends import resolve
@@ -28,8 +26,10 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
 from .config import CHOICES, FitConfig, timetable
-from .divergence import gradient_fault, parameter_fault, scale_fault
-from .machine import bytes_of, check_device
+from .divergence import gradient_fault, scale_fault, step_fault
+from .machine import check_device
+from .metrics import mean_psnr
+from .poses import MovingPoses, decayed
 from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
 from .targets import targets
@@ -59,6 +59,7 @@ class Trainer:
         init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
         order, stack: the random stream of views, and the views that still come before it is asked again.
         colors: the random stream of backgrounds.
+        poses: the training cameras, where the fit moves them; `scene` has them where they are now.
     """
 
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
@@ -69,6 +70,8 @@ class Trainer:
         model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)
         model.sh_degree = 0
         self.near_plane = config.recipe.near_plane * nearest
+        if self.poses is not None:
+            self.poses.depth = median
         self._build(model)
 
     def _prepare(self, scene: Scene, config: FitConfig) -> None:
@@ -80,6 +83,7 @@ class Trainer:
         self.curve: list[dict[str, float | None]] = []
         self.notes, self.needs, self.stack = list[str](), dict[str, Any](), list[int]()
         self._fingerprint = fingerprint(scene)
+        self.poses = MovingPoses(scene.train.cameras.extrinsics, config.steps) if config.refine_poses else None
         self._background = scene.background.to(self.device, torch.float32) if scene.background.any() else None
         sizes = [scene.train, *([scene.train.halved()] if self.times.coarse else [])]
         self._views = [targets(views, scene.background, self.device) for views in sizes]
@@ -101,11 +105,6 @@ class Trainer:
         limits |= {"max_gaussians": self.max_gaussians, "generator": torch.Generator().manual_seed(seed + 2)}
         self.densifier = Densifier(self.model, self.optimizer, self.extent, **limits)
         self.order, self.colors = (torch.Generator().manual_seed(seed + stream) for stream in (3, 4))
-
-    @property
-    def most_bytes(self) -> int:
-        """A bound for the bytes that the fit takes beyond what there is now, known before it begins."""
-        return self.config.max_bytes + bytes_of(self.max_gaussians, self.scene.train.images)
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
@@ -162,10 +161,7 @@ class Trainer:
 
     def psnr(self, views: Views) -> float | None:
         """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
-        renders = (views.shaded(self.render(views.camera(i))[0].clamp(0, 1).cpu()) for i in range(len(views)))
-        values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
-        mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
-        return round(mean, 4) if math.isfinite(mean) else None
+        return mean_psnr(self.render, views)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the rest of the fit depends on, copied: nested dicts of tensors and plain values."""
@@ -178,6 +174,7 @@ class Trainer:
             "order": self.order.get_state(),
             "colors": self.colors.get_state(),
             "drop": None if self.drop is None else self.drop.get_rng_state(),
+            "poses": None if self.poses is None else self.poses.state_dict(),
             "shown": self._part,
         }
         return copy.deepcopy(parts | {name: getattr(self, name) for name in PLAIN})
@@ -210,6 +207,8 @@ class Trainer:
                 self.show(**state["shown"])
             if self.drop is not None:
                 self.drop.set_rng_state(state["drop"])
+            if self.poses is not None:
+                self.scene = self.poses.restore(self.scene, state["poses"])
         except KeyError as error:
             raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
         except (AttributeError, RuntimeError, TypeError) as error:
@@ -250,12 +249,14 @@ class Trainer:
         config, recipe = self.config, self.config.recipe
         self.step += 1
         progress = self.step / config.steps
-        first, last = math.log(recipe.lr_means), math.log(recipe.lr_means_final)
-        self.optimizer.param_groups[0]["lr"] = self.extent * math.exp((1 - progress) * first + progress * last)
+        rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
+        self.optimizer.param_groups[0]["lr"] = self.extent * rate
         degree = sum(self.step >= step for step in self.times.sh)
         self.model.sh_degree = max(self.model.sh_degree, degree)  # a fit that is trained on keeps what it has
-        view, background = self._views[self.step <= self.times.coarse][self._next_view()], self._background
-        camera, target, moments = view[:3]
+        index, background = self._next_view(), self._background
+        view = self._views[self.step <= self.times.coarse][index]
+        camera = view.camera if self.poses is None else self.poses.camera(view.camera, index)
+        target, moments = view.image, view.moments
         if config.training_background == "random":
             background = torch.rand(3, generator=self.colors, dtype=torch.float32).to(self.device)
             target, moments = view.before(background)
@@ -273,10 +274,7 @@ class Trainer:
             scores = gaussian_scores("low-gradient" if low else "far", self.densifier, camera)
             loss = loss + config.opacity_l1 * opacity_l1(gaussians.opacities, scores)
         value = float(loss.detach())
-        if int(out.projected.num_nonfinite):
-            self._stop_if(parameter_fault(self.model))
-        if not math.isfinite(value):
-            self._stop_if(f"expected a finite loss, got {value}")
+        self._stop_if(step_fault(self.model, out.projected.num_nonfinite, value))
         if loss.requires_grad:
             loss.backward()
             self._stop_if(gradient_fault(self.model))
@@ -286,6 +284,8 @@ class Trainer:
                 self.optimizer.step()
                 if recipe.opacity_decay < 1.0 and progress > recipe.decay_from:
                     self.densifier.decay_opacity(recipe.opacity_decay)
+                if self.poses is not None:
+                    self.scene = self.poses.step(self.scene, progress)
             self.optimizer.zero_grad(set_to_none=True)
         return value
 

@@ -114,7 +114,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.run import choose_points
+    from kgs.fit.run import choose_points, most_bytes
     from kgs.fit.trainer import Trainer
 
     torch.set_num_threads(1)
@@ -131,7 +131,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     half = resident[len(resident) // 2 :]
     middle = len(half) // 2
     slope = (sum(half[middle:]) / len(half[middle:]) - sum(half[:middle]) / middle) / middle
-    return slope / 1024, max(resident) - before, trainer.most_bytes
+    return slope / 1024, max(resident) - before, most_bytes(trainer)
 
 
 def _resident() -> int:

@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kgs.datasets.images import list_images
 from kgs.datasets.layouts import CAMERAS_REPORT, nearest_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
@@ -42,8 +41,9 @@ def find_scene(
     """
     from . import pose_photos
     from .estimate import LEAST_PHOTOS
+    from .find import list_photos
 
-    if estimated and (count := len(list_images(photos))) < LEAST_PHOTOS:
+    if estimated and (count := len(list_photos(photos))) < LEAST_PHOTOS:
         raise DataError(
             photos, "", f"--estimate: expected at least {LEAST_PHOTOS} photos to leave one out, got {count}"
         )

@@ -38,7 +38,15 @@ class Exif(NamedTuple):
 def read_exif(data: bytes) -> Exif:
     """The metadata of an image's bytes; the default where there are none that can be read."""
     try:
-        tags = _tags(_block(data))
+        return read_tiff(_block(data))
+    except (struct.error, ValueError):
+        return Exif()
+
+
+def read_tiff(data: bytes) -> Exif:
+    """The same of the metadata's own bytes, which are a TIFF."""
+    try:
+        tags = _tags(data)
     except (struct.error, ValueError, ZeroDivisionError):
         return Exif()
     orientation, focal, density = (int(tags.get(_ORIENTATION, 1)), tags.get(_FOCAL, 0.0), tags.get(_DENSITY, 0.0))

@@ -5,12 +5,15 @@ from pathlib import Path
 from kgs.datasets.images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, list_images
 from kgs.errors import DataError
 
+from .heic import SUFFIXES as HEIC_SUFFIXES
+from .heic import can_read_heic
+
 FEWEST = 3
 _LISTED = 10
 CONVERT = (
-    "kgs reads PNG, JPEG, WebP, TIFF and BMP. Make JPEGs of them first: on a Mac `sips -s format jpeg *.HEIC --out "
-    "jpeg`, elsewhere `magick mogrify -format jpg *.HEIC` (ImageMagick) or `heif-convert` (libheif); on an iPhone "
-    "Settings > Camera > Formats > Most Compatible takes JPEGs from the start"
+    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install -e ".[heic]"). Or make JPEGs: on a '
+    "Mac `sips -s format jpeg *.HEIC --out jpeg`, elsewhere `magick mogrify -format jpg *.HEIC` (ImageMagick) or "
+    "`heif-convert` (libheif); on an iPhone Settings > Camera > Formats > Most Compatible takes JPEGs from the start"
 )
 ADVICE = "Take 3 to 12 photos of one scene that does not move, a small step between them, so that neighbours overlap"
 
@@ -25,8 +28,9 @@ def find_photos(folder: Path) -> list[Path]:
         raise DataError(folder, "", _from_video(folder))
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
-    paths = [path for path in list_images(folder) if path.is_file()]
-    kinds = {"others": UNREADABLE_SUFFIXES, "videos": VIDEO_SUFFIXES}
+    paths = list_photos(folder)
+    readable = HEIC_SUFFIXES if can_read_heic() else ()
+    kinds = {"others": set(UNREADABLE_SUFFIXES) - set(readable), "videos": set(VIDEO_SUFFIXES)}
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     found = {kind: [path for path in files if path.suffix.lower() in kinds[kind]] for kind in kinds}
     if others := found["others"]:
@@ -45,6 +49,12 @@ def find_photos(folder: Path) -> list[Path]:
         reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed(paths)}). {ADVICE}"
         raise DataError(folder, "", reason)
     return paths
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """The files that are photos and can be read, sorted by name; HEIC among them where pi-heif is there."""
+    suffixes = IMAGE_SUFFIXES + (HEIC_SUFFIXES if can_read_heic() else ())
+    return [path for path in list_images(folder, suffixes) if path.is_file()]
 
 
 def listed(paths: list[Path]) -> str:

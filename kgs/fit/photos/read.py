@@ -2,7 +2,9 @@
 
 import hashlib
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,6 +17,7 @@ from kgs.fit.progress import Stage
 
 from .exif import FILM_DIAGONAL, Exif, read_exif, turn
 from .find import CONVERT, listed
+from .heic import can_read_heic, is_heic, open_heic
 
 LONGEST = 1600  # pixels of the longer side, for matching and for what is written
 _SAME_ZOOM = 1.1  # ratio of focal lengths that one lens may have
@@ -69,25 +72,32 @@ def read_photos(paths: list[Path], stage: Stage) -> list[Photo]:
     """
     metadata, sizes = [], []
     for path in paths:
-        data = read_bytes(path)
-        if data[4:8] == b"ftyp":
-            raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
-        metadata.append(read_exif(data))
-        width, height = read_size(path)
-        sizes.append((height, width) if metadata[-1].orientation > 4 else (width, height))
+        exif, (width, height), read = _open(path)
+        metadata.append((exif, read))
+        sizes.append((height, width) if exif.orientation > 4 else (width, height))
     _check_shapes(paths, sizes)
     width, height = min(sizes)
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    _check_lenses(paths, [exif.focal_ratio(*size) for exif in metadata], size)
+    _check_lenses(paths, [exif.focal_ratio(*size) for exif, _ in metadata], size)
     photos = []
-    for path, exif in stage(list(zip(paths, metadata, strict=True)), "photos", "photo"):
-        image, stored = read_image(path), size[::-1] if exif.orientation > 4 else size
+    for path, (exif, read) in stage(list(zip(paths, metadata, strict=True)), "photos", "photo"):
+        image, stored = read(), size[::-1] if exif.orientation > 4 else size
         if image.shape[1::-1] != stored:
             image = np.asarray(cv2.resize(image, stored, interpolation=cv2.INTER_AREA), np.float32)
         upright = turn((image.clip(0, 1) * 255).round().astype(np.uint8), exif.orientation)
         photos.append(Photo(path, exif, np.ascontiguousarray(upright)))
     return photos
+
+
+def _open(path: Path) -> tuple[Exif, tuple[int, int], Callable[[], NDArray[np.float32]]]:
+    """What a photo says of its lens, the width and height that it is stored with, and what reads its pixels."""
+    data = read_bytes(path)
+    if is_heic(data) and can_read_heic():
+        return open_heic(path, data)
+    if data[4:8] == b"ftyp":
+        raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
+    return read_exif(data), read_size(path), partial(read_image, path)
 
 
 def blurred(photos: list[Photo]) -> list[Photo]:

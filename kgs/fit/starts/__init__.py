@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.camera import meeting_point
+from kgs.camera import camera_centers, meeting_point
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 from kgs.neighbours import log_spacing
@@ -18,7 +18,7 @@ from kgs.neighbours import log_spacing
 from .dense import dense_points
 from .files import read_points
 from .tracks import find_tracks
-from .triangulate import camera_centers, project_all, triangulate_certain, unproject
+from .triangulate import project_all, triangulate_certain, unproject
 
 __all__ = ["FirstPoints", "first_points", "typical_depths"]
 
@@ -160,7 +160,7 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
         _, depths = project_all(points, cameras)
         least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
         return 0.8 * least, 1.25 * most
-    centers, axes = camera_centers(cameras), cameras.extrinsics[:, 2, :3].double().cpu()
+    centers, axes = camera_centers(cameras.extrinsics), cameras.extrinsics[:, 2, :3].double().cpu()
     if (meeting := meeting_point(cameras.extrinsics)) is not None:
         depths = ((meeting - centers) * axes).sum(1)
         return 0.3 * float(depths.min()), 2.0 * float(depths.max())

@@ -15,10 +15,11 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.backends import choose, compiled_covers, register
+from kgs.camera import camera_centers
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 
-from .triangulate import camera_centers, matrices
+from .triangulate import matrices
 
 PLANES, MOST_PLANES = 128, 256  # as many as a picture moves by pixels, in these limits
 WINDOW = 7  # pixels, the side of the patches that are compared
@@ -78,7 +79,7 @@ def planes_wanted(views: Views, near: float, far: float) -> float:
 
 def _neighbours(views: Views, view: int, depth: float) -> list[int]:
     """The views to compare with, those first that stand as far apart as tells a depth without hiding it."""
-    centers = camera_centers(views.cameras)
+    centers = camera_centers(views.cameras.extrinsics)
     baselines = (centers - centers[view]).norm(dim=1) / depth
     order = (baselines / BASELINE).log().abs().argsort(stable=True).tolist()
     return [other for other in order if baselines[other] > 0][:NEIGHBOURS]

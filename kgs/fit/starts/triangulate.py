@@ -8,6 +8,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
+from kgs.camera import camera_centers
+
 from .tracks import Tracks
 
 MAX_ERROR = 0.75  # pixels between a point and its observation
@@ -18,7 +20,7 @@ def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
     """The points `(T, 3)`, float64, of tracks in two views or more; not finite, or behind, where rays do not meet."""
     intrinsics, extrinsics = matrices(cameras)
     # Unit focal lengths and an origin amid the cameras keep the equations well conditioned.
-    origin = camera_centers(cameras).mean(0)
+    origin = camera_centers(cameras.extrinsics).mean(0)
     rotations, translations = extrinsics[:, :3, :3], extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]
     projections = torch.cat([rotations, translations[..., None]], dim=-1)
     rays = (torch.linalg.inv(intrinsics) @ convert_points_to_homogeneous(tracks.pixels)[..., None])[..., 0]
@@ -43,7 +45,7 @@ def triangulate_certain(tracks: Tracks, cameras: PinholeCamera) -> tuple[Tensor,
         enough = kept.sum(1) >= 2
         points, agreeing = points[enough], agreeing[enough]
         tracks = Tracks(tracks.pixels[enough], kept[enough])
-    rays = torch.nn.functional.normalize(points[:, None] - camera_centers(cameras), dim=-1)
+    rays = torch.nn.functional.normalize(points[:, None] - camera_centers(cameras.extrinsics), dim=-1)
     cosines = (rays @ rays.mT).masked_fill(~(tracks.seen[:, :, None] & tracks.seen[:, None, :]), 1.0).flatten(1).amin(1)
     certain = agreeing & (cosines.clamp(-1.0, 1.0).acos().rad2deg() >= MIN_ANGLE)
     return points[certain], tracks.select(certain)
@@ -81,9 +83,3 @@ def unproject(pixels: Tensor, depths: Tensor, views: Tensor, cameras: PinholeCam
 def matrices(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
     """Intrinsics `(V, 3, 3)` and world-to-camera extrinsics `(V, 4, 4)` in float64 on the CPU."""
     return cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu()
-
-
-def camera_centers(cameras: PinholeCamera) -> Tensor:
-    """The centres of V cameras in the world, `(V, 3)` in float64."""
-    _, extrinsics = matrices(cameras)
-    return -(extrinsics[:, :3, :3].mT @ extrinsics[:, :3, 3:])[..., 0]

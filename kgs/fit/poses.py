@@ -1,0 +1,129 @@
+"""The poses of the training cameras as parameters of a fit, for poses that are only roughly known.
+
+Convention:
+    World-to-camera extrinsics. A motion is six numbers in a camera's own frame, as of Kornia's `Se3`: a translation in
+    units of `TRANSLATION` median depths of the first points, and a rotation in radians.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.liegroup import Se3
+from torch import Tensor
+
+from kgs.camera import camera_centers
+from kgs.datasets.scene import Scene
+
+from .checkpoint import load_moments, moments_of
+
+REACH = 0.004  # the sum of Adam's steps of one camera in a whole fit, in each of the six numbers
+TRANSLATION = 0.3  # median depths; where cameras face one way, a shift and a turn look alike: rather a turn
+LAST = 0.01  # the last step, relative to the first
+
+
+class MovingPoses:
+    """The poses of V cameras that a fit moves; each step moves one of them a little.
+
+    The gauge is fixed: the mean rotation, the mean centre and the spread of the centres stay as given, so that neither
+    the splat nor a test camera has to follow.
+
+    Args:
+        given: the world-to-camera extrinsics that the fit begins with, `(V, 4, 4)`.
+        steps: of the whole fit.
+
+    Attributes:
+        extrinsics: where the cameras are now, `(V, 4, 4)`, float64 on the CPU.
+        depth: the median depth of the first points, in world units, above 0: to be set before the first step.
+    """
+
+    def __init__(self, given: Tensor, steps: int) -> None:
+        self.given, self.depth = given.double().cpu(), 1.0
+        self._rate = REACH * len(given) / steps * -math.log(LAST) / (1 - LAST)
+        self.extrinsics = self.given.clone()
+        self._motions = [torch.zeros(6, dtype=torch.float64) for _ in given]  # 0 before each step
+        groups = [{"params": [motion], "name": f"view {view}"} for view, motion in enumerate(self._motions)]
+        self._optimizer = torch.optim.Adam(groups)
+        self._seen: tuple[int, Tensor] | None = None
+
+    def camera(self, camera: PinholeCamera, view: int) -> PinholeCamera:
+        """A camera of that view, in any resolution, where it is now; the next :meth:`step` uses its gradient."""
+        pose = self.extrinsics[view : view + 1].to(camera.extrinsics).requires_grad_()
+        self._seen = view, pose
+        return PinholeCamera(camera.intrinsics, pose, camera.height, camera.width)
+
+    @torch.no_grad()
+    def step(self, scene: Scene, progress: float) -> Scene:
+        """Move the camera that was seen last, if it has a finite gradient; `progress` of the fit is in (0, 1].
+
+        Returns the scene with its training cameras where they are now.
+        """
+        if self._seen is None or (found := self._seen[1].grad) is None or not bool(found.isfinite().all()):
+            return scene
+        view = self._seen[0]
+        motion, pose, units = self._motions[view], self.extrinsics[view], torch.ones(6, dtype=torch.float64)
+        units[:3] = TRANSLATION * self.depth
+        slope = found[0].double().cpu() @ pose.mT  # by a matrix that the pose is multiplied with from the left
+        turn = slope[:3, :3] - slope[:3, :3].mT
+        motion.grad = units * torch.stack([*slope[:3, 3], turn[2, 1], turn[0, 2], turn[1, 0]])
+        for group in self._optimizer.param_groups:
+            group["lr"] = decayed(self._rate, LAST * self._rate, progress)
+        self._optimizer.step()
+        self.extrinsics[view] = Se3.exp((units * motion)[None]).matrix()[0] @ pose
+        motion.grad, self._seen = None, None
+        motion.zero_()
+        self._fix_gauge()
+        return place_cameras(scene, self.extrinsics)
+
+    def moved(self) -> dict[str, float]:
+        """How far the cameras are from where they were: means and maxima of degrees, and of shares of the depth."""
+        relative = self.extrinsics[:, :3, :3] @ self.given[:, :3, :3].mT
+        chord = torch.linalg.matrix_norm(relative - torch.eye(3, dtype=torch.float64)) / 8**0.5  # sin(angle / 2)
+        degrees = 2 * chord.clamp(max=1).asin().rad2deg()
+        shares = (camera_centers(self.extrinsics) - camera_centers(self.given)).norm(dim=1) / self.depth
+        found = {"degrees": degrees.mean(), "most_degrees": degrees.max()}
+        found |= {"depths": shares.mean(), "most_depths": shares.max()}
+        return {name: round(float(value), 5) for name, value in found.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the motion depends on besides the given extrinsics."""
+        return {"extrinsics": self.extrinsics, "depth": self.depth, "optimizer": moments_of(self._optimizer)}
+
+    def restore(self, scene: Scene, state: dict[str, Any]) -> Scene:
+        """Go on from a :meth:`state_dict`; returns the scene with its training cameras where they are then.
+
+        A KeyError, TypeError or ValueError where an entry is missing or wrong.
+        """
+        found = state["extrinsics"]
+        if found.shape != self.given.shape:
+            raise ValueError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(found.shape)}")
+        self.extrinsics, self.depth = found.double().clone(), float(state["depth"])
+        load_moments(self._optimizer, state["optimizer"])
+        return place_cameras(scene, self.extrinsics)
+
+    def _fix_gauge(self) -> None:
+        """Turn, move and scale the world so that what all cameras have in common is as given."""
+        now, given = self.extrinsics, self.given
+        left, _, right = torch.linalg.svd((now[:, :3, :3].mT @ given[:, :3, :3]).sum(dim=0))
+        turn = (left @ right).mT  # of the world, to the given one
+        centers, wanted = camera_centers(now), camera_centers(given)
+        spreads = [(places - places.mean(dim=0)).norm() for places in (centers, wanted)]
+        scale = spreads[1] / spreads[0] if float(min(spreads)) > 1e-9 * self.depth else 1.0
+        now[:, :3, :3] @= turn.mT
+        centers = scale * (centers - centers.mean(dim=0)) @ turn.mT + wanted.mean(dim=0)
+        now[:, :3, 3] = -(now[:, :3, :3] @ centers[..., None])[..., 0]
+
+
+def place_cameras(scene: Scene, extrinsics: Tensor) -> Scene:
+    """The scene with training cameras at other poses, `(V, 4, 4)`."""
+    cameras = scene.train.cameras
+    poses = extrinsics.to(cameras.extrinsics)
+    moved = PinholeCamera(cameras.intrinsics, poses, cameras.height, cameras.width)
+    return replace(scene, train=replace(scene.train, cameras=moved))
+
+
+def decayed(first: float, last: float, progress: float) -> float:
+    """What lies between two rates, log-linearly: the first at progress 0, the last at 1."""
+    return math.exp((1 - progress) * math.log(first) + progress * math.log(last))
