@@ -1,6 +1,7 @@
 """`kgs fit` of bare photos, with their true cameras in the place of those that are found: what follows from them."""
 
 import json
+import re
 import shutil
 
 import cv2
@@ -13,9 +14,10 @@ from kgs.datasets import synthetic_scene
 from kgs.datasets.layouts import nearest_scene
 from kgs.fit import photos
 from kgs.fit.config import FitConfig
+from kgs.fit.minutes import expected_minutes
 from kgs.fit.outputs import write_json
 from kgs.fit.photos import estimate as estimate_module
-from kgs.fit.photos.entry import is_bare
+from kgs.fit.photos.entry import foretold, is_bare
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
@@ -82,12 +84,17 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     out = tmp_path / "out"
     assert run("fit", folder(4), "-o", out, *FIT) == 0
     said = capsys.readouterr().out
+    assert re.search(
+        r"^4 photos, the smallest of 96x72: cameras in about \d+ s, the fit in \d+ s, at most 1\.\d GiB", said
+    )
     assert "4 training and 0 test views of 96x72" in said
+    assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said
     assert f"--cameras {out}" in said
     request = json.loads((out / "config.json").read_text())["request"]
     assert (request["scene"], request["hold_out"], request["downscale"]) == (".", 0, 1.0)
     assert run("fit", tmp_path / "photos4", "-o", out, *FIT) == 0  # again, in the folder that it made
+    assert "the smallest of" not in capsys.readouterr().out  # cameras that are there take no time
     out.rename(tmp_path / "moved")
     assert run("eval", tmp_path / "moved") == 0
 
@@ -140,3 +147,19 @@ def test_photos_are_told_from_scenes(folder, tmp_path, asked):
     shutil.copytree(bare / "out" / "sparse", bare / "scene" / "sparse", dirs_exist_ok=True)
     assert nearest_scene(bare) == bare / "scene"
     assert not is_bare(bare)
+
+
+def test_what_large_photos_take_is_foretold(folder):
+    """Sizes alone count: 4 photos of 4000x3000 are posed at 1600 pixels, and fitted at 504 on a CPU."""
+    large = folder(4)
+    for path in large.iterdir():
+        cv2.imwrite(str(path), np.zeros((3000, 4000, 3), np.uint8))
+    said = foretold(large, None, FitConfig(backend="torch"))
+    found = re.fullmatch(r"4 photos, the smallest of 4000x3000: cameras in about (\d+) s, the fit in (\d+) s, .*", said)
+    cameras, fit = map(int, found.groups())
+    assert 10 <= cameras <= 30
+    assert fit == round(60 * expected_minutes(504 * 378, FitConfig(backend="torch")))
+    assert re.search(r"at most 1\.\d GiB of memory", said)
+    assert "the fit in 90 s" in foretold(large, None, FitConfig(minutes=1.5))
+    (large / "IMG_0.png").write_bytes(b"no image")
+    assert foretold(large, None, FitConfig()) == ""

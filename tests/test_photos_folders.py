@@ -8,6 +8,7 @@ import pytest
 from photo_folders import exif, planes, with_exif, write_planes
 from start_scenes import texture
 
+from kgs.cli import main
 from kgs.errors import DataError
 from kgs.fit.outputs import write_json
 from kgs.fit.photos import pose_photos
@@ -18,16 +19,23 @@ from kgs.fit.progress import silent
 pytest.importorskip("pycolmap")
 
 
-def refused(folder, *parts, out=None):
-    """The message with which a folder is refused; nothing is left behind."""
-    place = out or folder.parent / "out"
-    with pytest.raises(DataError) as error:
-        pose_photos(folder, place, say=lambda line: None)
-    assert not [path.name for path in place.glob("*photos*")]
-    text = str(error.value)
-    for part in parts:
-        assert part in text, text
-    return text
+@pytest.fixture
+def refused(capsys):
+    """Runs `kgs fit` on a folder that is refused; the message. Nothing half-made is left behind."""
+
+    def run(folder, *parts, out=None, code=2):
+        place = out or folder.parent / "out"
+        with pytest.raises(SystemExit) as stop:
+            main(["fit", str(folder), "-o", str(place)])
+        assert stop.value.code == code
+        assert not [path.name for path in place.glob("*photos*")]
+        text = capsys.readouterr().err
+        assert "Traceback" not in text
+        for part in parts:
+            assert part in text, text
+        return text
+
+    return run
 
 
 def small(images):
@@ -35,7 +43,7 @@ def small(images):
 
 
 def save(folder, images, names=None):
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for name, image in zip(names or [f"{i}.png" for i in range(len(images))], images, strict=True):
         cv2.imwrite(str(folder / name), image)
     return folder
@@ -48,78 +56,78 @@ def folder(tmp_path):
     return path
 
 
-def test_no_folder(tmp_path):
-    refused(tmp_path / "none", "found no such folder")
+def test_no_folder(tmp_path, refused):
+    refused(tmp_path / "none", "expected a folder, there is none")
 
 
-def test_an_empty_folder(folder):
+def test_an_empty_folder(folder, refused):
     (folder / "notes.txt").write_text("nothing")
     refused(folder, "expected photos", ".jpg", "found none", "Take 3 to 12 photos")
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_too_few_photos(folder, count):
+def test_too_few_photos(folder, count, refused):
     save(folder, planes()[:count])
     refused(folder, f"at least 3 photos, found {count}", "Take 3 to 12")
 
 
-def test_a_folder_one_level_too_deep(folder):
+def test_a_folder_one_level_too_deep(folder, refused):
     save(folder / "DCIM", planes())
     refused(folder, "these folders in it do: DCIM")
 
 
-def test_photos_of_a_kind_that_is_not_read(folder):
+def test_photos_of_a_kind_that_is_not_read(folder, refused):
     save(folder, planes())
     (folder / "raw.dng").write_bytes(b"II*\0")
     refused(folder, "1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible")
 
 
-def test_a_video_that_is_called_jpeg(folder):
+def test_a_video_that_is_called_jpeg(folder, refused):
     save(folder, planes())
     (folder / "z.jpg").write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
     refused(folder, "z.jpg: is a HEIC photo or a video", "sips")
 
 
-def test_videos(folder):
+def test_videos(folder, refused):
     (folder / "clip.MOV").write_bytes(b"\0\0\0\x14ftypqt  ")
     refused(folder, "clip.MOV is a video", 'ffmpeg -i "clip.MOV"', "3 to 12 sharp ones")
     refused(folder / "clip.MOV", "is a video", "ffmpeg")
 
 
-def test_one_photo_twice(folder):
+def test_one_photo_twice(folder, refused):
     save(folder, [*planes(), planes()[1]])
     refused(folder, "3.png: is the same photo as 1.png: remove one of them")
 
 
-def test_one_photo_twice_saved_anew(folder):
+def test_one_photo_twice_saved_anew(folder, refused):
     save(folder, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"])
     refused(folder, "1.png and 2.jpg show the same from the same place: remove one of them")
 
 
-def test_upright_and_lying_photos(folder):
+def test_upright_and_lying_photos(folder, refused):
     save(folder, [*planes(), planes()[0].transpose(1, 0, 2)])
     refused(folder, "2 (240x180: 0.png, 1.png, 2.png; 180x240: 3.png)", "all upright or all lying")
 
 
-def test_photos_of_several_shapes(folder):
+def test_photos_of_several_shapes(folder, refused):
     save(folder, [*planes(), planes()[0][:120]])
     text = refused(folder, "expected photos of one shape, got 2", "240x120: 3.png", "Cropped")
     assert "upright" not in text
 
 
-def test_photos_of_several_lenses(folder):
+def test_photos_of_several_lenses(folder, refused):
     for i, (image, film) in enumerate(zip(planes(), (26, 26, 13), strict=True)):
         jpeg = cv2.imencode(".jpg", image)[1].tobytes()
         (folder / f"{i}.jpg").write_bytes(with_exif(jpeg, exif(film=film)))
     refused(folder, "one focal length, got 2", "13 mm: 2.jpg", "26 mm: 0.jpg, 1.jpg", "without zoom")
 
 
-def test_photos_without_overlap(folder):
+def test_photos_without_overlap(folder, refused):
     save(folder, [texture(seed, (220.0, 220.0, 220.0), 120).astype(np.uint8) for seed in range(3)])
     refused(folder, "no two of the 3 photos show enough of the same things", "smaller step", "Matches of each pair")
 
 
-def test_two_scenes_in_one_folder(folder):
+def test_two_scenes_in_one_folder(folder, refused):
     save(folder, small([*planes()[:2], *planes()[:2, :, ::-1]]))
     text = refused(folder, "2 groups that do not overlap (1: 0.png, 1.png; 2: 2.png, 3.png)", "If they show two scenes")
     rows = [line.split() for line in text.splitlines()[-4:]]
@@ -129,7 +137,7 @@ def test_two_scenes_in_one_folder(folder):
     assert rows[3][5] == "."
 
 
-def test_a_camera_that_only_turned(folder):
+def test_a_camera_that_only_turned(folder, refused):
     """Homographies of one plane, seen from one place: nothing tells the depth."""
     wall, lens = (
         texture(0, (220.0, 220.0, 220.0)).astype(np.uint8),
@@ -157,14 +165,17 @@ def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
     assert {photo.size for photo in read_photos(sorted(folder.iterdir()), silent)} == {(1600, 1200)}
 
 
-def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path):
+def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
     write_planes(folder)
-    refused(folder, "holds the photos themselves: choose another folder", out=folder)
     (tmp_path / "scene" / "sparse").mkdir(parents=True)
-    refused(folder, "that kgs did not write", out=tmp_path / "scene")
-    (tmp_path / "other").mkdir()
     save(tmp_path / "other" / "images", planes())
-    refused(folder, "that kgs did not write", out=tmp_path / "other")
+    for out, said in (
+        (folder, "the photos themselves"),
+        *((tmp_path / n, "kgs did not write") for n in ("scene", "other")),
+    ):
+        refused(folder, "choose another folder with -o", out=out)
+        with pytest.raises(DataError, match=f"{said}.*: choose another folder"):
+            pose_photos(folder, out)
 
 
 def test_pycolmap_that_is_not_there(folder, monkeypatch):
@@ -185,11 +196,15 @@ def test_a_move_that_was_stopped_is_ended(tmp_path):
     assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0"]
 
 
-def test_a_full_disk_leaves_nothing_behind(folder, monkeypatch):
+@pytest.mark.parametrize("stage", ["pose.write_images", "pose.write_matches"])
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [(OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, "")],
+)
+def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refused, stage, error, code, said):
     def fail(*arguments):
-        raise OSError(28, "No space left on device")
+        raise error
 
-    monkeypatch.setattr("kgs.fit.photos.pose.write_matches", fail)
-    with pytest.raises(OSError, match="No space left"):
-        pose_photos(write_planes(folder), folder.parent / "out")
+    monkeypatch.setattr(f"kgs.fit.photos.{stage}", fail)
+    refused(write_planes(folder), said, code=code)
     assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]

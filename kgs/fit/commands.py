@@ -123,7 +123,7 @@ def fit(
     request["hold_out"] = hold_out
     request["points"] = config.init if config.init == "model-points" else "none"
     if bare := is_bare(scene):
-        request = find_scene(scene, out, request, seed=config.seed, device=config.device, estimated=estimate)
+        request = find_scene(scene, out, request, config, estimated=estimate)
     elif estimate:
         raise ValueError("estimate: expected a folder of bare photos, got a scene with cameras: see --hold-out")
     loaded = _load(request, out)

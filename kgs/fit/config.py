@@ -226,6 +226,11 @@ def timetable(config: FitConfig) -> Timetable:
     )
 
 
+def most_gaussians(config: FitConfig, points: int) -> int:
+    """The number at which densification stops in a fit from so many first points."""
+    return config.max_gaussians or max(10 * config.steps, 3 * points // 2)
+
+
 def _check(config: FitConfig | Recipe) -> None:
     """Hold each entry against its annotation; NumPy's numbers and paths given as text become Python's own."""
     hints = get_type_hints(type(config), include_extras=True)

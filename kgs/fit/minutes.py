@@ -9,7 +9,7 @@ import numpy as np
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
 
-from .config import FitConfig, Timetable, timetable
+from .config import FitConfig, Timetable, most_gaussians, timetable
 from .machine import check_device
 from .starts import FirstPoints
 from .trainer import Trainer
@@ -41,8 +41,8 @@ def steps_within(scene: Scene, config: FitConfig, points: FirstPoints, begun: fl
     """
     end, config = begun + 60.0 * (config.minutes or 0.0), replace(config, minutes=None, steps=2 * _FIRST)
 
-    def most(steps: float) -> float:
-        return config.max_gaussians or max(10 * steps, 3 * len(points.points) // 2)  # as in Trainer
+    def most(steps: int) -> int:
+        return most_gaussians(replace(config, steps=max(1, steps)), len(points.points))
 
     trial = Trainer(scene, replace(config, evaluations=1, coarse=0.0), points)
     trial.fit(lambda trainer, _: trainer.step == _FIRST)
@@ -50,7 +50,7 @@ def steps_within(scene: Scene, config: FitConfig, points: FirstPoints, begun: fl
     trial.fit(lambda trainer, _: trainer.step == 2 * _FIRST - 1)  # the last step measures the curve
     guess = round(max(_FEWEST, (end - time.perf_counter()) / (trial.seconds - seconds) * (_FIRST - 1)))
     count, start, found = max(_FEWEST, round(_SHARE * guess)), time.perf_counter(), list[tuple[float, int]]()
-    small = Trainer(scene, replace(config, steps=count, max_gaussians=round(most(guess))), points)
+    small = Trainer(scene, replace(config, steps=count, max_gaussians=most(guess)), points)
     small.times = _scaled(timetable(replace(config, steps=guess)), count / guess)
 
     def note(trainer: Trainer, _: float) -> bool:

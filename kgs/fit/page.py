@@ -100,7 +100,8 @@ def write_own_page(
     settings: Mapping[str, Any],
 ) -> None:
     """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
-    title = (out / settings["request"].get("scene", scene.root)).resolve().name
+    request = settings["request"]
+    title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
     one: dict[str, Any] = {"settings": settings, "report": out / CAMERAS_REPORT}
     write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **one)
 

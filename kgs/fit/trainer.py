@@ -25,7 +25,7 @@ from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
 from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
-from .config import CHOICES, FitConfig, timetable
+from .config import CHOICES, FitConfig, most_gaussians, timetable
 from .divergence import gradient_fault, scale_fault, step_fault
 from .machine import check_device
 from .metrics import mean_psnr
@@ -90,7 +90,7 @@ class Trainer:
 
     def _build(self, model: GaussianModel) -> None:
         config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
-        self.max_gaussians = config.max_gaussians or max(10 * config.steps, 3 * int(self.init["points"]) // 2)
+        self.max_gaussians = most_gaussians(config, int(self.init["points"]))
         self.model = self.shown = model.to(self.device)
         self._part: dict[str, Any] = {}
         groups = [

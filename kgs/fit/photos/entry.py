@@ -4,27 +4,36 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from kgs.datasets.images import VIDEO_SUFFIXES
 from kgs.datasets.layouts import CAMERAS_REPORT, nearest_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.fit.config import FAST, FitConfig
+from kgs.fit.config import FAST, FitConfig, most_gaussians
 from kgs.fit.folder import load_fit
+from kgs.fit.machine import bytes_of
+from kgs.fit.minutes import expected_minutes
 from kgs.fit.outputs import write_json
 from kgs.fit.page import refresh_page
 from kgs.fit.progress import each, say
 from kgs.json_files import read_json
 
 LONGEST = 504  # pixels of the longer side in a fit on a CPU
+_PHOTO, _PIXEL = 2.0, 1.3e-6  # seconds for the camera of a photo and for each of its pixels, on an AMD EPYC
+_POSING, _DECODING = 500e6, 50.0  # bytes, and bytes for each pixel of the largest photo
 FEW = 9  # photos: of fewer none is held out
 
 
 def is_bare(scene: Path) -> bool:
-    """Whether a folder can only be one of photos without cameras: it is no scene, and none is right below or above."""
+    """Whether this can only be photos without cameras, or a video of them: no scene, and none right below or above."""
+    if scene.is_file():
+        return scene.suffix.lower() in VIDEO_SUFFIXES
     return scene.is_dir() and nearest_scene(scene) is None
 
 
 def find_scene(
-    photos: Path, out: Path, request: dict[str, Any], *, seed: int, device: str, estimated: bool = False
+    photos: Path, out: Path, request: dict[str, Any], config: FitConfig, *, estimated: bool = False
 ) -> dict[str, Any]:
     """Find the cameras of bare photos, and return how the scene in `out` is to be loaded.
 
@@ -32,8 +41,7 @@ def find_scene(
         photos: the folder of the photos.
         out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
         request: what the user asked for; None stands for what was left open.
-        seed: of the solvers.
-        device: of the fit; on a CPU the photos are fitted at `LONGEST` pixels unless `request` says else.
+        config: of the fit; on a CPU the photos are fitted at `LONGEST` pixels unless `request` says else.
         estimated: whether `add_estimate` is to follow.
 
     Raises:
@@ -47,13 +55,45 @@ def find_scene(
         raise DataError(
             photos, "", f"--estimate: expected at least {LEAST_PHOTOS} photos to leave one out, got {count}"
         )
-    report = pose_photos(photos, out, seed=seed, stage=each, say=say)
+    if not (out / CAMERAS_REPORT).exists() and (told := foretold(photos, request["downscale"], config)):
+        say(told)
+    report = pose_photos(photos, out, seed=config.seed, stage=each, say=say)
     count, longest = len(report["photos"]), max(report["size"])
     if request["hold_out"] is None and count < FEW:
         request = request | {"hold_out": 0}
-    if request["downscale"] is None and device == "cpu":
-        request = request | {"downscale": max(1.0, longest / LONGEST)}
-    return request | {"scene": "."}
+    downscale = _downscale(request["downscale"], longest, config)
+    return request | {"downscale": downscale, "scene": ".", "title": photos.resolve().name}
+
+
+def foretold(photos: Path, downscale: float | None, config: FitConfig) -> str:
+    """What cameras and fit will take, in words, from the sizes of the photos alone: times within a factor of two.
+
+    "" where the photos cannot be read, which :func:`pose_photos` says better.
+    """
+    from .find import find_photos
+    from .read import LONGEST as POSED
+    from .read import stored_size
+
+    try:
+        paths = find_photos(photos)
+        stored = [stored_size(path) for path in paths]
+    except DataError:
+        return ""
+    width, height = min(stored)
+    posed = min(1.0, POSED / max(width, height))
+    seconds = len(paths) * (_PHOTO + _PIXEL * width * height * posed**2)
+    shrunk = posed / (_downscale(downscale, posed * max(width, height), config) or 1.0)
+    images = torch.empty(len(paths), 3, max(1, round(height * shrunk)), max(1, round(width * shrunk)), device="meta")
+    minutes = config.minutes or expected_minutes(images[0, 0].numel(), config)
+    fitting = config.max_bytes + bytes_of(most_gaussians(config, config.init_points), images)
+    most = max(fitting, _POSING + _DECODING * max(wide * high for wide, high in stored))
+    times = f"cameras in about {seconds:.0f} s, the fit in {60 * minutes:.0f} s"
+    return f"{len(paths)} photos, the smallest of {width}x{height}: {times}, at most {most / 2**30:.1f} GiB of memory"
+
+
+def _downscale(asked: float | None, longest: float, config: FitConfig) -> float | None:
+    """By how much posed photos are shrunk for the fit; `longest` is their longer side in pixels."""
+    return max(1.0, longest / LONGEST) if asked is None and config.device == "cpu" else asked
 
 
 def add_estimate(photos: Path, out: Path, scene: Scene, config: FitConfig) -> dict[str, Any]:

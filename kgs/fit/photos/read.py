@@ -72,9 +72,9 @@ def read_photos(paths: list[Path], stage: Stage) -> list[Photo]:
     """
     metadata, sizes = [], []
     for path in paths:
-        exif, (width, height), read = _open(path)
+        exif, size, read = _open(path)
         metadata.append((exif, read))
-        sizes.append((height, width) if exif.orientation > 4 else (width, height))
+        sizes.append(size)
     _check_shapes(paths, sizes)
     width, height = min(sizes)
     scale = min(1.0, LONGEST / max(width, height))
@@ -91,13 +91,19 @@ def read_photos(paths: list[Path], stage: Stage) -> list[Photo]:
 
 
 def _open(path: Path) -> tuple[Exif, tuple[int, int], Callable[[], NDArray[np.float32]]]:
-    """What a photo says of its lens, the width and height that it is stored with, and what reads its pixels."""
+    """What a photo says of its lens, its width and height when it is upright, and what reads its pixels as stored."""
     data = read_bytes(path)
     if is_heic(data) and can_read_heic():
         return open_heic(path, data)
     if data[4:8] == b"ftyp":
         raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
-    return read_exif(data), read_size(path), partial(read_image, path)
+    exif, (width, height) = read_exif(data), read_size(path)
+    return exif, (height, width) if exif.orientation > 4 else (width, height), partial(read_image, path)
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo, upright, from its header alone; a DataError where it cannot be read."""
+    return _open(path)[1]
 
 
 def blurred(photos: list[Photo]) -> list[Photo]:
