@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
 _PEAKS = 0.25  # of COLMAP's threshold for keypoints
 _MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
-_LONGEST = (
-    1000  # pixels of the longer side; COLMAP's own keypoints are as good in smaller photos, and take a minute less
-)
+_LONGEST = 1000  # pixels; COLMAP's own keypoints are as good in smaller photos, and take a minute less
 
 
 class Cameras(NamedTuple):
@@ -94,22 +92,21 @@ def looks(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], Loo
     return found
 
 
-def write_own_matches(database: Path, images: Path, like: Path, seed: int) -> None:
+def write_own_matches(database: Path, images: Path, names: list[str], lens: Any, seed: int) -> None:
     """Make a second database of the same photos, with COLMAP's own keypoints and matches, verified.
 
     Args:
         database: the file to write.
         images: the folder of the photos.
-        like: the first database, which has the photos' names and what is known of their lens.
+        names: of the photos in it.
+        lens: what is known of their lens, pycolmap's.
         seed: of the verification.
     """
     with quiet_pycolmap() as pycolmap:
-        with pycolmap.Database.open(like) as file:
-            names, camera = [image.name for image in file.read_all_images()], file.read_all_cameras()[0]
         reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
         reader.camera_model = "SIMPLE_RADIAL"
-        if camera.has_prior_focal_length:
-            reader.camera_params = camera.params_to_string()
+        if lens.has_prior_focal_length:
+            reader.camera_params = lens.params_to_string()
         extraction.num_threads, extraction.use_gpu, extraction.max_image_size = 1, False, _LONGEST
         extraction.sift.peak_threshold *= _PEAKS
         matching = pycolmap.FeatureMatchingOptions()

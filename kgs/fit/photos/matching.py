@@ -92,8 +92,8 @@ def _open(database: Path) -> Any:
     return pycolmap.Database.open(database)
 
 
-def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]:
-    """Write one lens for all photos, and the photos; returns their ids."""
+def lens_of(photos: list[Photo]) -> Any:
+    """What is known of the one lens of all photos, as pycolmap has it."""
     import pycolmap
 
     width, height = photos[0].size
@@ -101,6 +101,14 @@ def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]
     focal = known[len(known) // 2] if known else DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
     camera.has_prior_focal_length = bool(known)
+    return camera
+
+
+def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]:
+    """Write one lens for all photos, and the photos; returns their ids."""
+    import pycolmap
+
+    camera = lens_of(photos)
     camera.camera_id = file.write_camera(camera)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)

@@ -3,6 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -27,8 +28,8 @@ from .gates import (
     refusal,
     unfit,
 )
-from .mapping import Cameras, looks, solve, verify, write_own_matches
-from .matching import write_matches
+from .mapping import Cameras, looks, quiet_pycolmap, solve, verify, write_own_matches
+from .matching import lens_of, write_matches
 from .read import Photo, blurred, read_photos
 from .write import IMAGES, MODEL, level_and_scale, write_images, write_model
 
@@ -54,14 +55,16 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
         write_images(images, photos, list(png.values()))
         seconds["photos"] = lap()
         first, second, known = work / "first.db", work / "second.db", {image: name for name, image in png.items()}
-        write_matches(first, photos, list(png.values()), stage)
-        pairs = verify(first, seed, known)
-        seconds["matches"] = lap()
-        if against := unfit(names, pairs, looks(first, known)):
-            raise DataError(folder, "", against)
-        found = [solve(first, images, work / "model", seed, known)]
-        seconds["cameras"] = lap()
-        write_own_matches(second, images, first, seed)
+        with quiet_pycolmap(), ThreadPoolExecutor(1) as beside:
+            own = beside.submit(write_own_matches, second, images, list(png.values()), lens_of(photos), seed)
+            write_matches(first, photos, list(png.values()), stage)
+            pairs = verify(first, seed, known)
+            seconds["matches"] = lap()
+            if against := unfit(names, pairs, looks(first, known)):
+                raise DataError(folder, "", against)
+            found = [solve(first, images, work / "model", seed, known)]
+            seconds["cameras"] = lap()
+            own.result()
         found.append(solve(second, images, work / "model", seed, known))
         seconds["second solver"] = lap()
         chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
