@@ -134,6 +134,14 @@ def camera_centers(extrinsics: Tensor) -> Tensor:
     return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
 
 
+def common_up(extrinsics: Tensor) -> Tensor:
+    """What is up for cameras `(C, 4, 4)` on the whole, or for the first where they differ: `(3,)` float64, length 1."""
+    ups = -extrinsics[:, 1, :3].detach().double().cpu()
+    up = ups.mean(dim=0) if ups.mean(dim=0).norm() > 0.1 else ups[0]
+    unit: Tensor = up / up.norm()
+    return unit
+
+
 def meeting_point(extrinsics: Tensor) -> Tensor | None:
     """The point nearest to all optical axes, `(3,)` float64; None where axes are near-parallel, or it is behind one.
 

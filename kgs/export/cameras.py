@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 import kgs
+from kgs.camera import common_up
 from kgs.datasets.scene import Views
 
 
@@ -46,9 +47,7 @@ def upright(extrinsics: Tensor) -> Tensor:
     Args:
         extrinsics: world-to-camera, OpenCV axes, `(V, 4, 4)`, V >= 1.
     """
-    _, down, ahead = extrinsics[:, :3, :3].double().cpu().unbind(1)
-    up = -down.mean(0) if down.mean(0).norm() > 0.1 else -down[0]  # cameras of all orientations have no common one
-    up = up / up.norm()
+    up, ahead = common_up(extrinsics), extrinsics[:, 2, :3].double().cpu()
     back = -ahead.mean(0)
     back = back - (back @ up) * up
     if back.norm() < 0.1:  # they look inwards from all around

@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from kgs.camera import meeting_point
 from kgs.datasets.scene import Views, pinholes
+from kgs.eight_bits import eight_bits
 
 from .cameras import upright
 
@@ -67,8 +68,7 @@ def write_film(
             return f"no {path.name}: this OpenCV writes no WebM files"
         for pose in stage(list(poses), "film", "frame"):
             image = render(pinholes(lens[None], pose[None], size))[0]
-            pixels = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-            writer.write(np.ascontiguousarray(pixels[:, :, ::-1]))
+            writer.write(eight_bits(image))
         writer.release()
         if round(cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT)) != len(poses):
             return f"no {path.name}: it could not be written whole"

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from torch import Tensor
 
 from kgs.datasets.images import list_images
 from kgs.datasets.layouts import CAMERAS_REPORT
+from kgs.eight_bits import eight_bits
 from kgs.errors import DataError
 from kgs.export.film import MARK as FILM_MARK
 from kgs.json_files import write_whole
@@ -91,8 +91,7 @@ def write_png(path: Path, image: Tensor) -> None:
 
     As PNG has it alpha is straight: the colours are not multiplied by it.
     """
-    array = (image.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-    ok, content = cv2.imencode(".png", np.ascontiguousarray(array[:, :, [2, 1, 0, 3][: array.shape[2]]]))
+    ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")
     chunk = b"tEXt" + PNG_MARK

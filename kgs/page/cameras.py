@@ -7,6 +7,8 @@ import numpy as np
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.camera import common_up
+
 _PYRAMID = 0.3  # height of a pyramid, in typical distances between neighbours; at most a tenth of the view's depth
 
 
@@ -36,14 +38,12 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
             | {"centre": lens[:2, 2].tolist(), "rotation": rotation.tolist(), "position": position.tolist()}
             | {"distance": float(np.median(inside)) if len(inside) else 1.0}
         )
-    up, centres = -poses[:, 1, :3].mean(axis=0), np.array([camera["position"] for camera in found])
-    length = float(np.linalg.norm(up))
-    up = up / length if length > 1e-3 else -poses[0, 1, :3]  # cameras all around have no common up
+    centres = np.array([camera["position"] for camera in found])
     apart = np.linalg.norm(centres[:, None] - centres, axis=2)
     nearest = np.sort(apart, axis=1)[:, 1] if len(found) > 1 else np.array([np.inf])
     deep = float(np.median([camera["distance"] for camera in found]))
     return {
         "cameras": found,
-        "up": up.tolist(),
+        "up": common_up(cameras.extrinsics).tolist(),
         "pyramid": min(_PYRAMID * float(np.median(nearest)) or deep, deep / 10),
     }

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from kgs.eight_bits import eight_bits
+
 GAIN = 4  # by which differences are shown stronger
 _SIDES = (1008, 756, 504, 378, 252)  # pixels of the longer side, the first that fits
 _QUALITY = 90  # of JPEG
@@ -55,13 +57,13 @@ def _encoded(picture: Picture, side: int) -> dict[str, Any]:
 
 
 def _uri(image: Tensor, side: int) -> str:
-    array = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()[:, :, ::-1]
+    array = eight_bits(image)
     height, width = array.shape[:2]
     shrink = side / max(height, width)
     if shrink < 1:
         size = max(1, round(width * shrink)), max(1, round(height * shrink))
-        array = cv2.resize(array, size, interpolation=cv2.INTER_AREA)
-    done, content = cv2.imencode(".jpg", np.ascontiguousarray(array), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        array = np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_AREA), np.uint8)
+    done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:
         raise ValueError(f"image: expected one that can be encoded, got {width}x{height} pixels")
     return "data:image/jpeg;base64," + base64.b64encode(content.tobytes()).decode()
