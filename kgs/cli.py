@@ -30,6 +30,7 @@ _BENCHES = {
     "extremes": "errors of stiff and extreme cases, and their bounds",
     "starts": "depth errors, completeness and times of first points",
     "study": "DropGaussian on and off, its schedules and rivals, over scenes and seeds",
+    "cameras": "how often cameras that kgs fit finds in bare photos are right, wrong or refused",
     "training": "test PSNR against time, one setting of a fit at a time",
 }
 _EXTRAS = {

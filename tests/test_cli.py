@@ -241,7 +241,7 @@ def test_a_warning_is_one_line_without_code(folder, tmp_path, capsys):
     assert lines[0].startswith("kgs: first points: SIFT found")
 
 
-@pytest.mark.parametrize("name", ["speed", "precision", "extremes", "starts", "study", "training"])
+@pytest.mark.parametrize("name", ["speed", "precision", "extremes", "starts", "study", "cameras", "training"])
 def test_each_bench_has_its_own_help(name, capsys):
     assert run("bench", name, "--help") == 0
     said = capsys.readouterr().out

@@ -73,6 +73,21 @@ def synthetic_scene(
         return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
 
 
+def synthetic_views(
+    eyes: NDArray[np.float64], kind: str = "forward", size: tuple[int, int] = (126, 168), seed: int = 0
+) -> Views:
+    """Pictures of the synthetic scene from places of one's own: all of its middle, upright.
+
+    Args:
+        eyes: where the cameras are, `(V, 3)`, from the middle of the scene; y points down.
+        kind: as given to `synthetic_scene`.
+        size: as given to `synthetic_scene`.
+        seed: as given to `synthetic_scene`.
+    """
+    stage = _stage(kind, seed)
+    return _views(stage, stage.center + eyes, size, "photo")
+
+
 def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 0) -> Tensor:
     """The true depth of the synthetic scene at the pixel centres of any cameras.
 
