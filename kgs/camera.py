@@ -134,6 +134,12 @@ def camera_centers(extrinsics: Tensor) -> Tensor:
     return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
 
 
+def degrees_between(rotations: Tensor, others: Tensor) -> Tensor:
+    """The angles by which rotations `(..., 3, 3)` differ, `(...)`; |R - S| is 2 sqrt(2) times the sine of its half."""
+    sines: Tensor = torch.linalg.matrix_norm(rotations - others) / 8**0.5
+    return 2 * sines.clamp(max=1).asin().rad2deg()
+
+
 def common_up(extrinsics: Tensor) -> Tensor:
     """What is up for cameras `(C, 4, 4)` on the whole, or for the first where they differ: `(3,)` float64, length 1."""
     ups = -extrinsics[:, 1, :3].detach().double().cpu()

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from kgs.camera import camera_centers
+from kgs.camera import camera_centers, degrees_between
 from kgs.datasets import load_scene
 from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
@@ -67,11 +67,10 @@ def arc_cell(cell: Cell) -> dict[str, Any]:
         found = load_scene(Path(place) / "out", hold_out=0).train
     ours, given = found.cameras.extrinsics.double(), truth.cameras.extrinsics.double()
     between = [(r[:, None] @ r[None].mT) for r in (ours[:, :3, :3], given[:, :3, :3])]
-    sines = torch.linalg.matrix_norm(between[0] - between[1]) / 8**0.5
     scales = torch.pdist(camera_centers(ours)) / torch.pdist(camera_centers(given))
     focal = report["focal_px"] / float(truth.cameras.fx[0]) - 1
     errors = {
-        "degrees": float(2 * sines.max().asin().rad2deg()),
+        "degrees": float(degrees_between(*between).max()),
         "distances": float((scales.max() - scales.min()) / scales.mean()),
     }
     return {"accepted": True, "focal": focal, **errors}

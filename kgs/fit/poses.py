@@ -14,12 +14,12 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
-from kgs.camera import camera_centers
+from kgs.camera import camera_centers, degrees_between
 from kgs.datasets.scene import Scene
 
 from .checkpoint import load_moments, moments_of
 
-REACH = 0.004  # the sum of Adam's steps of one camera in a whole fit, in each of the six numbers
+REACH = 0.004  # about the sum of Adam's steps of one camera in a whole fit, in each of the six numbers
 TRANSLATION = 0.3  # median depths; where cameras face one way, a shift and a turn look alike: rather a turn
 LAST = 0.01  # the last step, relative to the first
 
@@ -79,9 +79,7 @@ class MovingPoses:
 
     def moved(self) -> dict[str, float]:
         """How far the cameras are from where they were: means and maxima of degrees, and of shares of the depth."""
-        relative = self.extrinsics[:, :3, :3] @ self.given[:, :3, :3].mT
-        chord = torch.linalg.matrix_norm(relative - torch.eye(3, dtype=torch.float64)) / 8**0.5  # sin(angle / 2)
-        degrees = 2 * chord.clamp(max=1).asin().rad2deg()
+        degrees = degrees_between(self.extrinsics[:, :3, :3], self.given[:, :3, :3])
         shares = (camera_centers(self.extrinsics) - camera_centers(self.given)).norm(dim=1) / self.depth
         found = {"degrees": degrees.mean(), "most_degrees": degrees.max()}
         found |= {"depths": shares.mean(), "most_depths": shares.max()}

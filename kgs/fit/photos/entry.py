@@ -72,21 +72,21 @@ def foretold(photos: Path, downscale: float | None, config: FitConfig) -> str:
     """
     from .find import find_photos
     from .read import LONGEST as POSED
-    from .read import stored_size
+    from .read import upright_size
 
     try:
         paths = find_photos(photos)
-        stored = [stored_size(path) for path in paths]
+        sizes = [upright_size(path) for path in paths]
     except DataError:
         return ""
-    width, height = min(stored)
+    width, height = min(sizes)
     posed = min(1.0, POSED / max(width, height))
     seconds = len(paths) * (_PHOTO + _PIXEL * width * height * posed**2)
     shrunk = posed / (_downscale(downscale, posed * max(width, height), config) or 1.0)
     images = torch.empty(len(paths), 3, max(1, round(height * shrunk)), max(1, round(width * shrunk)), device="meta")
     minutes = config.minutes or expected_minutes(images[0, 0].numel(), config)
     fitting = config.max_bytes + bytes_of(most_gaussians(config, config.init_points), images)
-    most = max(fitting, _POSING + _DECODING * max(wide * high for wide, high in stored))
+    most = max(fitting, _POSING + _DECODING * max(wide * high for wide, high in sizes))
     times = f"cameras in about {seconds:.0f} s, the fit in {60 * minutes:.0f} s"
     return f"{len(paths)} photos, the smallest of {width}x{height}: {times}, at most {most / 2**30:.1f} GiB of memory"
 

@@ -29,8 +29,7 @@ def find_photos(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = list_photos(folder)
-    readable = HEIC_SUFFIXES if can_read_heic() else ()
-    kinds = {"others": set(UNREADABLE_SUFFIXES) - set(readable), "videos": set(VIDEO_SUFFIXES)}
+    kinds = {"others": set(UNREADABLE_SUFFIXES).difference(_readable()), "videos": set(VIDEO_SUFFIXES)}
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     found = {kind: [path for path in files if path.suffix.lower() in kinds[kind]] for kind in kinds}
     if others := found["others"]:
@@ -53,8 +52,11 @@ def find_photos(folder: Path) -> list[Path]:
 
 def list_photos(folder: Path) -> list[Path]:
     """The files that are photos and can be read, sorted by name; HEIC among them where pi-heif is there."""
-    suffixes = IMAGE_SUFFIXES + (HEIC_SUFFIXES if can_read_heic() else ())
-    return [path for path in list_images(folder, suffixes) if path.is_file()]
+    return [path for path in list_images(folder, _readable()) if path.is_file()]
+
+
+def _readable() -> tuple[str, ...]:
+    return IMAGE_SUFFIXES + (HEIC_SUFFIXES if can_read_heic() else ())
 
 
 def listed(paths: list[Path]) -> str:

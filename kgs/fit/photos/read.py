@@ -101,8 +101,8 @@ def _open(path: Path) -> tuple[Exif, tuple[int, int], Callable[[], NDArray[np.fl
     return exif, (height, width) if exif.orientation > 4 else (width, height), partial(read_image, path)
 
 
-def stored_size(path: Path) -> tuple[int, int]:
-    """Width and height of a photo, upright, from its header alone; a DataError where it cannot be read."""
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo when it is upright, not decoded; a DataError where it cannot be read."""
     return _open(path)[1]
 
 
