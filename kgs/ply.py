@@ -94,6 +94,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
             if len(places) != 1:
                 raise DataError(path, "vertex", f"expected one element of that name, got {len(places)}")
             vertex = elements[places[0]]
+            if "packed_position" in vertex.codes:
+                raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
             rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
             sizes = [3 * (k - 1) for k in SH_SIZES]
             if rest not in sizes:

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import os
 import pickle
+import stat
 
 import pytest
 import safetensors.torch
@@ -148,6 +150,19 @@ def test_a_failed_write_leaves_the_old_file(path, monkeypatch):
         save_checkpoint(path, {"step": 2})
     assert load_checkpoint(path) == {"step": 1}
     assert [p.name for p in path.parent.iterdir()] == ["checkpoint.safetensors"]
+
+
+def test_a_file_system_that_cannot_sync_folders_is_no_fault(path, monkeypatch):
+    plain = os.fsync
+
+    def fsync(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(22, "Invalid argument")
+        plain(descriptor)
+
+    monkeypatch.setattr("os.fsync", fsync)
+    save_checkpoint(path, {"step": 1})
+    assert load_checkpoint(path) == {"step": 1}
 
 
 def test_the_last_two_are_kept_and_the_newest_whole_one_is_found(path):

@@ -21,6 +21,7 @@ from kgs.fit import folder, run
 from kgs.fit.checkpoint import load_checkpoint
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.folder import CHECKPOINT, UNFINISHED, load_fit, locked
+from kgs.fit.outputs import start_folder
 from kgs.fit.run import fit_scene
 from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
@@ -130,7 +131,7 @@ def test_results_that_cannot_be_written_leave_the_old_ones(
 
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
 def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, moves: int) -> None:
-    (done / "finished").mkdir()  # half removed
+    start_folder(done / "finished")  # half removed
     plain, calls = os.replace, []
 
     def killed(source: Any, target: Any) -> None:
@@ -186,12 +187,28 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done:
 
 def test_the_finished_fit_is_resumed_where_another_was_left_unfinished(scene: Any, done: Path) -> None:
     unfinished = Trainer(scene, OTHER, run.choose_points(scene, OTHER))
-    (done / UNFINISHED).mkdir()
+    start_folder(done / UNFINISHED)
     unfinished.save(done / UNFINISHED / CHECKPOINT)
     lines = fit(scene, replace(CONFIG, steps=5), done, resume=True)
     assert lines[0] == "resumed at step 3"
     assert "trained on from step 3" in lines[1]
     assert json.loads((done / "metrics.json").read_text())["steps"] == 5
+
+
+@pytest.mark.parametrize("name", ["finished", "unfinished", CHECKPOINT, "checkpoint.previous.pt"])
+def test_what_another_program_or_person_made_stays(scene: Any, tmp_path: Path, name: str) -> None:
+    mine = tmp_path / name / "thesis.txt" if "." not in name else tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    with pytest.raises(DataError, match=f"{name}: was not written by kgs.*choose another folder"):
+        fit(scene, CONFIG, tmp_path)
+    assert mine.read_text() == "mine"
+
+
+def test_a_damaged_checkpoint_of_a_fit_does_not_stand_in_the_way(scene: Any, done: Path) -> None:
+    (done / CHECKPOINT).write_bytes(b"damaged")
+    fit(scene, OTHER, done)
+    assert seed_of(done) == 1
 
 
 @pytest.mark.parametrize("place", ["file", "file/out", "/proc/kgs"])

@@ -16,6 +16,7 @@ from kgs.fit import run
 from kgs.fit.commands import evaluate
 from kgs.fit.config import FitConfig
 from kgs.fit.folder import load_fit
+from kgs.fit.metrics import in_words
 from kgs.fit.page import refresh_page, spread
 from kgs.fit.starts import FirstPoints
 
@@ -33,6 +34,7 @@ REPORT = {
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: Any) -> Any:
     out, scene = tmp_path_factory.mktemp("fitted"), synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0)
+    scene = replace(scene, root=out)
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
@@ -60,6 +62,31 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert facts["scene"] == "room"
     assert facts["steps"] == "3"
     assert "0123abcd" not in text
+
+
+def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any) -> None:
+    out, scene = fitted
+    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text())
+    refresh_page(out, load_fit(out), replace(scene, root=out / "elsewhere"), metrics)
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", (out / "index.html").read_text()))
+    assert "blurred" not in facts
+    assert "time" not in facts
+    (out / "index.html").write_bytes(own)
+
+
+def test_the_estimate_says_how_many_photos_it_could_judge(fitted: Any) -> None:
+    out, scene = fitted
+    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text())
+    rows = [{"name": "a.jpg", "psnr": 21.0}, {"name": "b.jpg", "psnr": 23.0}, {"name": "c.jpg", "why": "lost"}]
+    metrics["estimate"] = {"psnr": 22.0, "sd": 1.4, "n": 2, "photos": rows}
+    refresh_page(out, load_fit(out), scene, metrics)
+    text = " ".join((out / "index.html").read_text().split())
+    assert "each of 3 photos was left out once" in text
+    assert "2 of them could be judged" in text
+    assert "2 of 3 photos" in in_words(metrics)
+    metrics["estimate"] = {"psnr": None, "sd": None, "n": 0, "photos": rows[2:]}
+    assert "c.jpg: lost" in in_words(metrics)
+    (out / "index.html").write_bytes(own)
 
 
 def test_measures_that_come_later_are_on_it(fitted: Any, tmp_path: Path) -> None:

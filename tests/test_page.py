@@ -60,6 +60,20 @@ def test_a_page_loads_nothing_and_names_no_place_on_a_disk(tmp_path: Path) -> No
     assert str(tmp_path) not in text
 
 
+def test_names_that_are_no_utf8_are_shown_with_escapes(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3)}
+    write_page(tmp_path / "a.html", "\udce9t\udce9", GAUSSIANS, CAMERAS, ["\udcff.jpg", "b", "c"], ["a"] * 3, **options)
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "<title>\\udce9t\\udce9</title>" in text
+    assert "\\udcff.jpg" in text
+
+
+def test_a_picture_without_a_render_has_no_slider(tmp_path: Path) -> None:
+    text = write(tmp_path / "index.html", pictures=[Picture(NAMES[0], torch.rand(3, *SIZE))])
+    assert 'class="over"' in text
+    assert 'type="range"' not in text
+
+
 def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
     path = tmp_path / "index.html"
     text = write(path)
@@ -124,6 +138,9 @@ def test_any_two_moments_can_be_drawn(first: float, last: float) -> None:
     [
         ("/photos/my fern", "my fern"),
         ("D:\\photos\\fern", "fern"),
+        ("../../somebody/points.ply", "points.ply"),
+        ("~/photos/points.ply", "points.ply"),
+        ("~20 minutes", "~20 minutes"),
         ("see /photos/mine/a.jpg.", "see a.jpg."),
         ("PSNR/SSIM of a/b.png", "PSNR/SSIM of a/b.png"),
     ],

@@ -98,20 +98,44 @@ def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -
     def mouse(kind: str, x: float, **more: Any) -> None:
         browser.call("Input.dispatchMouseEvent", type=kind, x=middle[0] + x, y=middle[1], button="left", **more)
 
-    browser.run("viewer.overlay.toggleAttribute('hidden')")  # it would catch the pointer where a pyramid is
-    mouse("mousePressed", 0, clickCount=1, buttons=1)
-    mouse("mouseMoved", 40, buttons=1)
-    mouse("mouseReleased", 40, clickCount=1)
-    views.append(browser.run(eye))
+    def drag() -> None:
+        mouse("mousePressed", 0, clickCount=1, buttons=1)
+        mouse("mouseMoved", 40, buttons=1)
+        mouse("mouseReleased", 40, clickCount=1)
+        views.append(browser.run(eye))
+
+    drag()
     browser.run("viewer.canvas.focus()")
     for key in ("ArrowUp", "+"):
         browser.call("Input.dispatchKeyEvent", type="keyDown", key=key)
         views.append(browser.run(eye))
-    browser.run("viewer.overlay.toggleAttribute('hidden')")
     assert len(set(views)) == 4
-    browser.run("viewer.pyramids[1].dispatchEvent(new Event('click'))")
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key="+", modifiers=2)  # with Ctrl: the browser's zoom
+    assert browser.run(eye) == views[-1]
+    square = "M{0} {2}L{1} {2}L{1} {3}L{0} {3}Z".format(*(x + d for x in (300, 200) for d in (-50, 50)))
+    browser.run("viewer.drawPyramids = () => {}")  # a large one stays below the pointer
+    browser.run(f"viewer.pyramids[1].setAttribute('d', '{square}')")
+    drag()  # on a pyramid: no click
+    mouse("mouseWheel", 0, deltaX=0, deltaY=100)
+    views.append(browser.run(eye))
+    assert len(set(views)) == 6
+    mouse("mousePressed", 0, clickCount=1, buttons=1)
+    mouse("mouseReleased", 0, clickCount=1)
     there = "JSON.stringify([viewer.scene.cameras[1].position, viewer.scene.cameras[1].rotation])"
     browser.wait(f"{eye} === {there}")
+
+
+def test_graphics_that_the_browser_took_back_come_again(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    before = browser.picture(browser.run(f"({SHOW})(0)"))
+    browser.run("window.loss = viewer.renderer.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
+    browser.wait("document.querySelector('.viewer').dataset.state === 'lost'")
+    assert "graphics" in browser.run("document.querySelector('.failure').textContent")
+    browser.run("loss.restoreContext()")
+    browser.wait(READY)
+    assert browser.run("document.querySelector('.failure').textContent") == ""
+    assert np.array_equal(browser.picture(browser.run(f"({SHOW})(0)")), before)
 
 
 def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path) -> None:

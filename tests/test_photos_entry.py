@@ -73,7 +73,7 @@ def asked(truth, monkeypatch):
         (model / "images.txt").write_text("\n".join(lines) + "\n")
         report = {"photos": {name: {"image": name} for name in calls[-1]}, "size": [width, height]}
         write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
-        return report
+        return report | {"folder": str(out)}
 
     monkeypatch.setattr(photos, "pose_photos", true_cameras)
     monkeypatch.setattr(estimate_module, "pose_photos", true_cameras)

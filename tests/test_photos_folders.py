@@ -5,13 +5,16 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import torch
 from photo_folders import exif, planes, with_exif, write_planes
 from start_scenes import texture
 
 from kgs.cli import main
 from kgs.errors import DataError
-from kgs.fit.outputs import write_json
+from kgs.fit import photos
+from kgs.fit.outputs import PNG_MARK, start_folder, write_json, write_png
 from kgs.fit.photos import pose_photos
+from kgs.fit.photos.entry import settle
 from kgs.fit.photos.read import blurred, read_photos
 from kgs.fit.photos.write import end_move
 from kgs.fit.progress import silent
@@ -23,12 +26,12 @@ pytest.importorskip("pycolmap")
 def refused(capsys):
     """Runs `kgs fit` on a folder that is refused; the message. Nothing half-made is left behind."""
 
-    def run(folder, *parts, out=None, code=2):
+    def run(folder, *parts, out=None, code=2, kept=False):
         place = out or folder.parent / "out"
         with pytest.raises(SystemExit) as stop:
             main(["fit", str(folder), "-o", str(place)])
         assert stop.value.code == code
-        assert not [path.name for path in place.glob("*photos*")]
+        assert kept or not [path.name for path in place.glob("*photos*")]
         text = capsys.readouterr().err
         assert "Traceback" not in text
         for part in parts:
@@ -178,6 +181,36 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
             pose_photos(folder, out)
 
 
+@pytest.mark.parametrize("name", ["images", "finished-photos", "unfinished-photos", "finished", "unfinished", "sparse"])
+def test_a_users_own_folders_stay(folder, tmp_path, refused, name):
+    """Also such as hold what kgs does not read: HEIC photos, notes."""
+    mine = tmp_path / "project" / name / "deeper" / "IMG_1.HEIC"
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"mine")
+    refused(write_planes(folder), "choose another folder with -o", out=tmp_path / "project", kept=True)
+    assert mine.read_bytes() == b"mine"
+
+
+def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
+    images = write_planes(tmp_path / "images")
+    refused(images, "choose another folder with -o", out=tmp_path)
+    for path in images.iterdir():  # as renders of kgs are
+        write_png(path, torch.rand(3, 8, 8))
+    with pytest.raises(DataError, match="holds the photos themselves"):
+        pose_photos(images, tmp_path)
+    assert len(list(images.iterdir())) == 3
+
+
+def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
+    out = tmp_path / "project"
+    out.mkdir()
+    for name in ("checkpoint.safetensors", "checkpoint.pt"):
+        (out / name).write_bytes(b"mine")
+        refused(write_planes(folder), f"{name}: was not written by kgs", out=out)
+        assert (out / name).read_bytes() == b"mine"
+        (out / name).unlink()
+
+
 def test_pycolmap_that_is_not_there(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(ModuleNotFoundError, match="pycolmap"):
@@ -187,6 +220,7 @@ def test_pycolmap_that_is_not_there(folder, monkeypatch):
 def test_a_move_that_was_stopped_is_ended(tmp_path):
     """A kill between the renaming of the new folder and the last of its parts."""
     new = tmp_path / "finished-photos"
+    start_folder(new)
     (new / "sparse" / "0").mkdir(parents=True)
     save(tmp_path / "images", planes()[:1], ["old.png"])
     save(new / "images", planes()[:1], ["new.png"])
@@ -194,6 +228,48 @@ def test_a_move_that_was_stopped_is_ended(tmp_path):
     end_move(tmp_path)
     left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
     assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0"]
+
+
+def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch):
+    """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
+    out, found = folder.parent / "out", []
+
+    def find(paths, new, *_):
+        found.append(len(paths))
+        (new / "images").mkdir()
+        (new / "sparse" / "0").mkdir(parents=True)
+        for path in paths:
+            (new / "images" / path.name).write_bytes(PNG_MARK)
+        for name in ("cameras", "images", "points3D"):
+            (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
+        return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}
+
+    def placed():
+        """How many photos the cameras in their place are of."""
+        return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
+
+    monkeypatch.setattr(photos, "find_cameras", find)
+    assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
+    assert placed() == (3, 3)
+    (out / "splat.ply").write_bytes(b"ply")
+    save(folder, planes()[:1, 20:], ["IMG_4.png"])
+    for reused in (False, True):
+        report = pose_photos(folder, out, wait=True)
+        assert (report["reused"], report["folder"]) == (reused, str(out / "finished-photos"))
+        assert len(report["photos"]) == 4
+        assert placed() == (3, 3)
+    settle(out)
+    assert placed() == (4, 4)
+    assert not (out / "finished-photos").exists()
+    (folder / "IMG_4.png").unlink()
+    assert pose_photos(folder, out, wait=True)["folder"] == str(out / "finished-photos")
+    save(folder, planes()[:1, 20:], ["IMG_4.png"])
+    assert pose_photos(folder, out, wait=True)["folder"] == str(out)  # those of the fit after all
+    assert not (out / "finished-photos").exists()
+    assert found == [3, 4, 3]
+    (folder / "IMG_4.png").unlink()
+    assert pose_photos(folder, out)["folder"] == str(out)
+    assert placed() == (3, 3)
 
 
 @pytest.mark.parametrize("stage", ["pose.write_images", "pose.write_matches"])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import kgs
-from kgs.datasets import synthetic_scene
+from kgs.datasets import load, synthetic_scene
 from kgs.errors import DataError
 from kgs.fit.commands import render
 from kgs.fit.page_command import page
@@ -69,10 +69,13 @@ def test_a_second_render_replaces_the_first(splat, llff):
     assert hashes(out) == first
 
 
-def test_a_page_of_any_splat(splat, llff, tmp_path, capsys):
-    out = tmp_path / "page.html"
+def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
+    out, decoded, plain = tmp_path / "page.html", [], load.read_image
+    monkeypatch.setattr(load, "read_image", lambda path: decoded.append(path.name) or plain(path))
     page(splat, cameras=llff, out=out)
     text = out.read_text()
+    assert len(decoded) == 6  # of ten: there may be hundreds
+    assert all(f'alt="photo {name}"' in text for name in decoded)
     assert "10 photos of 40 × 30 pixels" in text
     assert "Whether the splat was fitted to these photos is not known here." in text
     assert f"open {out} in a browser" in capsys.readouterr().out

@@ -46,7 +46,7 @@ def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: 
 
 
 def test_points_lie_on_the_surfaces(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
-    points, colors = dense_points(views, *span, 2000, generator())
+    points, colors, _ = dense_points(views, *span, 2000, generator())
     assert points.shape == colors.shape == (2000, 3)
     assert points.dtype == colors.dtype == torch.float32
     pixels, depths = project_all(points, views.cameras)
@@ -68,7 +68,7 @@ def test_the_draw_follows_the_seed(views: Views, span: tuple[float, float]) -> N
 def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float]) -> None:
     masks = torch.zeros(3, 1, 96, 128)
     masks[..., 20:70, 30:100] = 1.0
-    points, _ = dense_points(replace(views, masks=masks), *span, 2000, generator())
+    points, *_ = dense_points(replace(views, masks=masks), *span, 2000, generator())
     pixels, _ = project_all(points, views.cameras)
     x, y = pixels.round().long().unbind(-1)
     inside = (x >= 30) & (x < 100) & (y >= 20) & (y < 70)
@@ -86,7 +86,7 @@ def test_planes_out_of_range(views: Views) -> None:
 def test_two_views_and_many(count: int) -> None:
     scene = synthetic_scene(train_views=count, test_views=1, size=(42, 56), seed=0)
     depths = synthetic_depths(scene.train.cameras, seed=0)
-    points, _ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
+    points, *_ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
     assert len(points) > 300
     assert points.isfinite().all()
 
@@ -206,10 +206,17 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
     assert planes_wanted(views.select([0]), 2.0, 10.0) == 0.0
 
 
+@pytest.mark.parametrize("draw", ["uniform", "spread"])
+def test_few_points_are_enough_where_many_agree(draw: str) -> None:
+    found = first_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
+    assert found.kind == "dense"
+    assert 450 <= len(found.points) <= 500
+
+
 @pytest.mark.parametrize("count", [50, 400])
 def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
-    spread, _ = dense_points(views, *span, count, generator(), draw="spread")
-    uniform, _ = dense_points(views, *span, count, generator(), draw="uniform")
+    spread, *_ = dense_points(views, *span, count, generator(), draw="spread")
+    uniform, *_ = dense_points(views, *span, count, generator(), draw="uniform")
     assert 0.9 * count <= len(spread) <= count == len(uniform)
 
     def apart(points: torch.Tensor) -> float:
@@ -219,7 +226,7 @@ def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[floa
         return float(distances.amin(1).quantile(0.25))
 
     assert apart(spread) > apart(uniform)
-    again, _ = dense_points(views, *span, count, generator(), draw="spread")
+    again, *_ = dense_points(views, *span, count, generator(), draw="spread")
     assert torch.equal(spread, again)
 
 

@@ -172,6 +172,19 @@ def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
     assert not torch.equal(first, other)
 
 
+def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
+    drops = []
+
+    def decide(scene, config, choose):
+        drops.append(config.drop)
+        return replace(config, sh_degree=2), {}
+
+    monkeypatch.setattr(cells_module, "decide", decide)
+    found = [sparse_cell(tiny_cell(method, start="random"))["config"] for method in ("auto", "auto, off")]
+    assert drops == [0.2, 0.2]
+    assert [(config["drop"], config["sh_degree"]) for config in found] == [(0.2, 2), (0.0, 2)]
+
+
 def test_a_scene_on_the_disk_and_its_own_points(folder):
     cell = tiny_cell(start="scene") | {"scene": folder.name, "views": 4, "downscale": 2.0}
     result = sparse_cell(cell, data=str(folder.parent))

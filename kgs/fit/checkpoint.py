@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial, reduce
 from operator import getitem
 from pathlib import Path
@@ -50,10 +51,11 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
         if path.exists():
             os.replace(path, previous(path))
         os.replace(temporary, path)
-        if os.name == "posix":  # the new names survive a power cut
+        if os.name == "posix":  # the new names survive a power cut, where the file system can promise that
             descriptor = os.open(path.parent, os.O_RDONLY)
             try:
-                os.fsync(descriptor)
+                with suppress(OSError):
+                    os.fsync(descriptor)
             finally:
                 os.close(descriptor)
     except OSError as error:

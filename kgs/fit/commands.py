@@ -108,40 +108,49 @@ def fit(
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
-    from .folder import RESULTS
+    from kgs.datasets.layouts import CAMERAS_REPORT
+
+    from .folder import UNFINISHED, is_finished, taken
+    from .metrics import in_words
     from .minutes import expected_minutes
-    from .outputs import check_folder
-    from .photos.entry import add_estimate, find_scene, is_bare
+    from .outputs import check_folder, is_own
+    from .photos.entry import add_estimate, find_scene, is_bare, settle
     from .run import fit_scene
-    from .slim import in_words
+    from .slim import left_out
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
     lpips = _prepare(config.device, config.backend, "matplotlib", "safetensors", "jinja2", lpips=lpips_weights)
-    check_folder(out, RESULTS, scene, make=False)
+    check_folder(out, taken(out), scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["hold_out"] = hold_out
     request["points"] = config.init if config.init == "model-points" else "none"
+    place = out
     if bare := is_bare(scene):
-        request = find_scene(scene, out, request, config, estimated=estimate)
+        request, place = find_scene(scene, out, request, config, estimated=estimate)
     elif estimate:
         raise ValueError("estimate: expected a folder of bare photos, got a scene with cameras: see --hold-out")
-    loaded = _load(request, out)
+    elif is_own(out / CAMERAS_REPORT):
+        raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder with -o")
+    loaded = _load(request, place)
     height, width = loaded.train.images.shape[-2:]
     say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     minutes = expected_minutes(width * height, config)
     if minutes > 2 and config.device == "cpu" and config.minutes is None:
         say(f"expect about {minutes:.0f} minutes on a CPU; see --fast, --minutes, --downscale")
     metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
+    kept = bool(stopped_by) and is_finished(out)  # the former fit
+    if bare and not kept:
+        settle(out)
     if bare and estimate and not stopped_by:
-        metrics = add_estimate(scene, out, loaded, config)
-    _print_metrics(metrics)
+        metrics = add_estimate(scene, out, loaded, config, background)
+    say(in_words(metrics))
     posed = out if bare else scene
-    splat, renders, by = out / "splat.ply", out / "renders", request["downscale"]
+    splat, renders, by = (out / UNFINISHED if kept else out) / "splat.ply", out / "renders", request["downscale"]
     shrunk = ("--downscale", f"{by:g}") if by else ()
     say(f"{splat}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
-    if left_out := in_words(metrics["needs"]):
-        say(f"left out: {left_out}")
+    if what := left_out(metrics["needs"]):
+        say(f"left out: {what}")
     if stopped_by:
         _next("the same command with --resume goes on where it stopped")
         return 128 + stopped_by
@@ -229,7 +238,7 @@ def evaluate(
     from kgs.json_files import read_json
 
     from .folder import load_fit
-    from .metrics import measure_again
+    from .metrics import in_words, measure_again
     from .outputs import write_json
     from .page import PAGE, refresh_page
 
@@ -240,10 +249,9 @@ def evaluate(
     metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
     write_json(path, metrics)
     refresh_page(out, saved, scene, metrics)
-    _print_metrics(metrics)
+    say(in_words(metrics))
     say(f"{path} and {out / PAGE} are up to date")
-    without = _line("kgs", "fit", out / saved.request["scene"], "-o", "OUT", "--drop", "0")
-    _next(f"{without}  # to compare: without DropGaussian")
+    _next(f"open {_line(out / PAGE)} in a browser")
 
 
 def _prepare(device: str, backend: str, *packages: str, lpips: Path | None = None) -> Any:
@@ -271,24 +279,6 @@ def _load(request: dict[str, Any], out: Path) -> Any:
     for note in scene.notes:
         say(note)
     return scene
-
-
-def _print_metrics(metrics: dict[str, Any]) -> None:
-    names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
-    for part in ("test", "train"):
-        values = metrics[part] or {}
-        shown = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
-        if shown:
-            say(f"{part:>5}: " + ", ".join(shown))
-    seen = metrics.get("seen") or {}
-    if seen.get("psnr") is not None and seen.get("psnr_rest") is not None:
-        share, level, rest = (seen[name] for name in ("share", "psnr", "psnr_rest"))
-        say(f" test: {100 * share:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
-    if (found := metrics.get("estimate")) and found["psnr"] is not None:
-        spread = "" if found["sd"] is None else f"sd {found['sd']:.2g}, "
-        say(f"estimate: PSNR {found['psnr']:.4g} ({spread}n {found['n']}) of photos that were left out, with --fast")
-    elif not metrics["test"]:
-        say("no photo was held out: how good other views are was not measured (--hold-out N, --estimate)")
 
 
 def _line(*words: object) -> str:

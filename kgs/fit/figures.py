@@ -33,10 +33,12 @@ def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
         seconds = [point["seconds"] for point in curve]
         for part, style in (("test", "-o"), ("train", ":")):
             values = np.array([point[f"{part}_psnr"] for point in curve], float)  # None is NaN, a gap
-            axes.plot(seconds, values, style, color=f"C{k}", markersize=3, label=f"{name} {part}".strip())
+            if np.isfinite(values).any():
+                axes.plot(seconds, values, style, color=f"C{k}", markersize=3, label=f"{name} {part}".strip())
     axes.set(xlabel="seconds of training", ylabel="PSNR [dB]")
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    if axes.lines:
+        axes.legend(frameon=False)
     _write(path, figure)
 
 

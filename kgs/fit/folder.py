@@ -25,7 +25,7 @@ from kgs.renderer import GaussianRenderer
 
 from .checkpoint import is_number, newest_checkpoint, previous
 from .config import FitConfig
-from .outputs import EXPORTS, remove_others, write_json
+from .outputs import EXPORTS, is_own, remove_others, write_json
 from .poses import place_cameras
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -57,6 +57,12 @@ def locked(out: Path) -> Iterator[None]:
         yield
 
 
+def taken(out: Path) -> list[str]:
+    """What a fit replaces or removes in its folder; checkpoints, which may be damaged, only where there is no fit."""
+    names = [*RESULTS, UNFINISHED, _FINISHED]
+    return names if is_own(out / "config.json") else [*names, CHECKPOINT, *_OPTIONAL]
+
+
 def publish(out: Path) -> None:
     """Put the results in `unfinished` in the place of a former fit's; what fails to move, the next `end_move` moves."""
     new = out / UNFINISHED
@@ -69,7 +75,7 @@ def publish(out: Path) -> None:
 def end_move(out: Path) -> None:
     """Within `locked`: what is left of a move goes to its place, what belonged to the former result goes away."""
     done = out / _FINISHED
-    if not (done / _LIST).exists():
+    if not (is_own(done) and (done / _LIST).exists()):
         return
     names = [str(name) for name in read_json(done / _LIST).get("files", [])]  # of the moved ones as well
     (out / "test").mkdir(exist_ok=True)

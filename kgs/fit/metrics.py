@@ -25,6 +25,7 @@ from kgs.errors import DataError
 from .lpips import Lpips
 
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
+BEST = 200.0  # decibels that stand for an infinite PSNR where numbers are compared
 _WINDOW = 11
 
 
@@ -45,12 +46,12 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
     rows = list[dict[str, Any]]()
     for index, name in enumerate(views.names):
-        image, target = views.shaded(render(views.camera(index))), views.images[index : index + 1]
+        image, target = render(views.camera(index)), views.images[index : index + 1]
         if image.shape != target.shape:
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
-        rows.append(_measure(image.clamp(0.0, 1.0), target.to(image), lpips))
+        rows.append(_measure(views.shaded(image.clamp(0.0, 1.0)), target.to(image), lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
     means = {key: fmean(values) if values and None not in values else None for key, values in columns.items()}
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
@@ -95,3 +96,27 @@ def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, fl
         *(None if lpips is None else lpips(image, target, rescale).item() for rescale in (True, False)),
     )
     return dict(zip(MEASURES, values, strict=True))
+
+
+def in_words(metrics: dict[str, Any]) -> str:
+    """What metrics.json says of a fit, in lines."""
+    lines = list[str]()
+    names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
+    for part in ("test", "train"):
+        values = metrics[part] or {}
+        shown = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
+        lines += [f"{part:>5}: " + ", ".join(shown)] if shown else []
+    seen = metrics.get("seen") or {}
+    if seen.get("psnr") is not None and seen.get("psnr_rest") is not None:
+        share, level, rest = (seen[name] for name in ("share", "psnr", "psnr_rest"))
+        lines.append(f" test: {100 * share:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
+    if (found := metrics.get("estimate")) and found["psnr"] is not None:
+        spread = "" if found["sd"] is None else f"sd {found['sd']:.2g}, "
+        count = f"{found['n']} of {len(found['photos'])} photos"
+        lines.append(f"estimate: PSNR {found['psnr']:.4g} ({spread}{count}, each left out once, with --fast)")
+    elif found:
+        lines.append("estimate: none of the photos that were left out could be judged")
+        lines += [f"  {photo['name']}: {photo['why']}" for photo in found["photos"]]
+    elif not metrics["test"]:
+        lines.append("no photo was held out: how good other views are was not measured (--hold-out N, --estimate)")
+    return "\n".join(lines)

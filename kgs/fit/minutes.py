@@ -15,6 +15,7 @@ from .starts import FirstPoints
 from .trainer import Trainer
 
 _SHARE, _FEWEST = 0.04, 20  # of the steps in the miniature, and how many at least
+_MOST = 10_000_000  # steps of a fit
 _FIRST = 3  # steps that are not timed: kernels are compiled or loaded, memory is fetched
 _STEP, _PIXEL = 0.025, 1.5e-7  # seconds of a step with 20 000 to 30 000 Gaussians, on two cores of an AMD EPYC
 _TORCH = 4.0  # times as long as the compiled backend
@@ -48,7 +49,8 @@ def steps_within(scene: Scene, config: FitConfig, points: FirstPoints, begun: fl
     trial.fit(lambda trainer, _: trainer.step == _FIRST)
     seconds = trial.seconds
     trial.fit(lambda trainer, _: trainer.step == 2 * _FIRST - 1)  # the last step measures the curve
-    guess = round(max(_FEWEST, (end - time.perf_counter()) / (trial.seconds - seconds) * (_FIRST - 1)))
+    guess = round((end - time.perf_counter()) / (trial.seconds - seconds) * (_FIRST - 1))
+    guess = min(_MOST, max(_FEWEST, guess))
     count, start, found = max(_FEWEST, round(_SHARE * guess)), time.perf_counter(), list[tuple[float, int]]()
     small = Trainer(scene, replace(config, steps=count, max_gaussians=most(guess)), points)
     small.times = _scaled(timetable(replace(config, steps=guess)), count / guess)
@@ -68,7 +70,7 @@ def steps_within(scene: Scene, config: FitConfig, points: FirstPoints, begun: fl
         return float(steps * (times * saved).mean())
 
     left = end - now - (now - start - small.seconds)  # the curve takes as long again
-    return max(1, bisect_right(range(10_000_001), left, key=seconds_of) - 1)
+    return max(1, bisect_right(range(_MOST + 1), left, key=seconds_of) - 1)
 
 
 def _scaled(times: Timetable, share: float) -> Timetable:

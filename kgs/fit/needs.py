@@ -19,6 +19,7 @@ from kgs.datasets.scene import Scene
 from kgs.datasets.splits import select_evenly
 
 from .config import CHOICES, FitConfig, Recipe
+from .metrics import BEST
 from .progress import Stage, silent
 from .starts import FirstPoints
 from .trainer import Trainer
@@ -74,7 +75,7 @@ def decide(
             levels.append([])
         trainer = Trainer(small, probe, points)
         trainer.fit()
-        levels[-1].append(trainer.psnr(small.test) or math.inf)
+        levels[-1].append(trainer.psnr(small.test) or BEST)
     for place, name in enumerate(still_open, 1):
         gains = [row[place] - row[0] for row in levels]
         gain, noise = fmean(gains), stdev(gains) / math.sqrt(len(gains))

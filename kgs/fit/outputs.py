@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import unicodedata
 import zlib
 from collections import Counter
@@ -22,10 +23,13 @@ from kgs.export.film import MARK as FILM_MARK
 from kgs.json_files import write_whole
 
 PNG_MARK = b"Software\0kgs"
+FOLDER_MARK = ".kgs"  # an empty file in a folder that kgs made for a while
 EXPORTS = ("cameras.json", "splat.glb", "turntable.webm")  # for other programs
 _MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
 _MARKS |= {".html": (b'<meta name="generator" content="kgs ',)}
 _MARKS |= {".glb": (b'"generator":"kgs ',), ".webm": (FILM_MARK,)}
+_MARKS |= {suffix: (b"kgs-checkpoint ",) for suffix in (".safetensors", ".pt")}
+_DEEP = (".json", ".webm", ".safetensors")  # the mark may stand far behind
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
 _LONGEST = 120  # bytes of a picture's name
@@ -56,12 +60,21 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
 
 
 def is_own(path: Path) -> bool:
-    """Whether kgs wrote this PNG, PLY, JSON, HTML, glTF or WebM file."""
+    """Whether kgs wrote this file (PNG, PLY, JSON, HTML, glTF, WebM, checkpoint), or made this folder."""
+    if path.is_dir():
+        return (path / FOLDER_MARK).is_file() or not any(path.iterdir())
     if not path.is_file():
         return False
     with open(path, "rb") as file:
-        content = file.read(2**26 if path.suffix in (".json", ".webm") else 2**12)
+        content = file.read(2**26 if path.suffix in _DEEP else 2**12)
     return any(mark in content for mark in _MARKS.get(path.suffix, ()))
+
+
+def start_folder(path: Path) -> None:
+    """An empty folder by which `is_own` knows kgs again, in the place of a former one of kgs's own."""
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir()
+    (path / FOLDER_MARK).touch()
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -70,11 +83,11 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def png_names(views: Iterable[str]) -> dict[str, str]:
-    """A file name of its own for a render of each view: folders become part of it, and the ending becomes .png.
+    """A file name of its own, in UTF-8, for a render of each view: folders become part of it, the ending becomes .png.
 
     Where two views would have the same (capitals do not count), or one is too long, a hash of the view's name is added.
     """
-    plain = {view: re.sub(r"[\\/\x00-\x1f]", "_", re.sub(_ENDING, "", view)) for view in views}
+    plain = {view: re.sub(r"[\\/\x00-\x1f\ud800-\udfff]", "_", re.sub(_ENDING, "", view)) for view in views}
     folded = {view: unicodedata.normalize("NFC", stem).casefold() for view, stem in plain.items()}
     counts = Counter(folded.values())
     names = {}

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.camera import camera_centers
+from kgs.camera import camera_centers, move_camera
 from kgs.datasets.scene import Views
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
@@ -30,10 +30,12 @@ def coadaptation(
         raise ValueError(f"subsets: expected at least 2, got {subsets}")
     renderer, generator = GaussianRenderer(near_plane=near_plane), torch.Generator().manual_seed(seed)
     gaussians, total, pixels = model(), 0.0, 0
+    device = gaussians.opacities.device
     for view in range(len(views)):
         kept = [torch.rand(gaussians.opacities.shape, generator=generator) < 0.5 for _ in range(subsets)]
-        halves = (replace(gaussians, opacities=gaussians.opacities * keep) for keep in kept)
-        renders = [renderer(half, views.camera(view), outputs=("image", "alpha")) for half in halves]
+        halves = (replace(gaussians, opacities=gaussians.opacities * keep.to(device)) for keep in kept)
+        camera = move_camera(views.camera(view), device)
+        renders = [renderer(half, camera, outputs=("image", "alpha")) for half in halves]
         covered = torch.stack([out.alpha[0, 0] > 0.8 for out in renders]).all(0)
         images = torch.stack([out.image[0].clamp(0, 1).double() for out in renders])
         total += float(images.var(0).mean(0)[covered].sum())

@@ -20,7 +20,7 @@ from kgs.page import Picture, write_page
 from .folder import SavedFit
 from .outputs import is_own
 from .progress import each, say
-from .slim import contributions, in_words
+from .slim import contributions, left_out
 
 PAGE = "index.html"
 MOST_PICTURES = 6
@@ -37,11 +37,12 @@ def write_fit_page(
     renders: Mapping[str, Render],
     runs: Mapping[str, Mapping[str, Any]],
     *,
+    shown: Views | None = None,
     words: tuple[str, str] = ("training", "test"),
     notes: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
     report: Path | None = None,
-) -> None:
+) -> str:
     """Write the page of one or more fits of a scene; the viewer shows one of them.
 
     Args:
@@ -52,24 +53,31 @@ def write_fit_page(
         near_plane: of its renderer.
         renders: from a camera to `(1, 3, H, W)`, by the name of the run.
         runs: what metrics.json holds, by the name of the run.
+        shown: some of the test views, or without those of the training views; None: `MOST_PICTURES` of them. Only
+            these need pixels.
         words: what training and test views are called.
         notes: sentences for the reader.
         settings: config.json.
         report: a JSON file about how the cameras were found; left aside where it is not there.
+
+    Returns:
+        What the page's limit of size cost, in words; "" for nothing.
     """
     views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
+    shown = shown or views.select(spread(len(views), MOST_PICTURES))
     known = {run: _levels(metrics) for run, metrics in runs.items()}
-    chosen, pictures = spread(len(views), MOST_PICTURES), list[Picture]()
-    for i in each(chosen, "page", "view"):
-        name, seen = views.names[i], {run: views.shaded(draw(views.camera(i))[0]) for run, draw in renders.items()}
+    pictures = list[Picture]()
+    for i in each(range(len(shown)), "page", "view"):
+        name, seen = shown.names[i], {run: draw(shown.camera(i))[0].clamp(0, 1) for run, draw in renders.items()}
         level = [f"{run} {known[run][name]:.2f} dB".strip() for run in renders if name in known.get(run, {})]
-        pictures.append(Picture(name, views.images[i], seen, ": ".join([name, *([", ".join(level)] if level else [])])))
+        seen = {run: shown.shaded(render) for run, render in seen.items()}
+        pictures.append(Picture(name, shown.images[i], seen, ": ".join([name, *([", ".join(level)] if level else [])])))
     found: dict[str, Any] = {}
     with suppress(DataError):
         found = read_json(report) if report is not None and report.is_file() else {}
     with torch.no_grad():
         gaussians = model()
-    write_page(
+    return write_page(
         path,
         title,
         gaussians,
@@ -79,9 +87,9 @@ def write_fit_page(
         near_plane=near_plane,
         background=scene.background,
         pictures=pictures,
-        pictures_note=_note(len(chosen), len(views), word),
+        pictures_note=_note(len(shown), len(views), word),
         runs=runs,
-        left_out=in_words(next(iter(runs.values()), {}).get("needs") or {}),
+        left_out=left_out(next(iter(runs.values()), {}).get("needs") or {}),
         notes=[*notes, *(line for run, metrics in runs.items() for line in (*_seen(metrics, run), *_moved(metrics)))],
         settings=_settings(settings or {}),
         report=_report(found),
@@ -102,7 +110,7 @@ def write_own_page(
     """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
     request = settings["request"]
     title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
-    one: dict[str, Any] = {"settings": settings, "report": out / CAMERAS_REPORT}
+    one: dict[str, Any] = {"settings": settings, "report": scene.root / CAMERAS_REPORT}
     write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **one)
 
 
@@ -134,8 +142,8 @@ def _report(found: Mapping[str, Any]) -> dict[str, Any]:
         points = [photo["points"] for photo in photos.values()]
         report["points in a photo"] = f"{min(points)} to {max(points)}"
         report["blurred"] = [name for name, photo in photos.items() if photo["blurred"]]
-    with suppress(AttributeError, TypeError):
-        report["time"] = f"{sum(report.pop('seconds', {}).values()):.0f} s"
+    with suppress(AttributeError, KeyError, TypeError):
+        report["time"] = f"{sum(report.pop('seconds').values()):.0f} s"
     with suppress(IndexError, TypeError, ValueError):
         counts = [row[2] for row in matches]
         report["matches of a pair"] = f"{min(counts)} to {max(counts)}"

@@ -1,7 +1,8 @@
 """What `kgs page` does: a page for a 3DGS file of any origin."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from .config import Backend, Recipe
 from .progress import say
@@ -57,7 +58,8 @@ def page(
         raise DataError(out, "", "was not written by kgs and would be overwritten: choose another file with -o")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
-    scene = load_scene(cameras, None, downscale, hold_out=0, background=background)
+    options: dict[str, Any] = {"hold_out": 0, "background": background}
+    scene = load_scene(cameras, None, downscale, **options, photos=False)  # there may be hundreds
     for note in scene.notes:
         say(note)
     model = load_ply(ply, origin=scene.offset).to(place)
@@ -70,11 +72,16 @@ def page(
             image: torch.Tensor = renderer(model(), move_camera(camera, place), behind).image
         return image
 
-    shown = scene.train.select(spread(len(scene.train), MOST_PICTURES))
+    few = spread(len(scene.train), MOST_PICTURES)
+    photos = load_scene(cameras, len(few), downscale, **options).train  # the same ones; moved by another offset
+    shown = replace(photos, cameras=scene.train.camera(few))
     runs = {"": {"views": evaluate(render, shown), "versions": versions()}}
     notes = ["Whether the splat was fitted to these photos is not known here."]
     title = f"{ply.stem}, {Path(cameras).resolve().name}"
-    write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, words=("photo", "test"), notes=notes)
+    words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes}
+    cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
     level = runs[""]["views"]["psnr"]
     say(f"{out}: {len(model)} Gaussians, {len(scene.train)} photos" + (f", PSNR {level:.4g}" if level else ""))
+    if cost:
+        say(f"to keep the page small it shows {cost}; {ply} has everything")
     say(f"next:\n  open {out} in a browser")

@@ -19,13 +19,13 @@ from .checkpoint import previous
 from .config import FitConfig
 from .exports import write_exports
 from .figures import write_curve
-from .folder import CHECKPOINT, RESULTS, UNFINISHED, end_move, is_finished, locked, publish
+from .folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
 from .lpips import Lpips
 from .machine import bytes_of, check_device, peak_rss_mb, versions
 from .metrics import evaluate
 from .minutes import steps_within
 from .needs import decide
-from .outputs import check_folder, is_own, png_names, write_json, write_png
+from .outputs import check_folder, is_own, png_names, start_folder, write_json, write_png
 from .page import PAGE, write_own_page
 from .progress import Stage, each, progress, say, silent
 from .seen import measure_seen
@@ -91,7 +91,7 @@ def fit_scene(
             raise DataError(scene.root, "images", reason)
     names = png_names([*scene.train.names, *scene.test.names])
     try:
-        check_folder(out, [*RESULTS, *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
+        check_folder(out, [*taken(out), *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
     except OSError as error:
         raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
     with locked(out):
@@ -118,8 +118,7 @@ def fit_scene(
         told, saved = len(trainer.notes), trainer.saved
         try:
             if source != new:
-                shutil.rmtree(new, ignore_errors=True)
-                new.mkdir()
+                start_folder(new)
                 trainer.save(new / CHECKPOINT)  # first points may have taken a minute
                 trainer.saved = saved
             settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
@@ -131,7 +130,8 @@ def fit_scene(
             write_exports(trainer, new)
             (new / "test").mkdir(exist_ok=True)
             for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
-                write_png(new / "test" / names[name], scene.test.shaded(trainer.render(scene.test.camera(i))[0]))
+                render = trainer.render(scene.test.camera(i))[0].clamp(0, 1)
+                write_png(new / "test" / names[name], scene.test.shaded(render))
             metrics = measure(trainer, lpips)
             write_json(new / "metrics.json", metrics)
             fitted = trainer.shown, trainer.near_plane, trainer.render
@@ -174,6 +174,8 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     scene, config = trainer.scene, trainer.config
     start = _STARTS.get(config.init, "first points from training views alone")
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
+    if trainer.poses is not None:
+        poses += ", those of the training views refined by the fit"
     return {
         "test": evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None,
         "train": evaluate(trainer.render, scene.train, lpips),

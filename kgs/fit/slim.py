@@ -11,19 +11,20 @@ from kgs.datasets.scene import Views
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
+from .metrics import BEST
 from .trainer import Trainer
 
 TOLERANCE = 0.01  # decibels by which the PSNR of a training view may change
 WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)  # pixels that a Gaussian covers in all training views; -1: all
 QUANTUM = 0.5 / 255  # what an 8-bit picture does not show
-_BEST = 200.0  # decibels that stand for an infinite PSNR
 
 
 def slim(trainer: Trainer) -> None:
     """Show only what the training views need; the fit itself keeps everything. Nothing is done with `keep_all`.
 
     Of the limits in `WEIGHTS` the highest is taken that changes the PSNR of no training view by more than `TOLERANCE`,
-    and of the degrees of harmonics the lowest that changes no value of their pictures by more than `QUANTUM`.
+    and of the degrees of harmonics the lowest of which that holds too, and that changes no value of the pictures by
+    more than `QUANTUM`.
 
     `trainer.needs` gets "gaussians": how many were "fitted" and are "kept", the limit "weight", and "sh_degree".
     """
@@ -37,21 +38,26 @@ def slim(trainer: Trainer) -> None:
     for limit in WEIGHTS:
         rows = weights > limit
         trainer.show(rows, model.sh_degree)
-        if all(abs(now - whole) <= TOLERANCE for now, whole in zip(_levels(trainer), levels, strict=True)):
+        if _is_close(_levels(trainer), levels):
             break
     degree, pictures = 0, [trainer.render(views.camera(i)) for i in range(len(views))] if model.sh_degree else []
     for degree in range(model.sh_degree + 1):
         trainer.show(rows, degree)
         renders = (trainer.render(views.camera(i)) for i in range(len(pictures)))
-        if all(bool(((now - whole).abs() <= QUANTUM).all()) for now, whole in zip(renders, pictures, strict=True)):
+        same = all(bool(((now - whole).abs() <= QUANTUM).all()) for now, whole in zip(renders, pictures, strict=True))
+        if same and _is_close(_levels(trainer), levels):
             break
     found = {"fitted": len(model), "kept": len(trainer.shown), "weight": limit, "sh_degree": degree}
     trainer.needs["gaussians"] = found
 
 
+def _is_close(levels: list[float], others: list[float]) -> bool:
+    return all(abs(level - other) <= TOLERANCE for level, other in zip(levels, others, strict=True))
+
+
 def _levels(trainer: Trainer) -> list[float]:
     views = trainer.scene.train
-    return [min(trainer.psnr(views.select([i])) or _BEST, _BEST) for i in range(len(views))]
+    return [min(trainer.psnr(views.select([i])) or BEST, BEST) for i in range(len(views))]
 
 
 def contributions(model: GaussianModel, views: Views, near_plane: float, **rules: Any) -> Tensor:
@@ -69,7 +75,7 @@ def contributions(model: GaussianModel, views: Views, near_plane: float, **rules
     return torch.zeros_like(colors[:, 0]) if colors.grad is None else colors.grad[:, 0]
 
 
-def in_words(needs: dict[str, Any]) -> str:
+def left_out(needs: dict[str, Any]) -> str:
     """What a fit left out, for its last line; "" where that is nothing."""
     parts, harmonics, gaussians = [], needs.get("sh_degree"), needs.get("gaussians")
     if harmonics and harmonics["chosen"] == 0:
@@ -79,5 +85,5 @@ def in_words(needs: dict[str, Any]) -> str:
         parts.append(f"harmonics ({why})")
     if gaussians and gaussians["kept"] < gaussians["fitted"]:
         share = 1 - gaussians["kept"] / gaussians["fitted"]
-        parts.append(f"{100 * share:.0f} % of the Gaussians (no contribution to a training view)")
+        parts.append(f"{100 * share:.0f} % of the Gaussians (next to no contribution to a training view)")
     return ", ".join(parts)

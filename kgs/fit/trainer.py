@@ -110,7 +110,7 @@ class Trainer:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
 
         Raises:
-            TrainingDiverged: something is not finite, or a scale explodes; no parameter has been changed by that step.
+            TrainingDiverged: something is not finite, and that step has changed no parameter; or a scale explodes.
         """
         while self.step < self.config.steps:
             loss = self.train_step()

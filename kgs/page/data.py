@@ -21,6 +21,8 @@ from kgs.harmonics import SH_C0
 from kgs.projection import finite_gaussians
 from kgs.types import SH_SIZES, Gaussians, RasterOptions
 
+from .cameras import Array, in_picture, lenses
+
 PIXEL_ERROR = 0.01  # by which fixed point may move a centre in a picture of the given cameras, in pixels
 FINE, COARSE = 16, 8  # bits of a number
 _MOST_BITS = 32  # of a position
@@ -29,8 +31,6 @@ _CELL_BITS = 16  # of a coordinate in the order of neighbours
 _GZIP_HEADER = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # no name, no time, no system
 _LAST_BLOCK = b"\x03\0"  # empty
 _FIT = 0.97  # of the room is aimed at when Gaussians have to go
-
-Array = NDArray[np.float64]
 
 
 class Packed(NamedTuple):
@@ -168,22 +168,12 @@ def _fixed(name: str, values: Array, bits: int) -> Column:
 def _pixels_per_unit(means: Array, cameras: PinholeCamera, near_plane: float) -> float:
     """By how many pixels at most a centre moves in a picture that shows it when it is moved by a world unit."""
     most = 0.0
-    for k, pose, height, width in zip(
-        *_matrices(cameras), cameras.height.tolist(), cameras.width.tolist(), strict=True
-    ):
-        points = means @ pose[:3, :3].T + pose[:3, 3]
-        points = points[points[:, 2] > near_plane]
-        tangents, focal, centre = points[:, :2] / points[:, 2:], np.diag(k)[:2], k[:2, 2]
-        pixels = tangents * focal + centre
-        inside = ((pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5)).all(axis=1)
-        slopes = np.abs(focal).max() / points[:, 2] * np.sqrt(1 + (tangents**2).sum(axis=1))
-        most = max(most, float(slopes[inside].max(initial=0.0)))
+    for k, pose, size in lenses(cameras):
+        points = in_picture(means, k, pose, size, near_plane)
+        tangents = points[:, :2] / points[:, 2:]
+        slopes = np.abs(k.diagonal()[:2]).max() / points[:, 2] * np.sqrt(1 + (tangents**2).sum(axis=1))
+        most = max(most, float(slopes.max(initial=0.0)))
     return most
-
-
-def _matrices(cameras: PinholeCamera) -> tuple[Array, Array]:
-    k, pose = (x.detach().cpu().double().numpy() for x in (cameras.intrinsics, cameras.extrinsics))
-    return k, pose
 
 
 def _worth(values: dict[str, Array]) -> Array:

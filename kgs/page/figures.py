@@ -23,9 +23,10 @@ Runs = Mapping[str, Mapping[str, Any]]
 
 
 def shareable(value: Any) -> str:
-    """A value as text, in which an absolute path is its last name."""
+    """A value as text, in which a path that leaves the folder is its last name."""
     text = str(value)
-    if PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute():
+    outside = text.startswith(("~", "../", "..\\"))
+    if outside or PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute():
         return PureWindowsPath(text).name
     return _PATH.sub("", text)
 

@@ -134,10 +134,10 @@ class SplatRenderer {
     return buffer;
   }
 
-  // Makes the canvas so many pixels large; returns whether that changed it.
+  // Makes the canvas so many pixels large.
   resize(width, height) {
     const { canvas, gl } = this;
-    if (canvas.width === width && canvas.height === height && this.sized) return false;
+    if (canvas.width === width && canvas.height === height && this.sized) return;
     [canvas.width, canvas.height, this.sized] = [width, height, true];
     gl.activeTexture(gl.TEXTURE2);
     gl.texImage2D(gl.TEXTURE_2D, 0, this.fine ? gl.RGBA16F : gl.RGBA8, width, height, 0,
@@ -145,7 +145,6 @@ class SplatRenderer {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
-    return true;
   }
 
   // `eye` has rotation (rows), position, focal and centre in pixels of the canvas, and scale: its pixels per photo's.

@@ -8,6 +8,8 @@ const add = (a, b, times = 1) => a.map((value, i) => value + times * b[i]);
 const unit = (a) => a.map((value) => value / Math.hypot(...a));
 const mix = (a, b, share) => a.map((value, i) => value + share * (b[i] - value));
 
+const CLICK = 4;  // pixels of the page that a pointer may move without dragging
+
 // A vector turned about a unit axis, by radians.
 function turned(vector, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle), along = dot(axis, vector) * (1 - c), side = cross(axis, vector);
@@ -20,7 +22,7 @@ class Viewer {
     this.canvas = frame.querySelector("canvas");
     this.overlay = frame.querySelector("svg");
     this.choice = frame.querySelector("select");  // of a camera, for the keyboard too
-    Object.assign(this, { renderer, scene, waiting: false, flight: 0 });
+    Object.assign(this, { renderer, scene, waiting: false, flight: 0, dragged: 0 });
     this.pyramids = scene.cameras.map((camera, index) => this.pyramid(camera, index));
     this.place(0);
     this.listen(frame);
@@ -125,7 +127,7 @@ class Viewer {
     shape.innerHTML = "<title></title>";  // what a pointer that rests on it shows
     shape.firstChild.textContent = `${camera.part} ${camera.name}`;
     shape.setAttribute("class", camera.part === "test" ? "held-out" : "");
-    shape.addEventListener("click", () => this.flyTo(index));
+    shape.addEventListener("click", () => { if (this.dragged <= CLICK) this.flyTo(index); });
     this.overlay.append(shape);
     return shape;
   }
@@ -155,33 +157,38 @@ class Viewer {
   // -- what the user does
 
   listen(frame) {
-    const { canvas } = this, pointers = new Map();
+    // Pyramids lie over the canvas; what is done to either reaches the stage.
+    const { canvas } = this, stage = frame.querySelector(".stage"), pointers = new Map();
     const spread = () => {
       const [a, b = a] = [...pointers.values()];
       return { middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) };
     };
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
+    stage.addEventListener("pointerdown", (event) => {
+      if (!pointers.size) this.dragged = 0;
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
     });
-    canvas.addEventListener("pointermove", (event) => {
+    stage.addEventListener("pointermove", (event) => {
+      if (!event.buttons) pointers.delete(event.pointerId);  // let go of outside
       if (!pointers.has(event.pointerId)) return;
       const before = spread();
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
       const after = spread(), [x, y] = add(after.middle, before.middle, -1);
+      this.dragged += Math.hypot(x, y);
+      if (this.dragged > CLICK) stage.setPointerCapture(event.pointerId);  // before that a click belongs to a pyramid
       if (pointers.size > 1 || event.shiftKey || event.buttons > 1) this.move(x, y);
       else this.turn(0.005 * x, 0.005 * y);
       if (pointers.size > 1 && after.apart > 0) this.zoom(before.apart / after.apart);
     });
     for (const end of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(end, (event) => pointers.delete(event.pointerId));
+      stage.addEventListener(end, (event) => pointers.delete(event.pointerId));
     }
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
+    stage.addEventListener("contextmenu", (event) => event.preventDefault());
+    stage.addEventListener("wheel", (event) => {
       event.preventDefault();
       this.zoom(Math.exp(Math.max(-0.3, Math.min(0.3, 0.0015 * event.deltaY))));
     }, { passive: false });
     canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;  // the browser's own
       const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
       const nearer = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 }[event.key];
       if (arrow && event.shiftKey) this.move(-20 * arrow[0], -20 * arrow[1]);
@@ -198,7 +205,9 @@ class Viewer {
       const hidden = this.overlay.toggleAttribute("hidden");
       pyramids.setAttribute("aria-pressed", String(!hidden));
     });
-    frame.querySelector(".full").addEventListener("click", () => {
+    const full = frame.querySelector(".full");
+    full.hidden = !document.fullscreenEnabled;
+    full.addEventListener("click", () => {
       if (document.fullscreenElement) document.exitFullscreen();
       else frame.requestFullscreen();
     });
@@ -206,20 +215,40 @@ class Viewer {
 }
 
 async function openViewer() {
-  const frame = document.querySelector(".viewer"), text = (id) => document.getElementById(id).textContent;
+  const frame = document.querySelector(".viewer"), canvas = frame.querySelector("canvas");
+  const text = (id) => document.getElementById(id).textContent;
   const { layout, content, scene, settings } = JSON.parse(text("splat"));
   const shaders = {
     splatVertex: text("splat-vertex"), splatFragment: text("splat-fragment"),
     screenVertex: text("screen-vertex"), screenFragment: text("screen-fragment"),
   };
-  try {
-    const splat = await decodeSplat(layout, content);
-    window.viewer = new Viewer(frame, new SplatRenderer(frame.querySelector("canvas"), splat, shaders, settings), scene);
-    frame.dataset.state = "ready";
-  } catch (error) {
-    frame.dataset.state = "failed";
-    frame.querySelector(".failure").textContent = `The viewer cannot run here: ${error.message}.`;
-  }
+  const say = (state, words = "") => {
+    frame.dataset.state = state;
+    frame.querySelector(".failure").textContent = words;
+  };
+  const attempt = async (work) => {
+    try {
+      await work();
+      say("ready");
+    } catch (error) {
+      say("failed", `The viewer cannot run here: ${error.message}.`);
+    }
+  };
+  let splat;
+  const renderer = () => new SplatRenderer(canvas, splat, shaders, settings);
+  await attempt(async () => {
+    splat = await decodeSplat(layout, content);
+    window.viewer = new Viewer(frame, renderer(), scene);
+  });
+  // Browsers take the graphics from pages that nobody looks at, and give them back.
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault();  // else they stay away
+    say("lost", "The browser has taken back its graphics for now.");
+  });
+  canvas.addEventListener("webglcontextrestored", () => attempt(() => {
+    viewer.renderer = renderer();
+    viewer.draw();
+  }));
 }
 
 openViewer();

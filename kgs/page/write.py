@@ -116,18 +116,19 @@ def write_page(
     template = environment.get_template("page.html.jinja")
     rules = {"nearPlane": near_plane, "lowPass": RasterOptions.eps2d, "background": background.tolist()}
 
-    def page(**splat: Any) -> str:
+    def page(**splat: Any) -> bytes:
         data = json.dumps({"scene": scene, "settings": rules, **splat.pop("data", {})}, separators=(",", ":"))
-        return template.render(**context, **splat, data=Markup(data.replace("<", "\\u003c")))
+        html: str = template.render(**context, **splat, data=Markup(data.replace("<", "\\u003c")))
+        return html.encode(errors="backslashreplace")  # names of files that are no UTF-8
 
-    room = most_bytes - len(page().encode()) - _LAYOUT
+    room = most_bytes - len(page()) - _LAYOUT
     packed = pack(gaussians, cameras, max(0, room) * 3 // 4, weights, near_plane)
     content = base64.b64encode(packed.content).decode()
     splat = {"layout": packed.layout, "content": content}
     sizes = {"scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}"}
-    html = page(data=splat, left_out_here=packed.left_out, page_size="0.00 MB", **sizes)
-    sizes["page_size"] = f"This page has {_megabytes(len(html.encode()))}"
-    write_whole(path, page(data=splat, left_out_here=packed.left_out, **sizes).encode())
+    draft = page(data=splat, left_out_here=packed.left_out, page_size="0.00 MB", **sizes)
+    sizes["page_size"] = f"This page has {_megabytes(len(draft))}"
+    write_whole(path, page(data=splat, left_out_here=packed.left_out, **sizes))
     return packed.left_out
 
 

@@ -15,7 +15,7 @@ from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.fit.config import PRESETS, FitConfig
+from kgs.fit.config import CHOICES, PRESETS, FitConfig
 from kgs.fit.lpips import Lpips
 from kgs.fit.machine import peak_rss_mb, revision
 from kgs.fit.metrics import MEASURES
@@ -47,7 +47,8 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     known = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
     scene, points, seconds = _start(data, *known, preset)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
-    trainer, metrics, result = fit_and_measure(scene, _config(**cell), points, lpips)
+    config, drop = _config(**cell), PRESETS[preset].drop  # methods that differ in dropping decide alike
+    trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed=replace(config, drop=drop))
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
         result["pictures"] = _pictures(scene, trainer)
     return result | {
@@ -61,11 +62,16 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
 
 
 def fit_and_measure(
-    scene: Scene, config: FitConfig, points: FirstPoints, lpips: Lpips | None = None
+    scene: Scene, config: FitConfig, points: FirstPoints, lpips: Lpips | None = None, probed: FitConfig | None = None
 ) -> tuple[Trainer, dict[str, Any], dict[str, Any]]:
-    """One fit, its metrics, and what every cell stores of it; "cpu_seconds" are of the training and its curve."""
+    """One fit, its metrics, and what every cell stores of it.
+
+    "cpu_seconds" are those of probes, training, curve and leaving out, "wall_seconds" those of the training alone.
+    `probed`, or else `config`, is what probes decide for.
+    """
     start = time.process_time()
-    config, needs = decide(scene, config, choose_points)
+    decided, needs = decide(scene, probed or config, choose_points)
+    config = replace(config, **{name: getattr(decided, name) for name in CHOICES})
     trainer = Trainer(scene, config, points)
     trainer.needs |= needs
     trainer.fit()

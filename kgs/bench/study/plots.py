@@ -126,7 +126,7 @@ those that it could not densify"""
 # What each plot shows, its axes, and its caption.
 _OVER, _PSNR = "test PSNR over off, same seeds and views [dB]", "test PSNR [dB]"
 _FOREST = "Paired differences of test PSNR over off, with 95 % intervals, of one scene over seeds; n pairs"
-_PLOTS = {"forest": (_forest, _OVER, "", f"{_FOREST}; from the same first points, but for {AUTO}")}
+_PLOTS = {"forest": (_forest, _OVER, "", f"{_FOREST}; from the same first points, but for the default's")}
 _PLOTS["curves"] = (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}")
 _SCATTERED = {"gap": "overfitting: PSNR, training less test views [dB]", "cost": "CPU time of the fit [s]"}
 for _name, _x in {**_SCATTERED, "coadaptation": "co-adaptation [1e-3]"}.items():

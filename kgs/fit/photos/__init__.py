@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from kgs.fit.folder import locked
+from kgs.fit.outputs import start_folder
 from kgs.fit.progress import Stage, say, silent
+from kgs.json_files import read_json
 
 from .find import find_photos
 from .mapping import quiet_pycolmap
 from .pose import find_cameras
 from .read import hash_photos
-from .write import UNFINISHED, check_place, end_move, kept_report, publish
+from .write import REPORT, UNFINISHED, WAITING, check_place, end_move, is_kept, is_whole, publish
 
 __all__ = ["pose_photos"]
 
@@ -23,7 +25,13 @@ SETTINGS = 1  # grows with every change after which the same photos give other f
 
 
 def pose_photos(
-    folder: Path, out: Path, *, seed: int = 0, stage: Stage = silent, say: Callable[[str], None] = say
+    folder: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    wait: bool = False,
+    stage: Stage = silent,
+    say: Callable[[str], None] = say,
 ) -> dict[str, Any]:
     """Find the cameras of bare photos, and write a scene that `kgs.datasets.load_scene` reads.
 
@@ -38,12 +46,13 @@ def pose_photos(
     Args:
         folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into.
         out: the folder for the results, made if it is not there.
-        seed: of what the solvers draw. The same photos and seed give the same files.
+        seed: of what the solvers draw. The same photos and seed give the same files, but for the times in photos.json.
+        wait: leave new files in `out/finished-photos` where `out` holds a fit, which belongs to the former cameras.
         stage: shows how far each part is, as `kgs.fit.progress.each` does.
         say: where lines for the user go.
 
     Returns:
-        What photos.json holds, and "reused": whether it is a former run's.
+        What photos.json holds, "reused": whether it is a former run's, and "folder": where the scene is.
 
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
@@ -58,16 +67,22 @@ def pose_photos(
     hashes = hash_photos(paths)
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        end_move(out)
-        same = {"settings": SETTINGS, "seed": seed, "sha256": hashes}
-        if report := kept_report(out, same):
-            say(f"cameras: those in {out} are of the same {len(paths)} photos and are used again")
-            return report | {"reused": True}
-        new = out / UNFINISHED
-        shutil.rmtree(new, ignore_errors=True)
-        try:
-            report = same | find_cameras(paths, new, seed, stage, say)
-            publish(out, report)
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
-    return report | {"reused": False}
+        waiting, same = out / WAITING, {"settings": SETTINGS, "seed": seed, "sha256": hashes}
+        if not (wait and is_whole(waiting)):
+            end_move(out)
+        place = next((place for place in (waiting, out) if is_kept(place, same)), None)
+        if place is not None:
+            say(f"cameras: those in {place} are of the same {len(paths)} photos and are used again")
+        if place == out:
+            shutil.rmtree(waiting, ignore_errors=True)
+        if place is None:
+            new = out / UNFINISHED
+            start_folder(new)
+            try:
+                publish(out, same | find_cameras(paths, new, seed % 2**31, stage, say))
+            finally:
+                shutil.rmtree(new, ignore_errors=True)
+        if not (wait and (out / "splat.ply").exists()):
+            end_move(out)
+        found = waiting if is_whole(waiting) else out
+        return read_json(found / REPORT) | {"reused": place is not None, "folder": str(found)}

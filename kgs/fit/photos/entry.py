@@ -11,7 +11,7 @@ from kgs.datasets.layouts import CAMERAS_REPORT, nearest_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import FAST, FitConfig, most_gaussians
-from kgs.fit.folder import load_fit
+from kgs.fit.folder import load_fit, locked
 from kgs.fit.machine import bytes_of
 from kgs.fit.minutes import expected_minutes
 from kgs.fit.outputs import write_json
@@ -34,8 +34,10 @@ def is_bare(scene: Path) -> bool:
 
 def find_scene(
     photos: Path, out: Path, request: dict[str, Any], config: FitConfig, *, estimated: bool = False
-) -> dict[str, Any]:
-    """Find the cameras of bare photos, and return how the scene in `out` is to be loaded.
+) -> tuple[dict[str, Any], Path]:
+    """Find the cameras of bare photos; returns how the scene is to be loaded, as config.json has it, and from where.
+
+    That folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
 
     Args:
         photos: the folder of the photos.
@@ -49,20 +51,29 @@ def find_scene(
     """
     from . import pose_photos
     from .estimate import LEAST_PHOTOS
-    from .find import list_photos
+    from .find import find_photos
 
-    if estimated and (count := len(list_photos(photos))) < LEAST_PHOTOS:
+    if estimated and (count := len(find_photos(photos))) < LEAST_PHOTOS:
         raise DataError(
             photos, "", f"--estimate: expected at least {LEAST_PHOTOS} photos to leave one out, got {count}"
         )
     if not (out / CAMERAS_REPORT).exists() and (told := foretold(photos, request["downscale"], config)):
         say(told)
-    report = pose_photos(photos, out, seed=config.seed, stage=each, say=say)
+    report = pose_photos(photos, out, seed=config.seed, wait=True, stage=each, say=say)
     count, longest = len(report["photos"]), max(report["size"])
     if request["hold_out"] is None and count < FEW:
         request = request | {"hold_out": 0}
     downscale = _downscale(request["downscale"], longest, config)
-    return request | {"downscale": downscale, "scene": ".", "title": photos.resolve().name}
+    request = request | {"downscale": downscale, "scene": ".", "title": photos.resolve().name}
+    return request, Path(report["folder"])
+
+
+def settle(out: Path) -> None:
+    """Put cameras that waited for a fit in their place, beside its results."""
+    from .write import end_move
+
+    with locked(out):
+        end_move(out)
 
 
 def foretold(photos: Path, downscale: float | None, config: FitConfig) -> str:
@@ -96,13 +107,14 @@ def _downscale(asked: float | None, longest: float, config: FitConfig) -> float 
     return max(1.0, longest / LONGEST) if asked is None and config.device == "cpu" else asked
 
 
-def add_estimate(photos: Path, out: Path, scene: Scene, config: FitConfig) -> dict[str, Any]:
+def add_estimate(photos: Path, out: Path, scene: Scene, config: FitConfig, background: str) -> dict[str, Any]:
     """Estimate how good views are that no photo shows, and add it to metrics.json and to the page of a finished fit."""
     from .estimate import estimate
 
     known = read_json(out / CAMERAS_REPORT)["photos"]
     fast = replace(FAST, seed=config.seed, backend=config.backend, device=config.device)
-    found = estimate(photos, list(known), fast, max(scene.train.images.shape[-2:]), stage=each)
+    longest = max(scene.train.images.shape[-2:])
+    found = estimate(photos, list(known), fast, longest, background=background, stage=each)
     metrics = read_json(out / "metrics.json") | {"estimate": found}
     write_json(out / "metrics.json", metrics)
     refresh_page(out, load_fit(out, config.device), scene, metrics)

@@ -30,7 +30,13 @@ LEAST_PHOTOS = 4
 
 
 def estimate(
-    folder: Path, names: list[str], config: FitConfig, longest: float, *, stage: Stage = silent
+    folder: Path,
+    names: list[str],
+    config: FitConfig,
+    longest: float,
+    *,
+    background: str = "black",
+    stage: Stage = silent,
 ) -> dict[str, Any]:
     """Leave each photo out once: cameras and first points anew without it, a fit, and its camera found by PnP.
 
@@ -41,6 +47,7 @@ def estimate(
         names: of at least `LEAST_PHOTOS` photos in it.
         config: of each fit, `FAST` for instance.
         longest: pixels of the longer side in each fit.
+        background: behind photos with transparency, as of `load_scene`.
         stage: shows how far it is, as `kgs.fit.progress.each` does.
 
     Returns:
@@ -59,7 +66,7 @@ def estimate(
             except DataError:
                 rows.append({"name": left_out, "why": "without it the cameras of the others are not sure"})
                 continue
-            level = _level(out, folder / left_out, config, longest)
+            level = _level(out, folder / left_out, config, longest, background)
             judged = {"why": "too little of it is in the others"} if level is None else {"psnr": level}
             rows.append({"name": left_out} | judged)
     levels = [row["psnr"] for row in rows if "psnr" in row]
@@ -67,10 +74,11 @@ def estimate(
     return {"psnr": round(fmean(levels), 3) if levels else None, "sd": spread, "n": len(levels), "photos": rows}
 
 
-def _level(out: Path, left_out: Path, config: FitConfig, longest: float) -> float | None:
+def _level(out: Path, left_out: Path, config: FitConfig, longest: float, background: str) -> float | None:
     """The PSNR of a photo in a fit of the others, whose cameras are in `out`; None where it cannot be placed."""
     lens = load_colmap(out).frames[0].intrinsics
-    scene = load_scene(out, downscale=max(1.0, max(lens.width, lens.height) / longest), hold_out=0)
+    smaller = max(1.0, max(lens.width, lens.height) / longest)
+    scene = load_scene(out, downscale=smaller, hold_out=0, background=background)
     with warnings.catch_warnings(action="ignore", category=UserWarning):
         trainer = Trainer(scene, config, choose_points(scene, config))
     trainer.fit()
@@ -81,7 +89,9 @@ def _level(out: Path, left_out: Path, config: FitConfig, longest: float) -> floa
 
 def _as_view(path: Path, lens: Intrinsics, scene: Scene) -> Views:
     """A photo as those of the scene are: upright, undistorted by their lens, in their size; its pose means nothing."""
-    pixels = read_photos([path], silent)[0].pixels[..., :3].astype(np.float32) / 255
+    pixels = read_photos([path], silent)[0].pixels.astype(np.float32) / 255
+    if pixels.shape[2] == 4:
+        pixels = pixels[..., :3] * pixels[..., 3:] + scene.background.numpy() * (1 - pixels[..., 3:])
     whole = np.asarray(cv2.resize(pixels, (lens.width, lens.height), interpolation=cv2.INTER_AREA), np.float32)
     pinhole, maps = rectification(lens)
     height, width = scene.train.images.shape[-2:]

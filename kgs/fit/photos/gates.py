@@ -4,12 +4,12 @@ A low reprojection error proves nothing: few matches fit wrong cameras as well. 
 lenses have, each photo has to see many points, and a second solver, from other keypoints, has to find the same poses.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 
-import numpy as np
-from numpy.typing import NDArray
+import torch
+
+from kgs.camera import degrees_between
 
 from .mapping import FEWEST_MATCHES, Cameras, Look
 
@@ -51,7 +51,7 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
     worst = (0.0, ("", ""))
     for pair in combinations(sorted({*first.rotations, *second.rotations}), 2):
         known = all(name in cameras.rotations for name in pair for cameras in (first, second))
-        angle = _degrees(*(_relative(cameras, pair) for cameras in (first, second))) if known else 180.0
+        angle = _angle(first, second, pair) if known else 180.0
         worst = max(worst, (angle, pair))
     return worst
 
@@ -129,12 +129,7 @@ def _row(name: str, names: Sequence[str], pairs: Pairs, width: int) -> str:
     return "".join(f" {cell:>{width}}" for cell in cells)
 
 
-def _relative(cameras: Cameras, pair: tuple[str, str]) -> NDArray[np.float64]:
-    return np.asarray(cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T)
-
-
-def _degrees(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """The angle between two rotations, exact for small ones as well."""
-    difference = first @ second.T
-    sine = np.linalg.norm(difference - difference.T) / math.sqrt(8)
-    return math.degrees(math.atan2(float(sine), (float(np.trace(difference)) - 1) / 2))
+def _angle(first: Cameras, second: Cameras, pair: tuple[str, str]) -> float:
+    """Between two solvers' rotations from one camera to another, in degrees."""
+    both = [cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T for cameras in (first, second)]
+    return float(degrees_between(*map(torch.from_numpy, both)))

@@ -4,6 +4,7 @@ import io
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,23 +41,18 @@ def open_heic(path: Path, data: bytes) -> tuple[Exif, tuple[int, int], Callable[
     """
     import pi_heif
 
-    def failed(error: Exception) -> DataError:
-        return DataError(path, "", f"the HEIC photo cannot be decoded ({error})")
+    def opened(use: Callable[[Any], Any]) -> Any:
+        try:
+            return use(pi_heif.open_heif(io.BytesIO(data)))
+        except _FAULTS as error:
+            raise DataError(path, "", f"the HEIC photo cannot be decoded ({error})") from error
 
-    try:
-        photo = pi_heif.open_heif(io.BytesIO(data))
-        exif = (photo.info.get("exif") or b"").removeprefix(b"Exif\0\0")
-    except _FAULTS as error:
-        raise failed(error) from error
-    width, height = photo.size
+    exif, (width, height) = opened(lambda photo: (photo.info.get("exif") or b"", photo.size))
     check_size(path, width, height, len(data))
 
     def read() -> NDArray[np.float32]:
-        try:
-            pixels = np.asarray(photo)
-        except _FAULTS as error:
-            raise failed(error) from error
+        pixels = opened(np.array)  # opened anew, and copied: the decoder keeps what it has decoded
         pixels = pixels if pixels.ndim == 3 else np.stack([pixels] * 3, axis=2)
         return np.asarray(pixels / np.float32(255), np.float32)
 
-    return read_tiff(exif)._replace(orientation=1), (width, height), read
+    return read_tiff(exif.removeprefix(b"Exif\0\0"))._replace(orientation=1), (width, height), read

@@ -1,7 +1,8 @@
 """Photos and cameras in a folder, as COLMAP has them: `images`, `sparse/0` and `photos.json`, all three or none.
 
 What is new is written to `unfinished-photos`. When all is there that folder is renamed to `finished-photos`, and its
-parts are moved to their places. Whoever opens the folder after a kill in between ends the move first.
+parts are moved to their places: beside a fit, which belongs to the former cameras, only when the new one is there.
+Whoever opens the folder after a kill in between ends the move first.
 """
 
 import os
@@ -13,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kgs.datasets.images import list_images
 from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.errors import DataError
 from kgs.fit.outputs import is_own, write_json, write_png
@@ -23,28 +23,42 @@ from .mapping import Cameras, quiet_pycolmap
 from .read import Photo
 
 REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
-UNFINISHED, _FINISHED = "unfinished-photos", "finished-photos"
+UNFINISHED, WAITING = "unfinished-photos", "finished-photos"
 
 
 def check_place(out: Path, folder: Path) -> None:
     """A DataError where the results would lie among the user's photos or in place of files of another program."""
-    if out.resolve() == folder.resolve():
-        raise DataError(out, "", "holds the photos themselves: choose another folder with -o")
-    foreign = (out / "sparse").exists() and not is_own(out / REPORT)
-    if foreign or ((out / IMAGES).is_dir() and not all(map(is_own, list_images(out / IMAGES)))):
-        raise DataError(out, "", "holds files of a scene that kgs did not write: choose another folder with -o")
+    advice, photos = "choose another folder with -o", folder.resolve()
+    replaced = [out / name for name in (IMAGES, "sparse", UNFINISHED, WAITING)]
+    if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
+        raise DataError(out, "", f"holds the photos themselves: {advice}")
+    for path in filter(os.path.lexists, replaced):
+        if not (_is_own_model(out) if path.name == "sparse" else _has_own_pictures(path)):
+            raise DataError(path, "", f"holds files of a scene that kgs did not write: {advice}")
 
 
-def kept_report(out: Path, same: dict[str, Any]) -> dict[str, Any] | None:
-    """The report of a former run, if it has the same values and all of its files are there; else None."""
+def _is_own_model(out: Path) -> bool:
+    files = [path for path in (out / "sparse").rglob("*") if path.is_file()]
+    return is_own(out / REPORT) and {path.suffix for path in files} <= {".bin"}
+
+
+def _has_own_pictures(folder: Path) -> bool:
+    """Whether all of a folder is kgs's own; hidden files do not count."""
+    if not folder.is_dir() or folder.is_symlink():
+        return False
+    return is_own(folder) or all(is_own(path) for path in folder.iterdir() if path.name[0] != ".")
+
+
+def is_kept(out: Path, same: dict[str, Any]) -> bool:
+    """Whether a former run's report has the same values, and all of its files are there."""
     try:
         report = read_json(out / REPORT)
         images = [out / IMAGES / str(photo["image"]) for photo in report["photos"].values()]
     except (DataError, KeyError, TypeError, AttributeError):
-        return None
+        return False
     files = [*images, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]
     unchanged = all(report.get(key) == value for key, value in same.items())
-    return report if unchanged and all(path.is_file() for path in files) else None
+    return unchanged and all(path.is_file() for path in files)
 
 
 def write_images(folder: Path, photos: list[Photo], names: list[str]) -> None:
@@ -78,17 +92,21 @@ def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
 
 
 def publish(out: Path, report: dict[str, Any]) -> None:
-    """Put what is in `unfinished-photos` in its place; what fails to move, the next `end_move` moves."""
+    """Make `unfinished-photos` whole: the results wait in `finished-photos` for `end_move`."""
     write_json(out / UNFINISHED / REPORT, report)
-    shutil.rmtree(out / _FINISHED, ignore_errors=True)
-    os.replace(out / UNFINISHED, out / _FINISHED)
-    end_move(out)
+    shutil.rmtree(out / WAITING, ignore_errors=True)
+    os.replace(out / UNFINISHED, out / WAITING)
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether all parts are there: nothing has been moved yet."""
+    return all((folder / name).exists() for name in (IMAGES, "sparse", REPORT))
 
 
 def end_move(out: Path) -> None:
-    """What is left of a move goes to its place."""
-    done = out / _FINISHED
-    if not done.is_dir():
+    """What waits, or is left of a move, goes to its place."""
+    done = out / WAITING
+    if not (done.is_dir() and is_own(done)):
         return
     for name in (IMAGES, "sparse"):
         if (done / name).is_dir():

@@ -100,10 +100,10 @@ def first_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
-        dense, colors = dense_points(views, near, far, count, generator, stage, backend, draw)
-        if len(dense) >= min(FEWEST_DENSE, count):
+        dense, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw)
+        if agreed >= min(FEWEST_DENSE, count):
             return FirstPoints(dense, colors, kind)
-        message = f"first points: {len(views)} training views agree on {len(dense)} points only; SIFT points instead"
+        message = f"first points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
         warnings.warn(message, stacklevel=2)
     if kind in ("dense", "sift"):
         if len(points) >= FEWEST_POINTS:

@@ -27,10 +27,12 @@ def dense_points(
     stage: Stage = silent,
     backend: str = "auto",
     draw: str = "uniform",
-) -> tuple[Tensor, Tensor]:
-    """At most `count` points between two depths that two views agree on, drawn at random, and RGB, both `(P, 3)`.
+) -> tuple[Tensor, Tensor, int]:
+    """At most `count` points between two depths that two views agree on, drawn at random.
 
-    The draw is "uniform", or "spread" evenly over the pictures: one point from each of as many cells. Points
+    Returns the points and RGB, both `(P, 3)`, and how many they were drawn from.
+
+    The draw is "uniform", or "spread" evenly over the pictures: one point from each of about as many cells. Points
     lie where the pixels of both views are usable. Large pictures, and many, and such as move by more pixels than a
     sweep has planes, are swept at half the width and height, or a quarter: enough points, in bounded time and memory.
     """
@@ -46,7 +48,7 @@ def dense_points(
     points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
     chosen = torch.randperm(len(points), generator=generator)
     chosen = chosen[_one_a_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
-    return points[chosen].float(), colors[chosen]
+    return points[chosen].float(), colors[chosen], len(points)
 
 
 def _one_a_cell(places: NDArray[np.int64], count: int) -> Tensor:
