@@ -47,7 +47,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Gives the wide tables of results the whole width."""
+    """Gives the wide tables of results the whole width, and links to notebooks their place on the site."""
     if page.file.src_uri.startswith("results/"):
         page.meta["hide"] = ["toc"]
-    return markdown
+    return markdown.replace("](../notebooks/", "](notebooks/")
