@@ -25,7 +25,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the 
 # What pytest -n hands out first: a file that compiles the kernels, beside it those that use none; then long ones.
 _FIRST = (
     *("test_resume", "test_study_report", "test_synthetic", "test_wheel", "test_figures", "test_notebooks"),
-    *("test_cli_process", "test_trainer", "test_study_grid", "test_study_cells", "test_bench_speed", "test_faults"),
+    *(
+        "test_cli_process",
+        "test_trainer",
+        "test_study_grid",
+        "test_study_cells",
+        "test_study_runs",
+        "test_bench_speed",
+        "test_faults",
+    ),
 )
 
 

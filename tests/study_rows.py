@@ -4,6 +4,9 @@ import random
 
 import mpmath
 
+from kgs.bench.study.presets import METHODS
+
+TINY = {"steps": 3, "max_gaussians": 400, "evaluations": 1}
 MAIN = ("off", "progressive 0.2", "fixed 0.1")
 ABLATIONS = ("progressive 0.3", "fixed 0.15", "fixed 0.3", "near", "far", "L1 gradient 0.01")
 
@@ -63,3 +66,15 @@ def student(freedom, probability=0.975):
         return 1 - tail - probability
 
     return float(mpmath.findroot(excess, 2.0))
+
+
+def tiny_cell(method="off", seed=0, start="sift"):
+    return {
+        "scene": "synthetic",
+        "views": 2,
+        "downscale": None,
+        "start": start,
+        "method": method,
+        "seed": seed,
+        "fit": TINY | METHODS[method],
+    }

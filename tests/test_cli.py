@@ -84,7 +84,9 @@ def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
     for values in (before["test"], *before["test"]["views"], before["train"], *before["train"]["views"]):
         values |= {"lpips_vgg": 0.25, "lpips_vgg_unscaled": 0.125}
     before["peak_rss_mb"] = 1
-    path.write_text(json.dumps(before))
+    wrong = json.loads(json.dumps(before))
+    wrong["test"]["psnr"] = wrong["train"]["views"][0]["ssim"] = 1.0
+    path.write_text(json.dumps(wrong))
     assert run("eval", fitted) == 0
     assert json.loads(path.read_text()) == before
     assert "PSNR" in capsys.readouterr().out

@@ -1,8 +1,9 @@
 """Figures and facts about the machine, without a display and without touching what is the caller's."""
 
+import os
 import re
 import subprocess
-import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -54,24 +55,14 @@ def test_a_sheet_shows_the_photo_and_each_render(tmp_path):
         assert float((pixel - images[image, :, 0, 0]).abs().max()) < 0.01
 
 
-def test_no_module_of_one_system_alone():
-    """Windows has no `resource`: a fit can still be imported, and its memory is not known where nothing tells it."""
-    code = (
-        "import sys; sys.modules['resource'] = None\n"
-        "import kgs.fit.run, kgs.fit.machine\n"
-        "from pathlib import Path\n"
-        "exists = Path.exists\n"
-        "Path.exists = lambda path: False if str(path).startswith('/proc') else exists(path)\n"
-        "print(kgs.fit.machine.peak_rss_mb())"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert (result.stdout.strip(), result.returncode) == ("0", 0), result.stderr
-
-
 def test_memory_and_versions():
-    block = np.ones(2**26, np.uint8)
-    assert peak_rss_mb() > 64
-    assert block.sum() == 2**26
+    before = peak_rss_mb()
+    room = 0
+    if (statm := Path("/proc/self/statm")).exists():  # the peak of earlier tests may lie far above
+        room = before - int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 2**20
+    block = np.ones((room + 256) * 2**20, np.uint8)
+    assert 200 <= peak_rss_mb() - before <= 320
+    assert block[-1]
     assert {"kgs", "torch", "kornia", "opencv", "python", "machine"} <= versions().keys()
     assert versions()["torch"] == torch.__version__
 

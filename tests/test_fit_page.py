@@ -11,16 +11,18 @@ from typing import Any
 import pytest
 import torch
 
-from kgs.datasets.synthetic import synthetic_scene
+from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.commands import evaluate
 from kgs.fit.config import FitConfig
 from kgs.fit.folder import load_fit
+from kgs.fit.lpips import Lpips
 from kgs.fit.metrics import in_words
 from kgs.fit.page import refresh_page, spread
 from kgs.fit.starts import FirstPoints
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
+REQUEST = {"train_views": 3, "downscale": None, "background": "black"}
 REPORT = {
     "photos": {"a.jpg": {"points": 70, "blurred": True}, "b.jpg": {"points": 90, "blurred": False}},
     "matches": [["a.jpg", "b.jpg", 123]],
@@ -39,7 +41,7 @@ def fitted(tmp_path_factory: Any) -> Any:
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "choose_points", lambda *_: FirstPoints(points, torch.full((150, 3), 0.5), "random"))
-        request = {"scene": "/photos/mine/room", "train_views": 3, "downscale": None, "background": "black"}
+        request = REQUEST | {"scene": "/photos/mine/room"}
         run.fit_scene(scene, CONFIG, out, request=request, say=lambda line: None)
     return out, scene
 
@@ -123,6 +125,36 @@ def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None
     (tmp_path / "index.html").unlink()
     evaluate(tmp_path)
     assert (tmp_path / "index.html").stat().st_size > 50_000
+    assert "LPIPS" not in capsys.readouterr().out
+
+
+class Half:
+    """Stands for LPIPS: the mean difference, or half of it where the inputs are not rescaled."""
+
+    net = "vgg16"
+
+    def to(self, device: Any) -> Half:
+        return self
+
+    def __call__(self, image: torch.Tensor, target: torch.Tensor, rescale: bool = True) -> torch.Tensor:
+        return (image - target).abs().mean() * (1.0 if rescale else 0.5)
+
+
+def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    config = replace(CONFIG, init="random", init_points=50)
+    request = REQUEST | {"scene": str(folder)}
+    run.fit_scene(load_scene(folder, 3), config, tmp_path, request=request, say=lambda line: None)
+    before = json.loads((tmp_path / "metrics.json").read_text())
+    monkeypatch.setattr(Lpips, "load", lambda weights: Half())
+    evaluate(tmp_path, lpips_weights=tmp_path)
+    after = json.loads((tmp_path / "metrics.json").read_text())
+    for part in ("test", "train"):
+        for row, old in zip([after[part], *after[part]["views"]], [before[part], *before[part]["views"]], strict=True):
+            assert row["lpips_vgg"] > 0
+            assert row["lpips_vgg"] == pytest.approx(2 * row["lpips_vgg_unscaled"])
+            assert row["psnr"] == old["psnr"]
+    assert f"LPIPS {after['test']['lpips_vgg']:.4g}" in capsys.readouterr().out
+    assert "LPIPS, held out" in (tmp_path / "index.html").read_text(encoding="utf-8")
 
 
 def test_pictures_are_spread_over_the_views() -> None:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+import kgs.fit
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
@@ -108,11 +110,39 @@ def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
     assert imported_modules("kgs.reference") <= {"kgs.types"}
 
 
-def test_importing_kgs_is_light():
-    # torch itself imports tqdm where it is installed
-    code = "import sys, torch; before = set(sys.modules); import kgs; print(*sorted(set(sys.modules) - before))"
+@pytest.fixture(scope="module")
+def imported():
+    """What one process finds after importing more and more, three lines. Torch itself imports tqdm where that is."""
+    code = """
+import sys, torch
+before = set(sys.modules)
+import kgs
+print(*sorted(set(sys.modules) - before))
+import kgs.fit.config
+print("heavy:", *{"cv2", "trimesh", "matplotlib", "tyro"} & set(sys.modules))
+sys.modules["resource"] = None
+import kgs.fit.run, kgs.fit.machine
+from pathlib import Path
+exists = Path.exists
+Path.exists = lambda path: False if str(path).startswith("/proc") else exists(path)
+print(kgs.fit.machine.peak_rss_mb())
+"""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    new = done.stdout.split()
+    return done.stdout.splitlines()
+
+
+def test_the_numbers_of_a_fit_are_read_without_heavy_libraries(imported):
+    assert imported[1] == "heavy:"
+    assert all(hasattr(kgs.fit, name) for name in ("FirstPoints", "FitConfig", "Trainer", "first_points", "fit_scene"))
+
+
+def test_no_module_of_one_system_alone(imported):
+    """Windows has no `resource`: a fit can still be imported, and its memory is not known where nothing tells it."""
+    assert imported[2] == "0"
+
+
+def test_importing_kgs_is_light(imported):
+    new = imported[0].split()
     above = [f"kgs.{name}" for name in ("losses", "datasets", "export", "page", "fit", "bench", "cli", "reference")]
     assert "kgs.renderer" in new
     assert [name for name in new if within(name, *HEAVY, *above)] == []

@@ -13,7 +13,7 @@ from kgs.fit.config import Recipe
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
-CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
+CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, sh_degree=2, recipe=Recipe(grad_threshold=1e-5))
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points
     assert [note for note in trainer.notes if "from step 6" in note and "fit of 9 steps from the start" in note]
     trainer.fit(lambda trainer, _: trainer.step == 7)
     assert trainer.drop.progress == 7 / 9
-    assert trainer.model.sh_degree == done.model.sh_degree  # nothing learned is switched off
+    assert trainer.model.sh_degree == done.model.sh_degree == 2  # nothing learned is switched off
     trainer.save(path)
     again = Trainer.resume(scene, longer, path)
     assert again.notes == trainer.notes
@@ -142,14 +142,14 @@ def test_a_loop_of_ones_own(scene, points):
 @pytest.mark.parametrize(
     "name", ["config", "scene", "model", "optimizer", "densifier", "order", "drop", "step", "stack"]
 )
-@pytest.mark.parametrize("value", [None, 7, "gone", [], {}])
+@pytest.mark.parametrize("value", [None, 7.5, "gone", [], {}])
 def test_a_wrong_entry_is_a_data_error(scene, saved, tmp_path, name, value):
     state = load_checkpoint(saved)
     state[name] = value
     if value == "gone":
         del state[name]
-    if (name, value) in (("stack", []), ("stack", "gone"), ("step", 7)):
-        return
+    if (name, value) == ("stack", []):
+        pytest.skip("it is empty after each round of the views")
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
     with pytest.raises(DataError, match=r"checkpoint\.safetensors"):
         Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")

@@ -37,13 +37,17 @@ def test_gradients_are_means_of_what_the_densifier_observed(scene, points):
 @pytest.mark.parametrize("by", ["high-gradient", "low-gradient", "near", "far"])
 def test_the_trainer_sets_the_scores_of_the_present_camera(scene, points, by):
     trainer = Trainer(scene, replace(CONFIG, drop_by=by), points)
-    seen = []
+    seen, cameras = [], []
 
     def check(module, inputs, output):
+        if module.training:
+            assert torch.equal(module.scores, gaussian_scores(by, trainer.densifier, cameras[-1]))
         seen.append((module.scores.clone(), inputs[0].detach(), output.detach(), module.rate))
 
+    trainer.renderer.register_forward_pre_hook(lambda _, inputs: cameras.append(inputs[1]))
     trainer.drop.register_forward_hook(check)
     trainer.fit(lambda trainer, _: trainer.step == 30)
+    assert len({tuple(camera.extrinsics.flatten().tolist()) for camera in cameras}) > 1
     for scores, before, after, rate in seen:
         dropped = (after == 0) & (before > 0)
         assert int(dropped.sum()) == round(rate * len(before))

@@ -78,7 +78,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str
         "        print(json.dumps([path, peak_rss_mb() - before, str(error)]))"
     )
     paths = [str(folder / f"cloud{ending}") for ending in ENDINGS]
-    done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, timeout=100)
+    done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, timeout=100, check=True)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     return {path.removeprefix(str(folder / "cloud")): (memory, said) for path, memory, said in rows}
 
@@ -87,7 +87,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str
 def test_a_packed_file_is_refused_before_it_is_unpacked(ending: str, packed: dict[str, tuple[int, str]]) -> None:
     """A few hundred kilobytes can hold gigabytes; whatever the file is called, its memory is bounded."""
     memory, said = packed[ending]
-    assert memory < 64
+    assert memory < 16  # the cloud has 46
     assert "unpack it first" in said
 
 

@@ -13,22 +13,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from study_rows import tiny_cell
 
 from kgs import DataError
 from kgs.bench.study import cells as cells_module
-from kgs.bench.study import grid, presets, study
 from kgs.bench.study.cells import FULL, sparse_cell
 from kgs.bench.study.presets import METHODS, SCENES, sparse_cells
 from kgs.cli import main
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
-
-TINY = {"steps": 3, "max_gaussians": 400, "evaluations": 1}
-
-
-@pytest.fixture
-def _coarse_plots(monkeypatch):
-    monkeypatch.setattr("kgs.bench.study.plots.DPI", 40)  # time
 
 
 @pytest.fixture
@@ -36,18 +29,6 @@ def data(tmp_path):
     for scene in SCENES:
         (tmp_path / scene).mkdir(parents=True)
     return tmp_path
-
-
-def tiny_cell(method="off", seed=0, start="sift"):
-    return {
-        "scene": "synthetic",
-        "views": 2,
-        "downscale": None,
-        "start": start,
-        "method": method,
-        "seed": seed,
-        "fit": TINY | METHODS[method],
-    }
 
 
 # -- the cells ----------------------------------------------------------------------------------------------------
@@ -228,73 +209,3 @@ def test_lpips_is_measured_where_there_are_weights(kgs_data):
 def test_a_real_scene_needs_a_folder():
     with pytest.raises(DataError, match="KGS_DATA"):
         sparse_cell(tiny_cell() | {"scene": "llff/fern"})
-
-
-# -- goes on -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("_coarse_plots")
-def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
-    cells = [tiny_cell("off"), tiny_cell("progressive 0.2"), tiny_cell("off", seed=1)]
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: cells[:2])
-    study(out=tmp_path, scheduler=threads)
-    before = (tmp_path / "sparse.jsonl").read_bytes()
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: cells)
-    capsys.readouterr()
-    study(out=tmp_path, scheduler=threads)
-    assert capsys.readouterr().out.startswith("2 of 3 cells are there")
-    content = (tmp_path / "sparse.jsonl").read_bytes()
-    assert content.startswith(before)
-    done = [json.loads(line)["cell"] for line in content.splitlines()]
-    assert sorted(done, key=str) == sorted(cells, key=lambda cell: str(dict(sorted(cell.items()))))
-    report = (tmp_path / "sparse.md").read_text(encoding="utf-8")
-    assert "kgs bench study --preset quick -o OUT" in report
-    assert "3 of 3 cells" in report
-    assert (tmp_path / "index.html").exists()
-
-
-@pytest.mark.usefixtures("_coarse_plots")
-def test_a_report_of_what_is_there_fits_nothing(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
-    with pytest.raises(DataError, match="expected cells of --preset quick, got none"):
-        study(out=tmp_path, report_only=True)
-    study(out=tmp_path, scheduler=threads)
-    cells = (tmp_path / "sparse.jsonl").read_bytes()
-    (tmp_path / "sparse.md").unlink()
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell(), tiny_cell(seed=1)])
-    assert study(out=tmp_path, report_only=True) == 1  # not all are there
-    assert "1 of 2 cells" in (tmp_path / "sparse.md").read_text(encoding="utf-8")
-    assert (tmp_path / "sparse.jsonl").read_bytes() == cells
-
-
-@pytest.mark.usefixtures("_coarse_plots")
-def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
-    study(out=tmp_path, scheduler=threads)
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell("fixed 0.1")])
-    with pytest.raises(DataError, match="expected cells of --preset quick"):
-        study(out=tmp_path, scheduler=threads)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-@pytest.mark.usefixtures("_coarse_plots")
-def test_a_second_run_is_refused_and_writes_nothing(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
-    study(out=tmp_path, scheduler=threads)
-    for path in tmp_path.iterdir():
-        if path.suffix != ".jsonl":
-            path.unlink()
-    with grid._alone(tmp_path / "sparse.jsonl"), pytest.raises(ValueError, match="expected no other run"):
-        study(out=tmp_path, scheduler=threads)
-    assert [path.name for path in tmp_path.iterdir()] == ["sparse.jsonl"]
-
-
-@pytest.mark.usefixtures("_coarse_plots")
-def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch, threads):
-    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
-    study(out=tmp_path, scheduler=threads)
-    path = tmp_path / "sparse.jsonl"
-    path.write_bytes(2 * path.read_bytes())
-    study(out=tmp_path, scheduler=threads)
-    assert "1 of 1 cells" in (tmp_path / "sparse.md").read_text(encoding="utf-8")

@@ -11,6 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
+from kgs.densify import Densifier
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.run import most_bytes
 from kgs.fit.trainer import Trainer
@@ -47,6 +48,37 @@ def test_it_learns(each_backend, scene, points):
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"]
     assert curve[-1]["train_psnr"] > Trainer(scene, CONFIG, points).psnr(scene.train) + 1
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
+
+
+def test_opacities_decay_or_are_reset_when_the_timetable_says(scene, points, monkeypatch):
+    done = []
+
+    def note(name):
+        plain = getattr(Densifier, name)
+
+        def noted(self, value):
+            done.append((name, trainer.step, value))
+            return plain(self, value)
+
+        monkeypatch.setattr(Densifier, name, noted)
+
+    for name in ("decay_opacity", "reset_opacity"):
+        note(name)
+    trainer = Trainer(scene, replace(CONFIG, recipe=Recipe(opacity_decay=0.9, decay_from=0.5)), points)
+    trainer.fit()
+    assert done == [("decay_opacity", step, 0.9) for step in range(16, 30)]  # the last step only looks
+    done.clear()
+    recipe = Recipe(opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
+    trainer = Trainer(scene, replace(CONFIG, recipe=recipe), points)
+    trainer.fit()
+    assert done == [("reset_opacity", step, recipe.reset_opacity) for step in (9, 18)]
+
+
+def test_harmonics_come_one_degree_after_the_other(scene, points):
+    trainer, degrees = Trainer(scene, replace(CONFIG, sh_degree=3), points), []
+    trainer.fit(lambda trainer, _: degrees.append(trainer.model.sh_degree))
+    assert degrees == sorted(degrees)
+    assert [degrees.index(degree) + 1 for degree in (1, 2, 3)] == list(trainer.times.sh)
 
 
 def test_gaussians_were_added_on_the_way(whole, points):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.config import FitConfig, Recipe, timetable
 
 __all__ = ["PATIENCE", "Fit", "memory_of"]
 
@@ -25,8 +25,11 @@ _PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.fit.run", "torch._dynamo
 
 def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
     """Densification, resets, harmonics and dropping all happen; a checkpoint is written every third step."""
-    recipe = Recipe(grad_threshold=1e-5, reset_recovery=30)
-    config = FitConfig(steps=steps, evaluations=steps // 3, max_gaussians=1500, recipe=recipe)
+    recipe = Recipe(grad_threshold=1e-5, reset_interval=3000, reset_recovery=5)
+    config = FitConfig(steps=steps, evaluations=steps // 3, max_gaussians=1500, sh_degree=3, recipe=recipe)
+    times = timetable(config)
+    if not (times.densify and times.reset and len(times.sh) == 3 and config.drop):
+        raise RuntimeError(f"steps: expected room for all that a fit can do, got {steps}: {times}")
     return replace(config, init="file", init_file=points, **changes)
 
 

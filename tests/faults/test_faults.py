@@ -61,8 +61,9 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
         if fit.wait_for_steps(process):
             time.sleep(moments.uniform(0.0, longest))
             process.kill()
-            kills += 1
         process.join(PATIENCE)
+        kills += process.exitcode == -signal.SIGKILL and path.exists()
+        longest = 0.7 * longest if process.exitcode == 0 else longest  # this machine is faster
         if process.exitcode == 0:  # it was done before
             different += (fit.out / "splat.ply").read_bytes() != expected
             fits += 1
