@@ -62,6 +62,8 @@ class PosedCamera:
         shape, params = tuple(self.extrinsics.shape), self.model.params
         if len(shape) != 3 or shape[1:] != (4, 4):
             raise ValueError(f"extrinsics: expected shape (C, 4, 4), got {shape}")
+        if not shape[0]:
+            raise ValueError("extrinsics: expected at least one camera, got none")
         if params.ndim == 2 and params.shape[0] not in (1, shape[0]):
             raise ValueError(f"model: expected params of 1 or {shape[0]} cameras as extrinsics, got {params.shape[0]}")
 
@@ -192,9 +194,9 @@ def lenses(cameras: Cameras) -> list[Lens]:
 
 
 def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
-    matrix, pose, *size = (
-        x[c : c + 1] for x in (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
-    )
+    with torch.inference_mode(False):  # autograd takes a clone of what was made in inference mode
+        both = [x.clone() if x.is_inference() else x for x in (cameras.intrinsics, cameras.extrinsics)]
+    matrix, pose, *size = (x[c : c + 1] for x in (*both, cameras.height, cameras.width))
     limits = tangent_limits(matrix[0].diagonal()[:2], matrix[0, :2, 2], *map(int, size))
 
     def pixels(matrix: Tensor, pose: Tensor, world: Tensor) -> Tensor:

@@ -130,7 +130,8 @@ def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, .
         limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
         rotation = pose[:3, :3]
         inverse = rotation.T if _is_turn(rotation) else np.linalg.inv(rotation)
-        views.append((pose[:3], matrix[:2, :3].copy(), limits, -(inverse @ pose[:3, 3])))
+        # copies: a user may change a camera in place before the backward pass
+        views.append((pose[:3].copy(), matrix[:2, :3].copy(), limits, -(inverse @ pose[:3, 3])))
     return views
 
 

@@ -66,7 +66,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
 
     Args:
         means: centres in world units, `(N, 3)`.
-        quats: of any non-zero norm, `(N, 4)`.
+        quats: of any norm from 1e-38 on, `(N, 4)`.
         scales: standard deviations in world units, > 0, `(N, 3)`.
         opacities: in [0, 1], `(N,)` or `(C, N)`.
         colors: without `sh_degree` any features, `(N, D)` or `(C, N, D)`; with it harmonics `(N, K, 3)`.
@@ -116,7 +116,8 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     count, n = posed.batch_size, means.shape[0] if isinstance(means, Tensor) and means.ndim else 0
     colors = _check_colors(colors, sh_degree, count, n)
     image, own = "RGB" in render_mode, sh_degree is None and colors.ndim == 3
-    gaussians = Gaussians(means, quats, scales, opacities, colors[0] if own else colors)
+    every = colors.transpose(0, 1).flatten(1) if own else colors  # one that is not finite in some camera is in none
+    gaussians = Gaussians(means, quats, scales, opacities, every)
     rules: dict[str, Any] = {"alpha_threshold": alpha_threshold, "backend": backend}
     projected = project(gaussians, posed, near_plane=near_plane, eps2d=eps2d, colors=image and not own, **rules)
     half = 0.5 if pixel_centers == "half" else 0.0

@@ -275,3 +275,20 @@ def test_a_model_made_in_inference_mode_renders_there_and_outside(kind, coeffici
     assert torch.equal(image, expected)
     image.square().sum().backward()
     assert leaf.grad.any()
+
+
+@pytest.mark.parametrize("backend", kgs.backends.available())
+def test_a_pinhole_made_in_inference_mode_can_be_trained_with(backend):
+    gaussians = random_gaussians(40, 0, torch.float32, 1)
+    with torch.inference_mode():
+        camera = random_camera(*SIZE, 0, torch.float32)
+    leaf = gaussians.means.clone().requires_grad_()
+    moved = Gaussians(leaf, *(getattr(gaussians, name) for name in FIELDS[1:]))
+    GaussianRenderer(backend=backend)(moved, camera).image.square().sum().backward()
+    assert leaf.grad.any()
+
+
+def test_a_camera_without_a_pose_is_refused():
+    lens = CameraModel(ImageSize(24, 32), CameraModelType.PINHOLE, torch.tensor([30.0, 30, 16, 12]))
+    with pytest.raises(ValueError, match="extrinsics: expected at least one camera"):
+        PosedCamera(lens, torch.zeros(0, 4, 4))

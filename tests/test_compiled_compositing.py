@@ -294,4 +294,5 @@ def test_pixels_are_the_lanes(kernel):
     names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
     text = assembly(kernel, *(types.get(name, i8) for name in names))
     packed, scalar = (len(re.findall(pattern, text)) for pattern in (PACKED, SCALAR))
-    assert packed > max(60, 1.5 * scalar)
+    # Forward has 44 where LLVM makes AVX2 (haswell to znver3), 92 with AVX-512 (unrolled twice), 0 of a scalar loop.
+    assert packed > max(40, 1.5 * scalar)

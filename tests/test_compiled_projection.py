@@ -12,6 +12,7 @@ pytest.importorskip("numba")
 import kgs.projection_compiled
 from kgs import GaussianRenderer, project
 from kgs.backends import choose
+from kgs.compiled import binning, projection
 from kgs.compiled.projection import BLOCK
 
 
@@ -227,3 +228,21 @@ def test_the_same_bits_on_any_number_of_threads():
             torch.equal(getattr(got, name), getattr(first, name)) for name in (*DIFFERENTIABLE, "radii", "gaussian_ids")
         )
         assert all(torch.equal(grads[name], first_grads[name]) for name in (*FIELDS, "pose"))
+
+
+def test_a_camera_that_is_changed_before_the_backward_pass_does_not_change_it():
+    gaussians, cameras = wide_scene()
+    found = []
+    for shift in (0.0, 0.5):
+        means = gaussians.means.clone().requires_grad_()
+        image = GaussianRenderer(backend="numba")(replace(gaussians, means=means), cameras).image
+        cameras.extrinsics[0, 0, 3] += shift
+        image.square().sum().backward()
+        found.append(means.grad)
+    assert torch.equal(*found)
+
+
+def test_kernels_are_compiled_anew_when_any_file_of_theirs_changes():
+    stamps = {k._cache._cache_file._source_stamp[-1] for k in (projection.footprints, binning.sort_by_depth)}
+    assert len(stamps) == 1
+    assert len(stamps.pop()) == 64

@@ -114,6 +114,20 @@ def test_features_of_any_width_also_one_set_per_camera(width, own):
     assert leaf.grad.reshape(-1, 60, width).flatten(1).any(1).all()
 
 
+@pytest.mark.parametrize("camera", [0, 1])
+def test_a_colour_of_one_camera_that_is_not_finite_leaves_its_gaussian_out(camera):
+    gaussians, cameras = scene(dtype=torch.float32)
+    features = torch.rand(2, 60, 3, generator=torch.Generator().manual_seed(0))
+    rest = torch.arange(60) != 7
+    expected, _, _ = call(gaussians[rest], cameras, colors=features[:, rest])
+    features[camera, 7, 0] = torch.nan
+    features.requires_grad_()
+    renders, _, _ = call(gaussians, cameras, colors=features)
+    assert torch.allclose(renders, expected, atol=1e-5)
+    renders.sum().backward()
+    assert features.grad.isfinite().all()
+
+
 def test_opacities_of_each_camera_and_gradients_of_everything():
     gaussians, cameras = scene(1)
     own = torch.stack([gaussians.opacities, gaussians.opacities.flip(0)])

@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 
 import pytest
 import torch
@@ -106,6 +107,17 @@ def test_the_number_of_threads_stays_in_the_caller_and_for_threads_born_later(th
     collect(list(range(10)))
     assert torch.get_num_threads() == threads
     assert in_a_new_thread(torch.get_num_threads) == threads
+
+
+def test_there_are_no_more_workers_than_asked_for(threads):
+    started = []
+
+    def make_worker():
+        started.append(1)
+        return lambda item: time.sleep(0.001)
+
+    run_all(range(20), make_worker, CPU, 1)
+    assert len(started) == 1
 
 
 def test_threads_are_kept_from_call_to_call(threads):

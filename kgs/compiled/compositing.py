@@ -65,7 +65,7 @@ def composite_forward(
         stop: less light is 0.
         feature: where the block begins.
         channels: any tuple of as many numbers as the block has features.
-        starts: out, T at the beginning of each chunk, `(chunks, P)`, see `count_chunks`; or empty.
+        starts: out, T at the beginning of each chunk, `(chunks, P)`; or empty.
         done: out, how many entries of each tile were reached.
         light: out, `(C, H, W)`.
         depths: out, the median depth, `(C, H, W)`; or empty.

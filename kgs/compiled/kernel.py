@@ -1,6 +1,10 @@
 """What all kernels share: how they are compiled, constants, scratch memory, 2^x."""
 
 import sys
+from collections.abc import Callable
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numba as nb
@@ -12,8 +16,23 @@ ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
 _LARGEST = np.finfo(np.float32).max
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # without nnan and ninf: see `is_finite`
-jit: Any = nb.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
-exact: Any = nb.njit(nogil=True, cache=True, error_model="numpy")  # rounds as written
+_SOURCES = sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
+
+
+def _cached(**options: Any) -> Callable[[Any], Any]:
+    """Numba's decorator, whose cache on the disk is that of all files here: kernels have code of others in them."""
+
+    def decorate(function: Any) -> Any:
+        kernel = nb.njit(nogil=True, cache=True, error_model="numpy", **options)(function)
+        with suppress(AttributeError):  # without compiling (NUMBA_DISABLE_JIT) there is no cache
+            file = kernel._cache._cache_file
+            file._source_stamp = file._source_stamp, _SOURCES
+        return kernel
+
+    return decorate
+
+
+jit, exact = _cached(fastmath=_FAST), _cached()  # `exact` rounds as written
 inline: Any = nb.njit(inline="always", fastmath=_FAST, error_model="numpy")
 
 # exp2 on [-1/2, 1/2] as in Cephes' exp2f: relative error 1.2e-7 with its roundings

@@ -60,8 +60,9 @@ def over(threads: int, count: int, kernel: Callable[..., None], *arguments: Any,
     total = len(work.ranges)
     for helper in range(min(threads, total) - 1):
         if helper == len(_helpers):
-            _helpers.append(SimpleQueue())
-            Thread(target=_serve, args=_helpers[-1:], name=f"kgs-compiled-{helper}", daemon=True).start()
+            queue: SimpleQueue[_Work] = SimpleQueue()
+            _helpers.append(queue)
+            Thread(target=_serve, args=(queue,), name=f"kgs-compiled-{helper}", daemon=True).start()
         _helpers[helper].put(work)
     work.drain()
     errors = [error for error in (work.done.get() for _ in range(total)) if error is not None]

@@ -35,7 +35,7 @@ from .torch_passes import composite_torch
 def _compiled_covers(
     projected: ProjectedGaussians, features: Tensor, options: RasterOptions, _: bool, chunk_size: int | None
 ) -> bool:
-    narrow = projected.image_size[1] < 2**18  # columns of tiles are numbers of 15 bits there
+    narrow = projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits there
     return compiled_covers(features) and options.tile_size == 8 and chunk_size is None and narrow
 
 

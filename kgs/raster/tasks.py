@@ -30,6 +30,7 @@ class Rules:
     median_depth: bool
     chunk_size: int  # K, entries of a tile per step
     buffer_bytes: int  # for the buffers of one thread
+    threads: int  # that have buffers, at most
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,8 @@ class Slice:
         self.floor = math.log(threshold) - 20 if threshold else math.log(torch.finfo(dtype).tiny) + 8
         self.cut = _below(max(threshold, 1.01 * math.exp(self.floor)), dtype)
         self.stop = _below(rules.transmittance_stop, dtype) if rules.transmittance_stop else -1.0
-        self.by_layer = device.type == "cpu"  # scans: a GPU wants few launches, a CPU few passes
+        # Scans: a GPU wants few launches, a CPU few passes. Sums along the layers of a GPU are not deterministic.
+        self.by_layer = device.type == "cpu" or torch.are_deterministic_algorithms_enabled()
         self.clamps = bool((table[0] > math.log(ALPHA_MAX)).any())
         self.groups = self._make_groups(lists.offsets.diff())
         slots = self.chunk_size * sum(sum(group.chunks) for group in self.groups)

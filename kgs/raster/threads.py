@@ -19,8 +19,10 @@ Item = TypeVar("Item")
 _pools: dict[int, ThreadPoolExecutor] = {}
 
 
-def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], None]], device: torch.device) -> None:
-    """Call a worker on every item, in order, on as many threads as torch has; one thread where no CPU does the work.
+def run_all(
+    items: Iterable[Item], make_worker: Callable[[], Callable[[Item], None]], device: torch.device, most: int = 2**16
+) -> None:
+    """Call a worker on every item, in order, on as many threads as torch has, but at most so many; one for a GPU.
 
     `make_worker` is called once per thread and returns the function that does one item (a place for its buffers).
     """
@@ -46,7 +48,7 @@ def run_all(items: Iterable[Item], make_worker: Callable[[], Callable[[Item], No
     if threads == 1 or not queue:
         drain()
         return
-    futures = [_pool(threads).submit(drain) for _ in range(min(threads, len(queue)))]
+    futures = [_pool(threads).submit(drain) for _ in range(min(threads, most, len(queue)))]
     wait(futures)  # all of them, so that nothing runs on after an error
     for future in futures:
         future.result()

@@ -37,7 +37,8 @@ def composite_torch(
     reach = Reach(projected, options.tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span)))
     slices = reach.row_slices(budget, per_span, per_entry)
     size = chunk_size or choose_chunk_size(reach)
-    rules = Rules(options.alpha_threshold, options.transmittance_stop, median_depth, size, buffers)
+    threads = max(4, options.max_bytes // 4 // max(1, buffers))
+    rules = Rules(options.alpha_threshold, options.transmittance_stop, median_depth, size, buffers, threads)
     spare = budget - per_entry * reach.num_entries - per_span * reach.num_spans // 4
     passes = _Passes(projected, reach, slices, rules, spare if len(slices) == 1 else 0)
     sums, transmittance, median = _Composite.apply(*inputs, passes, keep)
@@ -64,7 +65,7 @@ class _Passes:
             sums = sums or part.blank()
             keep_alphas = keep and part.alpha_bytes <= spare
             spare -= part.alpha_bytes * keep_alphas
-            run_all(part.groups, partial(Forward, part, sums, keep, keep_alphas), spans.rows.device)
+            run_all(part.groups, partial(Forward, part, sums, keep, keep_alphas), spans.rows.device, self.rules.threads)
             if keep:
                 done.append((ranks, part))
             live = sums[0].amax((1, 2)) > 0
@@ -86,7 +87,8 @@ class _Passes:
             if entries == 0:
                 continue
             rows = total.new_zeros(entries + 1, total.shape[1])
-            run_all(part.groups, partial(Backward, part, grads, behind, rows, moments, features), rows.device)
+            make = partial(Backward, part, grads, behind, rows, moments, features)
+            run_all(part.groups, make, rows.device, self.rules.threads)
             # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
             total[low:high] += F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 

@@ -48,9 +48,9 @@ class _Worker:
         flat = alpha.view(-1, part.pixels)
         torch.mm(table[:6].t(), part.monomials, out=flat)
         flat.clamp_(min=part.floor).exp_()
-        F.threshold(flat, part.cut, 0.0, inplace=True)
         if part.clamps:
             flat.clamp_(max=ALPHA_MAX)
+        F.threshold(flat, part.cut, 0.0, inplace=True)
         return ux, uy
 
     def scan(self, alpha: Tensor, before: Tensor) -> Tensor:
