@@ -70,6 +70,17 @@ def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
         yield request.param
 
 
+@pytest.fixture
+def torch_alone() -> None:
+    """For a test that comes to no kernel: of errors, of files."""
+
+
+@pytest.fixture
+def exactly(each_backend: str) -> tuple[torch.dtype, float]:
+    """The dtype in which a backend is as exact as it can be, and how near its images are to what they should be."""
+    return (torch.float32, 3e-6) if each_backend == "numba" else (torch.float64, 1e-12)
+
+
 @pytest.fixture(autouse=True)
 def _reproducible():
     """The same global random stream for every test, whatever ran before."""

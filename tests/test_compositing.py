@@ -198,6 +198,7 @@ def test_features_of_any_width(dtype):
         assert ((inputs[-1].grad - wide_inputs[-1].grad[:, :width]).abs() <= bound * wide_inputs[-1].grad.max()).all()
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
     ("option", "value"),
     [

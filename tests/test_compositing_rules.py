@@ -171,6 +171,7 @@ def test_transmittance_of_many_layers_is_accurate(n):
 # -- what it takes -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize("rows", [0, 1, 4, 30])
 def test_features_need_a_row_for_each_projected_gaussian(rows):
     layers = footprints([0.5, 0.5])
@@ -180,6 +181,7 @@ def test_features_need_a_row_for_each_projected_gaussian(rows):
         composite(layers, torch.zeros(2, dtype=torch.float64))
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize("name", ["projected", "features", "opacities", "factors"])
 def test_other_types_and_dtypes_are_named(name):
     layers = footprints([0.5, 0.5])
@@ -195,6 +197,7 @@ def test_other_types_and_dtypes_are_named(name):
         composite(layers, layers.colors.float())
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_projection_checks_its_options():
     gaussians, camera = random_gaussians(3, 0), random_camera(8, 8, 0)
     for name, value in (("alpha_threshold", -1.0), ("near_plane", -0.1), ("eps2d", float("nan")), ("backend", "cuda")):

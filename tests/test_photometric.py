@@ -141,6 +141,7 @@ def test_gradient_reaches_a_target_that_asks_for_it():
         torch.testing.assert_close(reached.grad.double(), expected, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_float64_passes_gradcheck_twice():
     image, target = make_pair((1, 1, 6, 7), dtype=torch.float64)
     image.requires_grad_()
@@ -197,6 +198,7 @@ def test_nan_in_the_image_reaches_the_loss():
     assert photometric_loss(image, target).isnan()
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_wrong_arguments_are_named():
     image, target = make_pair((1, 3, 16, 16))
     with pytest.raises(TypeError, match=r"image: expected a torch\.Tensor"):

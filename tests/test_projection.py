@@ -150,6 +150,7 @@ def test_orthographic_footprints_are_exact_marginals_and_all_rays_share_the_colo
 # -- errors --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_dtype_and_device_of_cameras_and_gaussians_must_agree():
     gaussians, cameras = scene()
     with pytest.raises(TypeError, match=r"cameras: expected torch.float64 on cpu .* got torch.float32 on cpu"):
@@ -159,6 +160,7 @@ def test_dtype_and_device_of_cameras_and_gaussians_must_agree():
         project(elsewhere, cameras)
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_intrinsics_of_another_dtype_are_refused_too(dtype):
     gaussians, cameras = scene(dtype=dtype)
@@ -172,6 +174,7 @@ def test_intrinsics_of_another_dtype_are_refused_too(dtype):
             project(gaussians, posed(kind, params, cameras.extrinsics))
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_camera_errors():
     gaussians, cameras = scene(cameras=2)
     with pytest.raises(TypeError, match="cameras: expected a kornia PinholeCamera or a kgs.PosedCamera"):
@@ -181,5 +184,6 @@ def test_camera_errors():
         project(gaussians, sizes)
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_the_public_name():
     assert kgs.project is project

@@ -35,6 +35,7 @@ def call(gaussians, cameras, half=True, **options):
     return rasterization(viewmats=cameras.extrinsics, Ks=k, width=32, height=24, **centers, **arguments)
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_the_names_and_their_order_are_gsplats():
     assert list(inspect.signature(rasterization).parameters)[: len(POSITIONAL)] == POSITIONAL
 
@@ -71,8 +72,9 @@ def test_a_point_lands_where_its_intrinsics_say():
 
 
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
-def test_the_modes_are_what_the_weights_of_the_reference_say(mode):
-    gaussians, cameras = scene(cameras=1)
+def test_the_modes_are_what_the_weights_of_the_reference_say(mode, exactly):
+    dtype, bound = exactly
+    gaussians, cameras = scene(cameras=1, dtype=dtype)
     exact = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
     drawn = kgs.reference.layers(gaussians, cameras, **exact)
     color = torch.einsum("lhw,lc->hwc", drawn.weights, drawn.colors)
@@ -80,35 +82,39 @@ def test_the_modes_are_what_the_weights_of_the_reference_say(mode):
     alpha = (1 - drawn.transmittance)[..., None]
     parts = {"RGB": color, "D": depth, "ED": depth / alpha}
     renders, alphas, _ = call(gaussians, cameras, render_mode=mode, **exact)
-    assert torch.allclose(renders[0], torch.cat([parts[part] for part in mode.split("+")], 2), atol=1e-11)
-    assert torch.allclose(alphas[0], alpha, atol=1e-12)
+    assert torch.allclose(
+        renders[0], torch.cat([parts[part] for part in mode.split("+")], 2).to(dtype), atol=20 * bound
+    )
+    assert torch.allclose(alphas[0], alpha.to(dtype), atol=bound)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_up_to_a_degree(degree):
-    gaussians, cameras = scene(3)
+def test_harmonics_up_to_a_degree(degree, exactly):
+    dtype, bound = exactly
+    gaussians, cameras = scene(3, dtype)
     lower = replace(gaussians, colors=gaussians.colors[:, : (degree + 1) ** 2])
     expected = GaussianRenderer()(lower, cameras).image.permute(0, 2, 3, 1)
-    assert torch.allclose(call(gaussians, cameras, sh_degree=degree)[0], expected, atol=1e-12)
+    assert torch.allclose(call(gaussians, cameras, sh_degree=degree)[0], expected, atol=bound)
 
 
 @pytest.mark.parametrize("width", [1, 2, 7])
 @pytest.mark.parametrize("own", [False, True])
-def test_features_of_any_width_also_one_set_per_camera(width, own):
-    gaussians, cameras = scene()
+def test_features_of_any_width_also_one_set_per_camera(width, own, exactly):
+    dtype, bound = exactly
+    gaussians, cameras = scene(dtype=dtype)
     generator = torch.Generator().manual_seed(0)
-    features = torch.randn(2, 60, width, generator=generator, dtype=torch.float64)
-    backgrounds = torch.randn(2, width, generator=generator, dtype=torch.float64)
+    features = torch.randn(2, 60, width, generator=generator, dtype=dtype)
+    backgrounds = torch.randn(2, width, generator=generator, dtype=dtype)
     leaf = (features if own else features[0]).clone().requires_grad_()
     renders, _, _ = call(gaussians, cameras, colors=leaf, backgrounds=backgrounds)
     for c in range(2):
         padded = torch.cat([features[c if own else 0], torch.zeros(60, 6 - width if width < 6 else 2)], 1)
-        bright = torch.cat([backgrounds[c], torch.zeros(len(padded[0]) - width, dtype=torch.float64)])
+        bright = torch.cat([backgrounds[c], torch.zeros(len(padded[0]) - width, dtype=dtype)])
         for first in range(0, width, 3):
             part = replace(gaussians, colors=padded[:, first : first + 3])
-            single = random_camera(*SIZE, c)
+            single = random_camera(*SIZE, c, dtype)
             image = GaussianRenderer()(part, single, bright[first : first + 3]).image[0].permute(1, 2, 0)
-            assert torch.allclose(renders[c, :, :, first : first + 3], image[..., : width - first], atol=1e-12)
+            assert torch.allclose(renders[c, :, :, first : first + 3], image[..., : width - first], atol=bound)
     renders.square().sum().backward()
     assert leaf.grad.isfinite().all()
     assert leaf.grad.reshape(-1, 60, width).flatten(1).any(1).all()
@@ -128,8 +134,9 @@ def test_a_colour_of_one_camera_that_is_not_finite_leaves_its_gaussian_out(camer
     assert features.grad.isfinite().all()
 
 
-def test_opacities_of_each_camera_and_gradients_of_everything():
-    gaussians, cameras = scene(1)
+def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
+    dtype, bound = exactly
+    gaussians, cameras = scene(1, dtype)
     own = torch.stack([gaussians.opacities, gaussians.opacities.flip(0)])
     gaussians, inputs = leaves(replace(gaussians, opacities=own))
     k = cameras.intrinsics[:, :3, :3].clone().requires_grad_()
@@ -140,13 +147,14 @@ def test_opacities_of_each_camera_and_gradients_of_everything():
     image = GaussianRenderer()(again, kgs.cameras(cameras.extrinsics, k.detach(), 32, 24)).image
     image.square().sum().backward()
     for got, wanted in zip(inputs, expected, strict=True):
-        assert torch.allclose(got.grad, wanted.grad, atol=1e-9)
+        assert torch.allclose(got.grad, wanted.grad, atol=1e3 * bound * float(wanted.grad.abs().max().clamp_min(1)))
     assert k.grad.any()
     assert pose.grad.any()
     assert meta["means2d"].grad.shape == meta["means2d"].shape
     assert meta["means2d"].grad.any()
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -179,6 +187,7 @@ def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
         call(gaussians, cameras, **{name: value})
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_what_does_nothing_is_accepted_and_unknown_names_are_not():
     gaussians, cameras = scene()
     harmless = {"packed": False, "channel_chunk": 8, "segmented": True, "far_plane": 1e12, "radial_coeffs": None}

@@ -82,16 +82,16 @@ def test_depth_of_a_single_plane_is_its_depth():
 # -- background ----------------------------------------------------------------------------------------------------
 
 
-def test_every_form_of_background():
-    cameras = batch(*[random_camera(24, 33, seed) for seed in (0, 1)])
-    gaussians, renderer = random_gaussians(20, 0), GaussianRenderer()
+def test_every_form_of_background(exactly):
+    dtype, bound = exactly
+    cameras = batch(*[random_camera(24, 33, seed, dtype) for seed in (0, 1)])
+    gaussians, renderer = random_gaussians(20, 0, dtype), GaussianRenderer()
     out = renderer(gaussians, cameras, outputs=("image", "alpha"))
     light = 1 - out.alpha
-    one, two = torch.rand(3, dtype=torch.float64), torch.rand(2, 3, dtype=torch.float64)
-    full = torch.rand(2, 3, 24, 33, dtype=torch.float64)
+    one, two, full = (torch.rand(shape, dtype=dtype) for shape in ((3,), (2, 3), (2, 3, 24, 33)))
     for background, behind in ((one, one[None, :, None, None]), (two, two[:, :, None, None]), (full, full)):
-        assert largest(renderer(gaussians, cameras, background).image, out.image + light * behind) <= 1e-15
-    black = renderer(gaussians, cameras, torch.zeros(3, dtype=torch.float64)).image
+        assert largest(renderer(gaussians, cameras, background).image, out.image + light * behind) <= 0.1 * bound
+    black = renderer(gaussians, cameras, torch.zeros(3, dtype=dtype)).image
     assert torch.equal(black, out.image)
 
 
@@ -116,8 +116,8 @@ class Half(torch.nn.Module):
 # -- the opacity layer and the colours -----------------------------------------------------------------------------
 
 
-def test_opacity_layer_is_applied_and_reached_by_train_and_eval():
-    gaussians, camera = random_gaussians(30, 0), random_camera(24, 32, 0)
+def test_opacity_layer_is_applied_and_reached_by_train_and_eval(exactly):
+    gaussians, camera = random_gaussians(30, 0, exactly[0]), random_camera(24, 32, 0, exactly[0])
     halved = dataclasses.replace(gaussians, opacities=gaussians.opacities / 2)
     plain, renderer = GaussianRenderer(), GaussianRenderer(opacity_layer=Half())
     assert torch.equal(renderer(gaussians, camera).image, plain(halved, camera).image)
@@ -128,8 +128,9 @@ def test_opacity_layer_is_applied_and_reached_by_train_and_eval():
     assert torch.equal(renderer(gaussians, camera).image, plain(halved, camera).image)
 
 
-def test_dropped_gaussians_are_seen_but_not_drawn():
-    gaussians, camera = random_gaussians(60, 0), pinhole(64, 64, (40.0, 40.0))
+def test_dropped_gaussians_are_seen_but_not_drawn(exactly):
+    dtype, bound = exactly
+    gaussians, camera = random_gaussians(60, 0, dtype), pinhole(64, 64, (40.0, 40.0), dtype=dtype)
     drop = DropGaussian(p=0.5, schedule="constant", seed=3)
     renderer = GaussianRenderer(opacity_layer=drop)
     gaussians, inputs = leaves(gaussians)
@@ -146,7 +147,7 @@ def test_dropped_gaussians_are_seen_but_not_drawn():
     assert out.projected.means2d.grad[~dropped].any()
     kept = [x.detach()[~torch.isin(torch.arange(60), ids)] for x in inputs]
     kept[3] = kept[3] * 2
-    assert torch.equal(out.image, GaussianRenderer()(Gaussians(*kept), camera).image)
+    assert largest(out.image, GaussianRenderer()(Gaussians(*kept), camera).image) <= bound
 
 
 def test_rgb_is_taken_as_it_is_and_harmonics_are_shifted_by_a_half():
@@ -221,6 +222,7 @@ def test_gradient_of_means2d_is_kept():
     assert inputs[0].grad.any()
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
 def test_other_dtypes_are_a_type_error_that_names_the_argument(name, dtype):
@@ -229,6 +231,7 @@ def test_other_dtypes_are_a_type_error_that_names_the_argument(name, dtype):
         dataclasses.replace(gaussians, **{name: getattr(gaussians, name).to(dtype)})
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
     ("argument", "error", "change"),
     [
@@ -258,12 +261,14 @@ def test_errors_name_the_argument(argument, error, change):
         GaussianRenderer()(**{**arguments, **change})
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_opacities_for_another_number_of_cameras_are_an_error():
     gaussians = dataclasses.replace(random_gaussians(3, 0), opacities=torch.full((2, 3), 0.5).double())
     with pytest.raises(ValueError, match="opacities: expected"):
         GaussianRenderer()(gaussians, random_camera(9, 12, 0))
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_repr_says_the_options():
     text = repr(GaussianRenderer(DropGaussian(), tile_size=16))
     assert "tile_size=16" in text
@@ -271,6 +276,7 @@ def test_repr_says_the_options():
     assert "DropGaussian" in text
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
     "option",
     [

@@ -50,6 +50,7 @@ def nudge(tensor):
     return tensor
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize("part", ["train", "test"])
 @pytest.mark.parametrize("change", [swap, nudge])
 @pytest.mark.parametrize(
@@ -64,6 +65,7 @@ def test_another_photo_pose_or_matrix_is_named(scene, saved, part, change, name,
         Trainer.resume(other, CONFIG, saved)
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_other_views_masks_and_background_are_named(scene, saved):
     views = scene.train
     for other, said in (
@@ -75,6 +77,7 @@ def test_other_views_masks_and_background_are_named(scene, saved):
             Trainer.resume(other, CONFIG, saved)
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
     ("change", "flag"),
     [
@@ -139,6 +142,7 @@ def test_a_loop_of_ones_own(scene, points):
         assert_same_bits(trainer, whole)
 
 
+@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
     "name", ["config", "scene", "model", "optimizer", "densifier", "order", "drop", "step", "stack"]
 )
