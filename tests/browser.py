@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import fcntl
 import json
 import os
 import select
@@ -26,6 +25,8 @@ _SECONDS = 60.0
 
 def _pipe() -> tuple[int, ...]:
     """A pipe whose ends are above 9: Chromium reads from 3 and writes to 4."""
+    import fcntl  # of POSIX
+
     ends = os.pipe()
     high = tuple(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in ends)
     for end in ends:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 from start_scenes import painted_planes
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
@@ -21,6 +22,9 @@ from kgs.fit.starts import FirstPoints
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
+
+settings.register_profile("kgs", deadline=None)  # another program may take the core
+settings.load_profile("kgs")
 
 # What pytest -n hands out first: a file that compiles the kernels, beside it those that use none; then long ones.
 _FIRST = (

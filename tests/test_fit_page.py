@@ -48,13 +48,13 @@ def fitted(tmp_path_factory: Any) -> Any:
 
 def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     out, _ = fitted
-    text = (out / "index.html").read_text()
+    text = (out / "index.html").read_text(encoding="utf-8")
     assert "<h1>room</h1>" in text
     assert "mine" not in text
     assert "3 training and 8 test photos of 32 × 24 pixels" in text
     assert "6 of 8 test photos." in text
     assert text.count('class="render"') == 6
-    assert f"{json.loads((out / 'metrics.json').read_text())['test']['psnr']:.2f}" in text
+    assert f"{json.loads((out / 'metrics.json').read_text(encoding='utf-8'))['test']['psnr']:.2f}" in text
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
     assert facts["points in a photo"] == "70 to 90"
     assert facts["blurred"] == "a.jpg"
@@ -68,9 +68,9 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
 
 def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any) -> None:
     out, scene = fitted
-    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text())
+    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     refresh_page(out, load_fit(out), replace(scene, root=out / "elsewhere"), metrics)
-    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", (out / "index.html").read_text()))
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", (out / "index.html").read_text(encoding="utf-8")))
     assert "blurred" not in facts
     assert "time" not in facts
     (out / "index.html").write_bytes(own)
@@ -78,11 +78,11 @@ def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any) -> None:
 
 def test_the_estimate_says_how_many_photos_it_could_judge(fitted: Any) -> None:
     out, scene = fitted
-    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text())
+    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     rows = [{"name": "a.jpg", "psnr": 21.0}, {"name": "b.jpg", "psnr": 23.0}, {"name": "c.jpg", "why": "lost"}]
     metrics["estimate"] = {"psnr": 22.0, "sd": 1.4, "n": 2, "photos": rows}
     refresh_page(out, load_fit(out), scene, metrics)
-    text = " ".join((out / "index.html").read_text().split())
+    text = " ".join((out / "index.html").read_text(encoding="utf-8").split())
     assert "each of 3 photos was left out once" in text
     assert "2 of them could be judged" in text
     assert "2 of 3 photos" in in_words(metrics)
@@ -93,23 +93,23 @@ def test_the_estimate_says_how_many_photos_it_could_judge(fitted: Any) -> None:
 
 def test_measures_that_come_later_are_on_it(fitted: Any, tmp_path: Path) -> None:
     out, scene = fitted
-    metrics = json.loads((out / "metrics.json").read_text())
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     for view in (metrics["test"], *metrics["test"]["views"]):
         view["lpips_vgg"] = 0.4321
     refresh_page(out, load_fit(out), scene, metrics)
-    assert "LPIPS, held out (8 views)" in (out / "index.html").read_text()
+    assert "LPIPS, held out (8 views)" in (out / "index.html").read_text(encoding="utf-8")
     own = (out / "index.html").read_bytes()
     (out / "index.html").write_text("mine")
     refresh_page(out, load_fit(out), scene, metrics)
-    assert (out / "index.html").read_text() == "mine"
+    assert (out / "index.html").read_text(encoding="utf-8") == "mine"
     (out / "index.html").write_bytes(own)
 
 
 def test_without_a_photo_held_out_training_views_are_shown(fitted: Any) -> None:
     out, scene = fitted
-    metrics = json.loads((out / "metrics.json").read_text()) | {"test": None, "seen": None}
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8")) | {"test": None, "seen": None}
     refresh_page(out, load_fit(out), replace(scene, test=scene.test.select([])), metrics)
-    text = (out / "index.html").read_text()
+    text = (out / "index.html").read_text(encoding="utf-8")
     assert "No photo was held out" in text
     assert "The training photos." in text
     assert text.count('class="render"') == 3
@@ -144,10 +144,10 @@ def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monk
     config = replace(CONFIG, init="random", init_points=50)
     request = REQUEST | {"scene": str(folder)}
     run.fit_scene(load_scene(folder, 3), config, tmp_path, request=request, say=lambda line: None)
-    before = json.loads((tmp_path / "metrics.json").read_text())
+    before = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     monkeypatch.setattr(Lpips, "load", lambda weights: Half())
     evaluate(tmp_path, lpips_weights=tmp_path)
-    after = json.loads((tmp_path / "metrics.json").read_text())
+    after = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     for part in ("test", "train"):
         for row, old in zip([after[part], *after[part]["views"]], [before[part], *before[part]["views"]], strict=True):
             assert row["lpips_vgg"] > 0

@@ -69,11 +69,24 @@ def test_a_second_render_replaces_the_first(splat, llff):
     assert hashes(out) == first
 
 
+def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_path):
+    for background, least in (("black", 0.0), ("white", 1.0)):
+        out = tmp_path / background
+        render(splat, cameras=llff, out=out, downscale=2.0, background=background)
+        pictures = [cv2.imread(str(path)) for path in sorted(out.iterdir())]
+        assert {picture.shape for picture in pictures} == {(15, 20, 3)}
+        assert {int(picture[0, 0].max()) for picture in pictures} == {round(255 * least)}  # no Gaussian is there
+    page(splat, cameras=llff, out=tmp_path / "page.html", downscale=2.0, background="white")
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "10 photos of 20 × 15 pixels" in text
+    assert '"background":[1.0,1.0,1.0]' in text
+
+
 def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     out, decoded, plain = tmp_path / "page.html", [], load.read_image
     monkeypatch.setattr(load, "read_image", lambda path: decoded.append(path.name) or plain(path))
     page(splat, cameras=llff, out=out)
-    text = out.read_text()
+    text = out.read_text(encoding="utf-8")
     assert len(decoded) == 6  # of ten: there may be hundreds
     assert all(f'alt="photo {name}"' in text for name in decoded)
     assert "10 photos of 40 × 30 pixels" in text

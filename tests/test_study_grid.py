@@ -47,7 +47,7 @@ def where(request):
 
 
 def test_rows_come_in_the_order_of_the_cells(tmp_path, threads):
-    cells = [{"x": x, "log": str(tmp_path), "seconds": 0.3 * (x == 0), "kill": None} for x in range(4)]
+    cells = [{"x": x, "log": str(tmp_path), "seconds": 0.6 * (x == 0), "kill": None} for x in range(4)]
     rows = run_grid(cells, do, tmp_path / "g.jsonl", scheduler=threads, say=quiet)
     assert [row["result"]["y"] for row in rows] == [0, 1, 4, 9]
     assert [row["cell"]["x"] for row in read_rows(tmp_path / "g.jsonl")][-1] == 0
@@ -151,7 +151,7 @@ def test_a_killed_grid_leaves_no_process_and_goes_on(tmp_path, monkeypatch, thre
 from pathlib import Path
 from grid_cells import do
 from kgs.bench.study.grid import run_grid
-run_grid({cells!r}, do, Path({str(path)!r}))
+run_grid({cells!r}, do, Path({str(path)!r}), processes=2)
 """
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
