@@ -77,7 +77,7 @@ def test_the_preset_cpu_holds_what_the_study_must_show(data):
         ("nerfstudio/fox", 6),
         ("colmap/monstree", 12),
     ):
-        for method in ("off", "progressive 0.2", "auto"):
+        for method in ("off", "progressive 0.2", "auto", "auto, off"):
             assert count[scene, views, "dense", method] == 3
     assert all(count["llff/fern", 3, "dense", method] == 3 for method in METHODS)
     assert {cell["fit"]["steps"] for cell in cells} == {2000}

@@ -71,7 +71,7 @@ def _cpu(data: Path) -> list[Block]:
     every, auto = SCENES.items(), (AUTO, AUTO_OFF)
     main: list[Any] = [*(([scene], ["dense"], names) for names in (MAIN, auto) for scene in every)]
     blocks: list[Block] = [([seed], *block) for seed in range(3) for block in main]
-    blocks += [([seed], MORE_VIEWS, ["dense"], names) for seed in range(3) for names in ((OFF, PAPER), [AUTO])]
+    blocks += [([seed], MORE_VIEWS, ["dense"], names) for seed in range(3) for names in ((OFF, PAPER), auto)]
     blocks += [([seed], every, ["sift"], [PAPER]) for seed in range(3)]
     blocks += [(range(3), [("blender/lego", 8)], ["scene"], MAIN)]
     blocks += [(range(3), [(fern, 3)], ["dense"], [name for name in METHODS if name not in (*MAIN, *auto)])]
