@@ -7,7 +7,7 @@ BITMAPINFOHEADER), TIFF 6.0 (sections 2, 8 and 18).
 import mmap
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from kgs.errors import DataError
@@ -138,16 +138,22 @@ def _tags(data: Buffer) -> dict[int, tuple[int, int]]:
     order = "<" if data[:1] == b"I" else ">"
     start = struct.unpack_from(f"{order}I", data, 4)[0]
     tags: dict[int, tuple[int, int]] = {}
+    for tag, (form, _, at) in tiff_entries(data, order, start, {3: "H", 4: "I"}):
+        # of a tag that occurs twice the larger value counts, so that no size is larger than it seems
+        tags[tag] = max(tags.get(tag, (0, 0)), (struct.unpack_from(form, data, at)[0], at))
+    return tags
+
+
+def tiff_entries(
+    data: Buffer, order: str, start: int, forms: Mapping[int, str]
+) -> Iterator[tuple[int, tuple[str, int, int]]]:
+    """The entries of a TIFF's directory whose kind has a form: tag, form of a value, how many, and where they stand."""
     for at in range(start + 2, start + 2 + 12 * struct.unpack_from(f"{order}H", data, start)[0], 12):
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, at)
-        if kind in (3, 4):
-            form, size = ("H", 2) if kind == 3 else ("I", 4)
-            at += 8
-            if count * size > 4:
-                at = struct.unpack_from(f"{order}I", data, at)[0]
-            # of a tag that occurs twice the larger value counts, so that no size is larger than it seems
-            tags[tag] = max(tags.get(tag, (0, 0)), (struct.unpack_from(order + form, data, at)[0], at))
-    return tags
+        if kind in forms:
+            form = order + forms[kind]
+            inside = count * struct.calcsize(form) <= 4
+            yield tag, (form, count, at + 8 if inside else struct.unpack_from(f"{order}I", data, at + 8)[0])
 
 
 _TIFF = {b"II*\0": _tiff, b"MM\0*": _tiff}

@@ -10,6 +10,7 @@ from os import PathLike
 from pathlib import Path
 
 import kornia.geometry as kg
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -75,9 +76,9 @@ def load_scene(
     for name, value, known in (("background", background, _BACKGROUNDS), ("points", points, ("none", "model-points"))):
         if value not in known:
             raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
-    if downscale is not None and not (isinstance(downscale, (int, float)) and 1 <= downscale < math.inf):
+    if downscale is not None and not (isinstance(downscale, int | float | np.number) and 1 <= downscale < math.inf):
         raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
-    whole = isinstance(hold_out, int) and not isinstance(hold_out, bool)
+    whole = isinstance(hold_out, int | np.integer) and not isinstance(hold_out, bool)
     if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
         raise ValueError(f"hold_out (--hold-out): expected None, 0 or a whole number of at least 2, got {hold_out!r}")
     root = Path(path)

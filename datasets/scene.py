@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kgs.errors import DataError
+from kgs.types import check_tensor
 
 
 def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
@@ -29,15 +30,16 @@ class Views:
 
     Args:
         cameras: the V cameras; height and width of each equal the images'.
-        images: RGB in [0, 1], `(V, 3, H, W)`; on the "meta" device (a shape without pixels) in a scene that was
-            loaded with `photos=False`.
+        images: floating point RGB in [0, 1], `(V, 3, H, W)`; on the "meta" device (a shape without pixels) in a scene
+            that was loaded with `photos=False`.
         names: file names, unique, in the order of the images.
         masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
         light: `(H, W)` in [0, 1], how much of the scene's light each pixel of all images lets through, or None: all.
             It is below 1 in the dark border that removing a lens's distortion can leave.
 
     Raises:
-        ValueError: counts, shapes or sizes do not fit.
+        TypeError: the images are no tensor of floating point numbers.
+        ValueError: counts, shapes or sizes do not fit, or two names are equal.
 
     Examples:
         >>> from torch.utils.data import DataLoader
@@ -55,6 +57,11 @@ class Views:
 
     def __post_init__(self) -> None:
         count = len(self.names)
+        check_tensor("images", self.images)
+        if not self.images.is_floating_point():
+            raise TypeError(f"images: expected floating point RGB in [0, 1], got {self.images.dtype}")
+        if len(set(self.names)) < count:
+            raise ValueError("names: expected each once, got two that are equal")
         if self.images.ndim != 4 or self.images.shape[:2] != (count, 3):
             raise ValueError(f"images: expected shape ({count}, 3, H, W), got {tuple(self.images.shape)}")
         if self.cameras.batch_size != count:
@@ -105,8 +112,9 @@ class Views:
         names = tuple(self.names[i] for i in indices)
         return replace(self, cameras=self.camera(rows), images=self.images[rows], names=names, masks=masks)
 
-    def shaded(self, image: Tensor) -> Tensor:
-        """An image of the scene, `(..., H, W)`, behind the border that these views' photos have, if any."""
+    def as_photo(self, render: Tensor) -> Tensor:
+        """A render `(..., H, W)` as these views' photos show it: in [0, 1], behind the border that they may have."""
+        image = render.clamp(0, 1)
         return image if self.light is None else image * self.light.to(image)
 
     @property

@@ -87,11 +87,14 @@ def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers
 
     A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make a new one in each step.
 
+    Convention:
+        World-to-camera matrices, OpenCV axes. In the result pixels have integer centres, whatever `Ks` have.
+
     Args:
         viewmats: world-to-camera matrices, OpenCV axes, `(C, 4, 4)`, or `(4, 4)` for one.
         Ks: intrinsics in pixels, `(C, 3, 3)` or `(C, 4, 4)`, or one matrix for all cameras.
-        width: of the images in pixels.
-        height: of the images in pixels.
+        width: of the images in pixels, an integer >= 1.
+        height: likewise.
         pixel_centers: where the first pixel's centre lies in the coordinates of `Ks`: "integer" at (0, 0) as in Kornia
             and OpenCV, "half" at (0.5, 0.5) as in COLMAP and gsplat.
 

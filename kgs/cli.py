@@ -18,10 +18,10 @@ from itertools import pairwise
 from typing import Annotated, Any, get_type_hints
 
 from .errors import DataError, TrainingDiverged
-from .fit.commands import demo, evaluate, fit, render
+from .fit.commands import demo, evaluate, fit
 from .fit.config import FAST, PRESETS, FitConfig, Recipe
-from .fit.page_command import page
 from .fit.progress import say
+from .fit.splat_commands import page, render
 
 _COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate, "page": page}
 _BENCHES = {

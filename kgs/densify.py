@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from .camera import camera_centers
 from .covariance import rotation_matrices
 from .model import GaussianModel
-from .types import ProjectedGaussians
+from .types import ProjectedGaussians, check_kind, check_tensor
 
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
@@ -62,6 +62,7 @@ class Densifier:
         generator: the stream for the children's places; None makes one of its own, seeded with 0.
 
     Raises:
+        TypeError: `model` is no GaussianModel.
         ValueError: a number is out of range, or the optimizer does not hold the model's parameters or keeps another
             state (from `step` and `reset_opacity` too, which then change nothing).
 
@@ -84,6 +85,7 @@ class Densifier:
         max_gaussians: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
+        check_kind("model", model, GaussianModel)
         most = 1 if max_gaussians is None else max_gaussians
         for name, number, fits, expected in (
             ("extent", extent, 0.0 < extent < math.inf, "a finite number > 0"),
@@ -124,7 +126,9 @@ class Densifier:
             return
         gradient = projected.means2d.grad
         if gradient is None:
-            raise ValueError("projected: expected means2d.grad, got None; call observe after backward")
+            raise ValueError(
+                "projected: expected means2d.grad, got None: observe comes after backward (and retain_grad)"
+            )
         height, width = projected.image_size
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         ids = projected.gaussian_ids
@@ -248,12 +252,16 @@ def camera_extent(extrinsics: Tensor) -> float:
 
     Source: the normalisation of NeRF++ (Zhang et al., 2020) as 3D Gaussian Splatting uses it; over training cameras.
 
+    Convention:
+        World-to-camera extrinsics; which way the axes point does not matter.
+
     Args:
-        extrinsics: world-to-camera matrices [R | t] with a rotation R, `(C, 4, 4)`, C >= 1, else a ValueError.
+        extrinsics: matrices [R | t] with a rotation R, `(C, 4, 4)`, C >= 1, else a ValueError.
 
     Returns:
         The extent in world units; 0 for a single camera.
     """
+    check_tensor("extrinsics", extrinsics)
     if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
         raise ValueError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
     centres = camera_centers(extrinsics)

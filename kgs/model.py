@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -62,8 +63,9 @@ class GaussianModel(nn.Module):
         super().__init__()
         values = (means, quats, log_scales, opacity_logits, sh_dc, sh_rest)
         for name, value in zip(PARAMETERS, values, strict=True):
-            if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
-                raise TypeError(f"{name}: expected float32 or float64, got {getattr(value, 'dtype', type(value))}")
+            check_tensor(name, value)
+            if value.dtype not in (torch.float32, torch.float64):
+                raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
             check_tensor(name, value, means, " as means")
         most = _check_shapes(values)
         parameters = [nn.Parameter(value.detach().clone()) for value in values]
@@ -84,13 +86,15 @@ class GaussianModel(nn.Module):
             sh_degree: the degree of the harmonics, 0 to 3; the active degree starts there too.
 
         Raises:
-            TypeError: `points` is not float32 or float64, or `colors` is not floating point.
+            TypeError: `points` is no tensor of float32 or float64, or `colors` is not floating point.
             ValueError: shapes do not fit, points are fewer than 4, not finite or all one, or `sh_degree` is no degree.
         """
-        if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"points: expected float32 or float64, got {getattr(points, 'dtype', type(points))}")
-        if not isinstance(colors, Tensor) or not colors.is_floating_point():
-            raise TypeError(f"colors: expected floating point values, got {getattr(colors, 'dtype', type(colors))}")
+        check_tensor("points", points)
+        check_tensor("colors", colors)
+        if points.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"points: expected float32 or float64, got {points.dtype}")
+        if not colors.is_floating_point():
+            raise TypeError(f"colors: expected floating point values, got {colors.dtype}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
             shapes = f"{tuple(points.shape)} and {tuple(colors.shape)}"
             raise ValueError(f"points, colors: expected two of shape (N, 3), got {shapes}")
@@ -187,9 +191,9 @@ class _JoinedBands(torch.autograd.Function):
 
 
 def _check_degree(value: int, most: int) -> int:
-    if not isinstance(value, int) or not 0 <= value <= most:
+    if not isinstance(value, int | np.integer) or not 0 <= value <= most:
         raise ValueError(f"sh_degree: expected an integer from 0 to {most}, got {value!r}")
-    return value
+    return int(value)
 
 
 def _check_shapes(values: Sequence[Tensor]) -> int:

@@ -21,7 +21,7 @@ from torch import Tensor
 from .errors import DataError
 from .json_files import write_whole
 from .model import GaussianModel
-from .types import SH_SIZES
+from .types import SH_SIZES, check_kind
 
 MAX_HEADER = 1 << 16
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -46,12 +46,14 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
 
     Raises:
+        TypeError: `model` is no GaussianModel.
         ValueError: `offset` has another shape, or a value is not finite in float32.
     """
+    check_kind("model", model, GaussianModel)
     values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
     n, means = len(model), values["means"].astype(np.float64)
     if offset is not None:  # not + 0: that would lose the sign of zero
-        means += _vector("offset", offset)
+        means += as_vector("offset", offset)
     rest = values["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * model.sh_rest.shape[1])
     parts = [means, np.zeros((n, 3)), values["sh_dc"][:, 0], rest, values["opacity_logits"][:, None]]
     with np.errstate(over="ignore"):
@@ -86,7 +88,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
             the header says, or a value is not finite.
         ValueError: `origin` has another shape or is not finite.
     """
-    path, start = Path(path), np.zeros(3) if origin is None else _vector("origin", origin)
+    path, start = Path(path), np.zeros(3) if origin is None else as_vector("origin", origin)
     try:
         with open(path, "rb") as file:
             order, elements, degree = _read_header(path, file)
@@ -124,7 +126,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     return GaussianModel(means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, degree)
 
 
-def _vector(name: str, value: Tensor) -> NDArray[np.float64]:
+def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
+    """Three finite numbers in float64; else a ValueError with the argument's name."""
     vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
     if vector.shape != (3,):
         raise ValueError(f"{name}: expected shape (3,), got {vector.shape}")

@@ -16,7 +16,7 @@ from .camera import Cameras, Lens, image_size, intrinsics, lenses
 from .covariance import footprint_factors, rotation_matrices, variances
 from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
-from .types import Gaussians, ProjectedGaussians, RasterOptions, check_tensor
+from .types import Gaussians, ProjectedGaussians, RasterOptions, check_kind, check_tensor
 
 Touches = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
@@ -55,8 +55,7 @@ def project(  # noqa: D417 - options are described in one place
             number of cameras.
     """
     options = RasterOptions(near_plane=near_plane, eps2d=eps2d, alpha_threshold=alpha_threshold)
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
+    check_kind("gaussians", gaussians, Gaussians)
     size = image_size(cameras)
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
         check_tensor("cameras", matrix, gaussians.means, " as the Gaussians")

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -78,7 +79,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         backgrounds: `(C, D)`, or None for 0.
         render_mode: "RGB" (the colours), "D" (sum of w z), "ED" (that over alpha), "RGB+D" or "RGB+ED".
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
-        backend: "auto", or the name of one, see `kgs.backends`.
+        backend: "auto", "torch", or "numba" (float32 on a CPU, tiles of 8), see `kgs.backends`.
 
     Returns:
         Renders `(C, H, W, D)`, where a depth is the last channel; alphas `(C, H, W, 1)`; and a dict `meta` of the M
@@ -89,6 +90,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     Raises:
         TypeError: a tensor is none, or of another dtype or device; an argument that gsplat does not have.
         ValueError: shapes or options do not fit, or an argument of gsplat's asks for what kgs does not do.
+        ModuleNotFoundError: the backend is numba, and it is not installed.
 
     Examples:
         >>> import torch, kgs
@@ -105,15 +107,18 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     for name, value in others.items():
         if name not in _HARMLESS:
             raise TypeError(f"rasterization: got an unexpected argument {name!r}")
-        if isinstance(value, Tensor) or value != _HARMLESS[name]:
-            shown = f"a tensor {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
+        if hasattr(value, "shape") or value != _HARMLESS[name]:
+            shown = f"an array {tuple(value.shape)}" if hasattr(value, "shape") else repr(value)
             raise ValueError(f"{name}: expected {_HARMLESS[name]!r}, all that kgs supports, got {shown}")
     if not far_plane >= 1e10:
         raise ValueError(f"far_plane: expected 1e10 or more, kgs cuts nothing far away, got {far_plane}")
     if render_mode not in _MODES:
         raise ValueError(f"render_mode: expected one of {_MODES}, got {render_mode!r}")
+    check_tensor("means", means)
+    if backgrounds is not None:
+        check_tensor("backgrounds", backgrounds)
     posed = cameras(viewmats, Ks, width, height, pixel_centers)
-    count, n = posed.batch_size, means.shape[0] if isinstance(means, Tensor) and means.ndim else 0
+    count, n = posed.batch_size, means.shape[0] if means.ndim else 0
     colors = _check_colors(colors, sh_degree, count, n)
     image, own = "RGB" in render_mode, sh_degree is None and colors.ndim == 3
     every = colors.transpose(0, 1).flatten(1) if own else colors  # one that is not finite in some camera is in none
@@ -155,7 +160,7 @@ def _check_colors(colors: Tensor, sh_degree: int | None, count: int, n: int) -> 
         if shape[:-1] not in ((n,), (count, n)):
             raise ValueError(f"colors: expected shape ({n}, D) or ({count}, {n}, D) without sh_degree, got {shape}")
         return colors
-    if sh_degree not in range(len(SH_SIZES)):
+    if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
         raise ValueError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree}")
     least = (sh_degree + 1) ** 2
     if len(shape) != 3 or shape[0] != n or shape[1] < least or shape[2] != 3:

@@ -14,7 +14,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from .types import Gaussians
+from .types import Gaussians, RasterOptions, check_kind, check_tensor
 
 __all__ = ["Layers", "layers", "render"]
 
@@ -44,10 +44,10 @@ def render(
     gaussians: Gaussians,
     camera: PinholeCamera,
     background: Tensor | None = None,
-    alpha_threshold: float = 1 / 255,
-    transmittance_stop: float = 1e-4,
-    near_plane: float = 0.01,
-    eps2d: float = 0.3,
+    alpha_threshold: float = RasterOptions.alpha_threshold,
+    transmittance_stop: float = RasterOptions.transmittance_stop,
+    near_plane: float = RasterOptions.near_plane,
+    eps2d: float = RasterOptions.eps2d,
 ) -> Tensor:
     """Render one camera; differentiable with respect to the Gaussians, extrinsics, intrinsics and the background.
 
@@ -64,15 +64,18 @@ def render(
         eps2d: variance in px^2 added to each footprint; with 0 no footprint may be flat.
 
     Returns:
-        The image `(1, 3, H, W)`, float64; with both thresholds 0 the exact sum.
+        The image `(1, 3, H, W)`, or `(1, D, H, W)` of features, which take no background; float64; with both thresholds
+        0 the exact sum.
 
     Raises:
-        TypeError: `camera` is no `PinholeCamera`.
+        TypeError: `gaussians` or `camera` is of another kind.
         ValueError: more than one camera or row of opacities, or a background of another shape.
+        torch.linalg.LinAlgError: `eps2d` is 0 and a footprint is flat.
     """
     drawn = layers(gaussians, camera, alpha_threshold, transmittance_stop, near_plane, eps2d)
     image = torch.einsum("lhw,lc->chw", drawn.weights, drawn.colors)
     if background is not None:
+        check_tensor("background", background)
         if tuple(background.shape) not in {(3,), (1, 3), (1, *image.shape)}:
             raise ValueError(f"background: expected (3,), (1, 3) or (1, 3, H, W), got {tuple(background.shape)}")
         behind = background.double().reshape(3, *(background.shape[2:] or (1, 1)))
@@ -83,14 +86,14 @@ def render(
 def layers(
     gaussians: Gaussians,
     camera: PinholeCamera,
-    alpha_threshold: float = 1 / 255,
-    transmittance_stop: float = 1e-4,
-    near_plane: float = 0.01,
-    eps2d: float = 0.3,
+    alpha_threshold: float = RasterOptions.alpha_threshold,
+    transmittance_stop: float = RasterOptions.transmittance_stop,
+    near_plane: float = RasterOptions.near_plane,
+    eps2d: float = RasterOptions.eps2d,
 ) -> Layers:
     """The layers that :func:`render` adds up; see there for arguments and errors."""
-    if not isinstance(camera, PinholeCamera):
-        raise TypeError(f"camera: expected a kornia PinholeCamera, got {type(camera).__name__}")
+    check_kind("gaussians", gaussians, Gaussians)
+    check_kind("camera", camera, PinholeCamera)
     if camera.batch_size != 1 or gaussians.opacities.numel() != len(gaussians):
         shape = tuple(gaussians.opacities.shape)
         raise ValueError(f"camera: expected one camera and one row of opacities, got {camera.batch_size} and {shape}")

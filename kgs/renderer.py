@@ -12,7 +12,7 @@ from .backends import check_backend
 from .camera import Cameras
 from .projection import normals, project
 from .raster import composite
-from .types import Gaussians, RasterOptions, Rendering, check_tensor
+from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 
@@ -32,10 +32,12 @@ class GaussianRenderer(nn.Module):
 
     Args:
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
-        backend: "auto" (the fastest that covers the call) or "torch", see `kgs.backends`.
+        backend: "auto" (the fastest that covers the call), "torch", or "numba" (float32 on a CPU, tiles of 8), see
+            `kgs.backends`.
 
     Raises:
         ValueError: an option is out of range, or there is no such backend.
+        ModuleNotFoundError: the backend is numba, and it is not installed.
 
     Examples:
         >>> import torch, kgs
@@ -100,12 +102,12 @@ class GaussianRenderer(nn.Module):
 
         Raises:
             TypeError: an argument has another type or dtype.
-            ValueError: an unknown output, or shapes that do not fit.
+            ValueError: an unknown output, shapes that do not fit, `max_bytes` too small for a row of tiles, or the
+                backend that is named does not cover the call.
         """
         if isinstance(outputs, str) or not outputs or set(outputs) - set(_OUTPUTS):
             raise ValueError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
-        if not isinstance(gaussians, Gaussians):
-            raise TypeError(f"gaussians: expected kgs.Gaussians, got {type(gaussians).__name__}")
+        check_kind("gaussians", gaussians, Gaussians)
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
             gaussians = dataclasses.replace(gaussians, opacities=opacities)

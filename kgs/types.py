@@ -22,16 +22,16 @@ class RasterOptions:
     """How Gaussians become pixels: every option with its default and its range, once.
 
     Args:
-        tile_size: side of a tile in pixels; the speed depends on it, the image only by rounding (float32: about 1e-6 at
-            16, growing with the square).
-        near_plane: Gaussians with z <= near_plane are left out; in world units, at least 1e-7 for perspective cameras
-            (Kornia does not divide by less than 1e-8).
-        eps2d: variance in px^2 added to the diagonal of each footprint, the low-pass filter of 3D Gaussian splatting.
+        tile_size: side of a tile in pixels, >= 1; the speed depends on it, the image only by rounding (float32: about
+            1e-6 at 16, growing with the square).
+        near_plane: Gaussians with z <= near_plane are left out; in world units, >= 0. Below 1e-7 perspective cameras
+            are not exact (Kornia does not divide by less than 1e-8).
+        eps2d: variance in px^2 added to the diagonal of each footprint, >= 0: the low-pass filter of 3DGS.
         alpha_threshold: alphas below it are skipped, in [0, 1). The option that trades accuracy for time: 0 is exact;
             the error is at most the number of layers times it.
         transmittance_stop: light below it counts as 0, in [0, 1); the error is at most it.
-        max_bytes: bound for the working memory of one call, beside what is kept for each Gaussian and each pixel; an
-            image that needs more is made in row slices, and the backward pass makes each again.
+        max_bytes: bound for the working memory of one call in bytes, beside what is kept for each Gaussian and each
+            pixel; an image that needs more is made in row slices, and the backward pass makes each again.
 
     Raises:
         ValueError: an option is out of range.
@@ -59,6 +59,9 @@ class RasterOptions:
 @dataclass(frozen=True, eq=False)
 class Gaussians:
     """A set of N Gaussians with activated values: what the renderer draws.
+
+    Convention:
+        World coordinates; a quaternion turns local axes into those of the world, the columns of R are local axes.
 
     Args:
         means: centres in world units, shape `(N, 3)`.
@@ -103,7 +106,10 @@ class Gaussians:
         return True  # also without Gaussians
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """Some of the Gaussians: those of a mask `(N,)`, of indices `(M,)` or of a slice."""
+        """Some of the Gaussians: those of a mask `(N,)`, of indices `(M,)` or of a slice; a TypeError for one index."""
+        given: Any = index
+        if isinstance(given, Integral):
+            raise TypeError(f"index: expected a mask, indices or a slice, got {given}")
         return replace(self, **{k: v[..., index] if k == "opacities" else v[index] for k, v in vars(self).items()})
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
@@ -124,7 +130,8 @@ class ProjectedGaussians:
     Args:
         camera_ids: `(M,)` int64.
         gaussian_ids: `(M,)` int64.
-        means2d: projected centres in pixels, `(M, 2)`. With gradients on, its `.grad` is kept.
+        means2d: projected centres in pixels, `(M, 2)`. A render with gradients on keeps its `.grad`; after
+            :func:`kgs.project` call `means2d.retain_grad()`.
         factors: `(M, 2, 3)`, the product J W R S in pixels: the covariance is `factors @ factors.mT + eps2d I`.
         depths: z in the camera frame, `(M,)`.
         radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.
@@ -198,3 +205,9 @@ def check_tensor(name: str, value: Any, like: Tensor | None = None, whose: str =
         raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
     if like is not None and (value.dtype, value.device) != (like.dtype, like.device):
         raise TypeError(f"{name}: expected {like.dtype} on {like.device}{whose}, got {value.dtype} on {value.device}")
+
+
+def check_kind(name: str, value: Any, kind: type) -> None:
+    """Raise a TypeError where the argument is of another kind: a model in the place of its Gaussians, for instance."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")

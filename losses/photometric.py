@@ -23,6 +23,7 @@ from kornia.losses import ssim_loss
 from torch import Tensor
 
 from kgs.backends import check_backend, choose, compiled_covers, register
+from kgs.types import check_kind
 
 WINDOW, SIGMA = 11, 1.5
 RADIUS = WINDOW // 2
@@ -69,15 +70,16 @@ def photometric_loss(
             whole, 0 without such a window. What is outside has no gradient and may be NaN.
         fast: False keeps to Kornia's own operations, as second derivatives need.
         moments: `target_moments(target)` of this very target, to save that work. Used by the fast path only.
-        backend: one of :func:`kgs.backends.available`. Compiled: the fast path without a mask; torch does the rest.
+        backend: "auto", "torch" or "numba". Compiled: the fast path without a mask; torch does the rest.
 
     Returns:
         The loss, 0-d.
 
     Raises:
-        TypeError: an image is no float32 or float64 tensor, or the two differ in dtype or device.
+        TypeError: an image is no float32 or float64 tensor, the two differ in dtype or device, or `moments` are none.
         ValueError: shapes or the weight do not fit, the mask is empty or has other values than 0 and 1, or the backend
             is not there or does not cover the call.
+        ModuleNotFoundError: the backend is numba, and it is not installed.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
     Examples:
@@ -89,6 +91,8 @@ def photometric_loss(
     _check_images(image, image)
     shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
     moments = target if isinstance(target, TargetMoments) else moments
+    if moments is not None:
+        check_kind("moments", moments, TargetMoments)
     known = None if moments is None else (tuple(moments.mean.shape), moments.mean.dtype, moments.mean.device)
     if known not in (None, (shape, image.dtype, image.device)):
         raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")

@@ -8,7 +8,6 @@ from test_cli import one_line, run
 
 from kgs import DataError, backends
 from kgs.fit import FitConfig, Trainer
-from kgs.fit.checkpoint import save_checkpoint
 from kgs.fit.folder import CHECKPOINT, load_fit
 from kgs.fit.run import fit_scene
 from kgs.json_files import read_json
@@ -65,13 +64,6 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
         assert (resumed.backend, resumed.renderer.backend) == (begun, begun)
     with pytest.raises(DataError, match=f"--backend: expected '{begun}', as the fit was begun with, got '{other}'"):
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
-
-
-def test_a_fit_of_before_there_was_a_choice_goes_on_with_torch(installed, scene, points, tmp_path):
-    state = Trainer(scene, replace(CONFIG, backend="torch"), points).state_dict()
-    del state["backend"], state["config"]["backend"]
-    save_checkpoint(tmp_path / CHECKPOINT, state)
-    assert Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT).backend == "torch"
 
 
 @pytest.mark.parametrize("words", [["fit", "{scene}"], ["demo"], ["render", "x.ply", "--cameras", "{scene}"]])

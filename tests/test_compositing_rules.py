@@ -203,5 +203,5 @@ def test_projection_checks_its_options():
     for name, value in (("alpha_threshold", -1.0), ("near_plane", -0.1), ("eps2d", float("nan")), ("backend", "cuda")):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             project(gaussians, camera, **{name: value})
-    with pytest.raises(TypeError, match="^gaussians: expected kgs.Gaussians, got list"):
+    with pytest.raises(TypeError, match="^gaussians: expected Gaussians, got list"):
         project([gaussians], camera)

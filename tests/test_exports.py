@@ -18,8 +18,8 @@ import kgs
 from kgs.export import film
 from kgs.export.cameras import camera_list, upright
 from kgs.fit import exports
-from kgs.fit.commands import render
 from kgs.fit.outputs import EXPORTS, is_own, write_json
+from kgs.fit.splat_commands import render
 
 
 def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:

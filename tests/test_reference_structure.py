@@ -244,7 +244,7 @@ def test_wrong_arguments_are_named():
     two = PinholeCamera(
         *(torch.cat([value, value]) for value in (SMALL.intrinsics, SMALL.extrinsics, SMALL.height, SMALL.width))
     )
-    with pytest.raises(TypeError, match="camera: expected a kornia PinholeCamera, got str"):
+    with pytest.raises(TypeError, match="camera: expected PinholeCamera, got str"):
         render(gaussians, "camera")
     with pytest.raises(ValueError, match="camera: expected one camera"):
         render(gaussians, two)

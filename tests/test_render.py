@@ -10,8 +10,7 @@ import torch
 import kgs
 from kgs.datasets import load, synthetic_scene
 from kgs.errors import DataError
-from kgs.fit.commands import render
-from kgs.fit.page_command import page
+from kgs.fit.splat_commands import page, render
 
 
 @pytest.fixture(scope="module")

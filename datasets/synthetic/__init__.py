@@ -62,7 +62,8 @@ def synthetic_scene(
     Raises:
         ValueError: the kind is unknown, or a number is out of range.
     """
-    for name, value, least in (("train_views", train_views, 1), ("test_views", test_views, 0), ("size", min(size), 1)):
+    given = {"train_views": train_views, "test_views": test_views, "size": min(size), "seed": seed}
+    for (name, value), least in zip(given.items(), (1, 0, 1, 0), strict=True):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}")
     stage = _stage(kind, seed)

@@ -181,9 +181,9 @@ def framed(picture: Picture, width: float, height: float, border: Texture, rim: 
     return parts
 
 
-def bars(width: float, height: float, color: Color, rim: float = 0.025) -> list[Part]:
+def bars(width: float, height: float, color: Color) -> list[Part]:
     """The cross of a window of that size."""
-    upright, level = (rim, 0.025, height), (width, 0.025, rim)
+    upright, level = (0.025, 0.025, height), (width, 0.025, 0.025)
     return [Part(box(size, (0, -0.0125, 0)), plain(color)) for size in (upright, level)]
 
 

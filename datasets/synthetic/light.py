@@ -15,6 +15,7 @@ MAP_SIZE = 288  # pixels along each side of a depth map
 DISTANCE = 30.0  # m from the middle of the casters to each lamp
 LIFT = 0.012  # m off its surface from where a point looks at the lamps: over the steps of the depth maps
 AMBIENT = np.float32(0.16)  # what reaches every point
+NUM_SUN, NUM_SKY = 6, 18  # lamps
 SUN_COLOR, SKY_COLOR = (0.74, 0.68, 0.58), (0.5, 0.54, 0.6)
 CHUNK = 4096  # points at a time, so that their numbers stay in the cache
 
@@ -28,16 +29,16 @@ class Lights(NamedTuple):
     depths: NDArray[np.float32]  # (L, S, S), infinite where nothing is hit
 
 
-def daylight(casters: Array, sun: Array, sky: Array, num_sun: int = 6, num_sky: int = 18) -> Lights:
+def daylight(casters: Array, sun: Array, sky: Array) -> Lights:
     """Lamps around triangles `(F, 3, 3)`: a sun, and a sky that is half a sphere.
 
     `sun` and `sky` `(3,)` are unit vectors from the scene towards the sun and towards the middle of the sky.
     """
     low, high = casters.min(axis=(0, 1)), casters.max(axis=(0, 1))
     middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
-    directions = np.concatenate([_cap(sun, num_sun, 0.9985), _cap(sky, num_sky, 0.0)])
-    colors = np.repeat([SUN_COLOR, SKY_COLOR], [num_sun, num_sky], axis=0)
-    colors /= np.repeat([num_sun, 0.5 * num_sky], [num_sun, num_sky])[:, None]  # 0.5: the mean cosine
+    directions = np.concatenate([_cap(sun, NUM_SUN, 0.9985), _cap(sky, NUM_SKY, 0.0)])
+    colors = np.repeat([SUN_COLOR, SKY_COLOR], [NUM_SUN, NUM_SKY], axis=0)
+    colors /= np.repeat([NUM_SUN, 0.5 * NUM_SKY], [NUM_SUN, NUM_SKY])[:, None]  # 0.5: the mean cosine
     focal, center = 0.5 * (MAP_SIZE - 2) * np.sqrt(DISTANCE**2 - radius**2) / radius, (MAP_SIZE - 1) / 2
     intrinsics = np.array([[focal, 0, center], [0, focal, center], [0, 0, 1.0]])
     rows, depths = [], []

@@ -16,6 +16,7 @@ from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
 from kgs.fit.outputs import write_png
 from kgs.fit.photos import pose_photos
+from kgs.fit.photos.mapping import quiet_pycolmap
 
 from .output import markdown_table
 from .study.grid import Cell, run_grid
@@ -34,7 +35,7 @@ def cameras(*, out: Path, quick: bool = False, processes: int | None = None, sch
       kgs bench cameras -o cameras-quick --quick
       kgs bench cameras -o cameras --processes 2
 
-    Writes cameras.jsonl and cameras.md.
+    Needs the extra sfm, too. Writes cameras.jsonl and cameras.md.
 
     Args:
         out: folder for the results; cells that its cameras.jsonl has are not repeated.
@@ -42,6 +43,8 @@ def cameras(*, out: Path, quick: bool = False, processes: int | None = None, sch
         processes: cells at a time, one per core unless given.
         scheduler: address of a Dask scheduler whose workers run the cells instead.
     """
+    with quiet_pycolmap():  # a missing package is told once, not for each cell
+        pass
     cells: list[Cell] = [{"world": w, "photos": n, "spacing": d} for w, n, d in product((0, 1), (3, 6), SPACINGS)]
     cells = [{"world": 0, "photos": 3, "spacing": d} for d in (5.0, 60.0)] if quick else cells
     rows = run_grid(cells, arc_cell, out / "cameras.jsonl", scheduler=scheduler, processes=processes)

@@ -149,8 +149,6 @@ class Cases:
         outputs = [getattr(projected, name) for name in names]
         inputs: Any = [x.detach().requires_grad_() for x in outputs]
         yield "projection, harmonics"
-        bin_to_tiles(projected)
-        yield "binning"
         composited = composite(replace(projected, **dict(zip(names, inputs, strict=True))), inputs[3]).features
         yield "compositing, binning included"
         image = composited.detach().requires_grad_()

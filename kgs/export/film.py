@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 def write_film(
-    path: Path,
+    path: str | os.PathLike[str],
     render: Callable[[PinholeCamera], Tensor],
     views: Views,
     depth: float,
@@ -52,6 +52,7 @@ def write_film(
     Returns:
         "", or why there is no film: OpenCV cannot write such files here.
     """
+    path = Path(path)
     height, width = views.images.shape[-2:]
     shrink = min(1.0, LONGEST / max(height, width))
     size = (max(2, 2 * round(height * shrink / 2)), max(2, 2 * round(width * shrink / 2)))

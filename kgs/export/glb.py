@@ -19,6 +19,8 @@ import kgs
 from kgs.harmonics import SH_C0
 from kgs.json_files import write_whole
 from kgs.model import GaussianModel
+from kgs.ply import as_vector
+from kgs.types import check_kind
 
 _NAME = "KHR_gaussian_splatting"
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -44,14 +46,18 @@ def save_glb(
             translation.
 
     Raises:
-        ValueError: a value is not finite in float32.
+        TypeError: `model` is no GaussianModel.
+        ValueError: a value is not finite in float32, or `rotation` or `offset` has another shape.
     """
+    check_kind("model", model, GaussianModel)
+    if tuple(rotation.shape) != (3, 3) or not bool(rotation.isfinite().all()):
+        raise ValueError(f"rotation: expected finite numbers of shape (3, 3), got {rotation.tolist()}")
     attributes = _attributes(model)
     for name, values in attributes.items():
         if not np.isfinite(values).all():
             raise ValueError(f"model: expected values that are finite in float32, got others in {name}")
     turn = rotation.double().cpu()
-    shift = torch.zeros(3).double() if offset is None else turn @ offset.double().cpu()
+    shift = torch.zeros(3).double() if offset is None else turn @ torch.from_numpy(as_vector("offset", offset))
     quaternion = rotation_matrix_to_quaternion(turn)[[1, 2, 3, 0]]
     node: dict[str, Any] = {"name": "splat", "rotation": quaternion.tolist(), "translation": shift.tolist()}
     document: dict[str, Any] = {

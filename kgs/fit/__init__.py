@@ -1,5 +1,7 @@
 """Fits: turns a scene into a splat, with one call or in a loop of your own.
 
+`first_points` needs the packages of kgs alone; `Trainer`, `fit_scene` and `kgs.fit.photos` need the extra `app`.
+
 Examples:
     >>> from kgs.fit import FitConfig, Trainer, first_points
     >>> from kgs.datasets import synthetic_scene

@@ -1,19 +1,16 @@
-"""What `kgs demo`, `fit`, `render` and `eval` do; options are arguments. Checks come before work and heavy imports."""
+"""What `kgs demo`, `fit` and `eval` do; options are arguments. Checks come before work and heavy imports."""
 
 import math
 import os
-import shlex
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 from kgs.errors import DataError
 
-from .config import DEMO, Backend, FitConfig, Recipe
-from .progress import each, say
+from .config import DEMO, Backend, FitConfig
+from .progress import VIEWER, as_line, say, say_next
 
-_VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"
 _Background = Literal["black", "white"]
 
 
@@ -44,12 +41,13 @@ def demo(
     from kgs.datasets import synthetic_scene
 
     from .demo import run_demo
+    from .machine import check_tools
     from .outputs import EXPORTS, check_folder
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     if min(size) < 12:  # the window of SSIM
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
-    _prepare(device, backend, "matplotlib", "jinja2")
+    check_tools(device, backend, "matplotlib", "jinja2")
     check_folder(out, ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS])
     runs = run_demo(synthetic_scene("room", train_views=3, test_views=5, size=size, seed=seed), config, out)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
@@ -60,10 +58,10 @@ def demo(
     gain = level["with"][0] - level["without"][0]
     say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
     say(f"pictures: {out / 'demo.png'}, {out / 'curve.png'}")
-    _next(
-        f"open {_line(out / 'index.html')} in a browser",
+    say_next(
+        f"open {as_line(out / 'index.html')} in a browser",
         "kgs fit PHOTOS -o OUT  # three or more photos of your own",
-        _VIEWER.format(_line(out / "splat.ply")),
+        VIEWER.format(as_line(out / "splat.ply")),
     )
 
 
@@ -90,8 +88,8 @@ def fit(
       kgs fit fern -o fern-3 --views 3 --downscale 2
 
     Args:
-        scene: a folder of 3 or more photos, whose cameras are found first (extra sfm); or one with camera poses: LLFF,
-            COLMAP, Blender or nerfstudio.
+        scene: a folder of 3 or more photos, whose cameras are found first (extra sfm) and written to the output folder
+            (images, sparse/0, photos.json); or one with camera poses: LLFF, COLMAP, Blender or nerfstudio.
         out: folder for index.html, the page to look at, turntable.webm, a film, splat.ply and .glb, cameras.json,
             metrics.json, test/*.png, curve.png, config.json and the checkpoints.
         views: training views, spread over the views that are not held out; all of them unless given.
@@ -108,9 +106,12 @@ def fit(
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
+    del preset, fast  # kgs.cli has read them: they are the defaults of `config`
     from kgs.datasets.layouts import CAMERAS_REPORT
 
     from .folder import UNFINISHED, is_finished, taken
+    from .lpips import Lpips
+    from .machine import check_tools
     from .metrics import in_words
     from .minutes import expected_minutes
     from .outputs import check_folder, is_own
@@ -120,7 +121,8 @@ def fit(
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
-    lpips = _prepare(config.device, config.backend, "matplotlib", "safetensors", "jinja2", lpips=lpips_weights)
+    check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
+    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     check_folder(out, taken(out), scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["hold_out"] = hold_out
@@ -152,78 +154,21 @@ def fit(
     if what := left_out(metrics["needs"]):
         say(f"left out: {what}")
     if stopped_by:
-        _next("the same command with --resume goes on where it stopped")
+        say_next("the same command with --resume goes on where it stopped")
         return 128 + stopped_by
-    _next(
-        f"open {_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
-        f"{_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
-        f"{_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
-        _VIEWER.format(_line(splat)),
+    say_next(
+        f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
+        f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
+        f"{as_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
+        VIEWER.format(as_line(splat)),
     )
     return 0
-
-
-def render(
-    ply: Path,
-    /,
-    *,
-    cameras: Path,
-    out: Path,
-    downscale: float | None = None,
-    background: Literal[_Background, "transparent"] = "black",
-    device: str = "cpu",
-    backend: Backend = "auto",
-) -> None:
-    """Render a splat from every camera of a scene into PNGs.
-
-    For example:
-      kgs render fern-3/splat.ply --cameras fern -o renders
-      kgs render fern-3/splat.ply --cameras fern -o small --downscale 8 --background white
-
-    Args:
-        ply: a 3DGS PLY file.
-        cameras: the scene (LLFF, COLMAP, Blender or nerfstudio folder) whose cameras to use.
-        out: folder for the PNGs, named like the scene's photos; not where these are.
-        downscale: shrink the pictures by this factor.
-        background: behind the splat; transparent: PNGs with an alpha channel.
-        device: cpu, cuda, ...
-        backend: as of kgs fit.
-    """
-    import torch
-
-    from kgs.camera import move_camera
-    from kgs.datasets import load_scene
-    from kgs.ply import load_ply
-    from kgs.renderer import GaussianRenderer
-
-    from .outputs import check_folder, png_names, write_png
-    from .starts import typical_depths
-
-    _prepare(device, backend)
-    check_folder(out, (), cameras, make=False)
-    clear = background == "transparent"
-    scene = load_scene(cameras, None, downscale, background="black" if clear else background, photos=False)
-    model = load_ply(ply, origin=scene.offset)
-    near_plane = Recipe().near_plane * typical_depths(scene.train, model.means)[0]  # from the Gaussians themselves
-    posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
-    names = png_names(name for name, _ in posed)
-    check_folder(out, names.values(), scene.root)
-    renderer = GaussianRenderer(near_plane=near_plane, backend=backend).eval()
-    model, background_color = model.to(device), scene.background.to(device)
-    outputs = ("image", "alpha") if clear else ("image",)
-    for name, camera in each(posed, "pictures", "view"):
-        with torch.no_grad():
-            seen = renderer(model(), move_camera(camera, torch.device(device)), background_color, outputs)
-        image = torch.cat([seen.image / seen.alpha.clamp_min(1e-6), seen.alpha], 1) if clear else seen.image
-        write_png(out / names[name], image[0])
-    say(f"{len(names)} pictures in {out}")
-    _next(_VIEWER.format(_line(ply)))
 
 
 def evaluate(
     out: Path, /, *, lpips_weights: Path | None = None, device: str = "cpu", backend: Backend = "auto"
 ) -> None:
-    """Measure a fit again and bring its metrics.json up to date; what is not measured stays as it is.
+    """Measure a fit again and bring its metrics.json and page up to date; what is not measured stays as it is.
 
     For example:
       kgs eval fern-3
@@ -238,11 +183,14 @@ def evaluate(
     from kgs.json_files import read_json
 
     from .folder import load_fit
+    from .lpips import Lpips
+    from .machine import check_tools
     from .metrics import in_words, measure_again
     from .outputs import write_json
     from .page import PAGE, refresh_page
 
-    lpips = _prepare(device, backend, "jinja2", lpips=lpips_weights)
+    check_tools(device, backend, "jinja2")
+    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
     saved, path = load_fit(out, device), out / "metrics.json"
     saved = saved if backend == "auto" else saved._replace(backend=backend)
     scene = saved.placed(_load(saved.request, out))
@@ -251,23 +199,7 @@ def evaluate(
     refresh_page(out, saved, scene, metrics)
     say(in_words(metrics))
     say(f"{path} and {out / PAGE} are up to date")
-    _next(f"open {_line(out / PAGE)} in a browser")
-
-
-def _prepare(device: str, backend: str, *packages: str, lpips: Path | None = None) -> Any:
-    """Make sure before any work that all this is there; the perceptual metric, where it is asked for."""
-    from kgs.backends import resolve
-
-    from .machine import check_device
-
-    resolve(backend, check_device(device))
-    for package in packages:
-        import_module(package)
-    if lpips is None:
-        return None
-    from .lpips import Lpips
-
-    return Lpips.load(lpips).to(device)
+    say_next(f"open {as_line(out / PAGE)} in a browser")
 
 
 def _load(request: dict[str, Any], out: Path) -> Any:
@@ -279,11 +211,3 @@ def _load(request: dict[str, Any], out: Path) -> Any:
     for note in scene.notes:
         say(note)
     return scene
-
-
-def _line(*words: object) -> str:
-    return shlex.join(map(str, words))
-
-
-def _next(*steps: str) -> None:
-    say("\n  ".join(["next:", *steps]))

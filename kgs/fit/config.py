@@ -12,6 +12,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
+from kgs.types import RasterOptions
+
 
 class _Range(NamedTuple):
     """What a number may be; `ends` says which of the two limits belong to it, "[" and "]" that they do."""
@@ -98,10 +100,13 @@ class Recipe:
 class FitConfig:
     """What one fit is asked to do. NumPy's numbers are taken as Python's.
 
+    `fit_scene` and the command act on all entries. A `Trainer` takes its points as they are and does all steps: for it
+    minutes, init, init_file, init_points, draw and keep_all have no effect, and no `sh_degree` means 0.
+
     Args:
         steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
-        minutes: from first points to the last step, in the place of `steps`: :func:`kgs.fit.fit_scene` and the command
-            fix the steps once, after a warm-up, to within a tenth; a resumed fit keeps them. A Trainer goes by `steps`.
+        minutes: from first points to the last step, in the place of steps. Their number is fixed once, after a warm-up,
+            to within a tenth; a resumed fit keeps it.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         drop_until: share of the steps, the first ones, in which Gaussians are dropped; in [0, 1].
@@ -110,7 +115,7 @@ class FitConfig:
         opacity_l1: weight of the L1 penalty on opacities; 0 leaves it out.
         opacity_l1_by: the penalty is heavier on Gaussians with a low mean gradient, or at a great distance.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, what the training
-            views need, see :mod:`kgs.fit.needs`.
+            views need, which short fits find out.
         refine_poses: move the training cameras too, for poses that are half a degree or more off: good ones lose a
             little. What all cameras have in common stays; test cameras stay as given.
         coarse: share of the steps, the first ones, that see the training views at half their width; in [0, 1].
@@ -118,7 +123,7 @@ class FitConfig:
         init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
             view. sift: from matches of their keypoints. random: where at least two images see. scene: the random points
             that Blender's layout prescribes. model-points: those of a COLMAP model, refined with the test views too.
-            file: those of init_file.
+            file: those of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
         init_points: how many first points random gives, and dense at most.
         draw: how these are chosen. spread: one from each of as many even cells of the pictures. uniform: all alike.
@@ -126,14 +131,14 @@ class FitConfig:
             a photo is opaque. scene: that of the scene, as in test views.
         max_gaussians: densification stops at this number; unless given 10 per step, and at least 1.5 times the first
             points.
-        growth: share of the steps over which the limit rises evenly from the first points to max_gaussians; 0 sets it
-            at once. In [0, 1].
+        growth: share of the steps over which that limit rises evenly from the number of first points; 0 sets it at
+            once. In [0, 1].
         keep_all: keep Gaussians that no training view shows, and harmonics that change no picture.
         max_bytes: bound for the working memory of a render in bytes; it changes rounding alone.
         evaluations: how often the curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
         backend: numba: compiled, several times faster, on a CPU alone. auto: that where it is installed, else torch.
-        recipe: all the other numbers.
+        recipe: all the other numbers, a `kgs.fit.config.Recipe`.
 
     Raises:
         ValueError: an entry is out of range or of another kind; the message begins with its name.
@@ -159,7 +164,7 @@ class FitConfig:
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
     growth: _Share = 0.0
     keep_all: bool = False
-    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30
+    max_bytes: Annotated[int, _Range(1, 2**62)] = RasterOptions.max_bytes
     evaluations: _Steps = 8
     device: str = "cpu"
     backend: Backend = "auto"
@@ -187,13 +192,12 @@ class FitConfig:
 class Choice(NamedTuple):
     """What an entry of FitConfig that is None may become."""
 
-    cheaper: Any
+    cheaper: Any  # also where there are too few views for probes
     dearer: Any
-    rule: Any  # where there are too few views for probes
 
 
 # Measured, see docs/recipe.md.
-CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3, rule=0)}
+CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3)}
 
 
 class Timetable(NamedTuple):

@@ -17,6 +17,6 @@ def write_exports(trainer: Trainer, folder: Path) -> None:
     scene, model = trainer.scene, trainer.shown
     write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset))
     save_glb(folder / "splat.glb", model, upright(scene.train.cameras.extrinsics), scene.offset)
-    depth = typical_depths(scene.train, model.means.detach().cpu())[1]
+    depth = typical_depths(scene.train, model.means)[1]
     if note := write_film(folder / "turntable.webm", trainer.render, scene.train, depth, each):
         trainer.notes.append(note)

@@ -43,10 +43,9 @@ def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    return FigureCanvasAgg(Figure((width, height), layout="constrained")).figure
+    return Figure((width, height), layout="constrained")
 
 
 def _write(path: Path, figure: Any) -> None:

@@ -36,24 +36,33 @@ _OPTIONAL = (previous(Path(CHECKPOINT)).name, "turntable.webm", "checkpoint.pt",
 
 
 @contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Keep other fits out of a folder until the block or the process ends; DataError where one is at work there."""
-    with open(out / ".lock", "ab") as file:
+def held(path: Path) -> Iterator[bool]:
+    """Hold a file, made if it is not there, until the block or the process ends; False where another one has it."""
+    with open(path, "ab") as file:
+        ours = True
         try:
             if sys.platform == "win32":
                 import msvcrt
 
-                file.seek(0)
+                file.seek(2**30)  # behind its end: what is locked cannot be read
                 msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
             else:
                 import fcntl
 
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError) as error:
-            reason = "another fit is at work in this folder: wait for it or choose another --out"
-            raise DataError(out, "", reason) from error
+        except (BlockingIOError, PermissionError):
+            ours = False
         except OSError:
             pass  # a file system without locks
+        yield ours
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep other fits out of a folder until the block or the process ends; DataError where one is at work there."""
+    with held(out / ".lock") as ours:
+        if not ours:
+            raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another --out")
         yield
 
 
@@ -147,8 +156,8 @@ class SavedFit(NamedTuple):
     @torch.no_grad()
     def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
         """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
-        rules: dict[str, Any] = {"max_bytes": self.config.max_bytes, "backend": self.backend}
-        renderer, device = GaussianRenderer(near_plane=self.near_plane, **rules).eval(), self.model.means.device
+        device, most = self.model.means.device, self.config.max_bytes
+        renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=most, backend=self.backend).eval()
         image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
         return image
 

@@ -79,10 +79,10 @@ class Lpips(nn.Module):
         folder, files = Path(folder), (f"{net}_features.npz", f"lpips_lin_{net}.npz")
         if not folder.is_dir():
             raise DataError(folder, "", f"expected a folder with {files[0]} and {files[1]}, got none")
-        shapes: tuple[dict[str, tuple[int, ...]], ...] = ({}, {})
-        for name, value in module.state_dict().items():
-            shapes[name.startswith("lin")][name] = tuple(value.shape)
-        module.load_state_dict(_read(folder / files[0], shapes[0]) | _read(folder / files[1], shapes[1]), assign=True)
+        shapes = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+        heads = {name: shape for name, shape in shapes.items() if name.startswith("lin")}
+        features = {name: shape for name, shape in shapes.items() if name not in heads}
+        module.load_state_dict(_read(folder / files[0], features) | _read(folder / files[1], heads), assign=True)
         return module.requires_grad_(False).eval()
 
     def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:

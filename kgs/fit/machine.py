@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import sys
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kgs import __version__
+from kgs.backends import resolve
 
 # Measured, with room: what libraries load at first use; parameters, gradients, moments and copies of each Gaussian.
 _AT_FIRST_USE, _PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
@@ -28,6 +30,15 @@ def check_device(name: str) -> torch.device:
         reason = str(error).partition(". ")[0].splitlines()[0]
         raise ValueError(f"device: expected cpu or a GPU of this machine, got {name!r} ({reason:.120})") from error
     return device
+
+
+def check_tools(device: str, backend: str, *packages: str) -> torch.device:
+    """The device; an error where it, the backend or a package that a command will need is not there."""
+    place = check_device(device)
+    resolve(backend, place)
+    for package in packages:
+        import_module(package)
+    return place
 
 
 def versions() -> dict[str, str]:

@@ -51,7 +51,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
-        rows.append(_measure(views.shaded(image.clamp(0.0, 1.0)), target.to(image), lpips))
+        rows.append(_measure(views.as_photo(image), target.to(image), lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
     means = {key: fmean(values) if values and None not in values else None for key, values in columns.items()}
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
@@ -59,7 +59,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 
 def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float | None:
     """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
-    renders = (views.shaded(render(views.camera(i))[0].clamp(0, 1).cpu()) for i in range(len(views)))
+    renders = (views.as_photo(render(views.camera(i))[0].cpu()) for i in range(len(views)))
     values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
     mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
     return round(mean, 4) if math.isfinite(mean) else None

@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from statistics import fmean, stdev
 from typing import Any
 
@@ -50,7 +51,7 @@ def decide(
         standard error of the gain) and "n" (left-out views).
     """
     still_open = [name for name in CHOICES if getattr(config, name) is None]
-    by_rule = {name: CHOICES[name].rule for name in still_open}
+    settled = replace(config, **{name: CHOICES[name].cheaper for name in still_open})
     views, fits = scene.train, 1 + len(still_open)
     steps = math.floor(SHARE * config.steps / (FOLDS * fits))
     reasons = {
@@ -61,25 +62,27 @@ def decide(
     }
     if not still_open or any(reasons.values()):
         why = {"by": "rule", "why": next((reason for reason, holds in reasons.items() if holds), "")}
-        return replace(config, **by_rule), {name: {"chosen": by_rule[name], **why} for name in still_open}
-    settled, needs = replace(config, **{name: CHOICES[name].cheaper for name in still_open}), dict[str, Any]()
+        return settled, {name: {"chosen": CHOICES[name].cheaper, **why} for name in still_open}
+    needs, cheap = dict[str, Any](), _hasty(settled, steps)
+
+    @lru_cache(maxsize=1)  # the fits of one left-out view follow each other
+    def start(fold: int) -> tuple[Scene, FirstPoints]:
+        small = _without(scene, fold)
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            return small, choose(small, cheap)
+
     variants = [settled, *(replace(settled, **{name: CHOICES[name].dearer}) for name in still_open)]
     left_out = [round((fold + 0.5) * len(views) / FOLDS - 0.5) for fold in range(FOLDS)]
-    levels: list[list[float]] = []
+    levels: dict[int, list[float]] = {fold: [] for fold in left_out}
     for fold, variant in stage([(f, v) for f in left_out for v in variants], "probes", "fit"):
-        probe = _hasty(variant, steps)
-        if variant is settled:
-            small = _without(scene, fold)
-            with warnings.catch_warnings(action="ignore", category=UserWarning):
-                points = choose(small, probe)
-            levels.append([])
-        trainer = Trainer(small, probe, points)
+        small, points = start(fold)
+        trainer = Trainer(small, _hasty(variant, steps), points)
         trainer.fit()
-        levels[-1].append(trainer.psnr(small.test) or BEST)
+        levels[fold].append(trainer.psnr(small.test) or BEST)
     for place, name in enumerate(still_open, 1):
-        gains = [row[place] - row[0] for row in levels]
+        gains = [row[place] - row[0] for row in levels.values()]
         gain, noise = fmean(gains), stdev(gains) / math.sqrt(len(gains))
-        cheaper, dearer, _ = CHOICES[name]
+        cheaper, dearer = CHOICES[name]
         chosen = dearer if gain > max(LEAST, CERTAIN * noise) else cheaper
         needs[name] = {"chosen": chosen, "by": "probes", "over": cheaper if chosen == dearer else dearer}
         needs[name] |= {"gain": round(gain, 3), "noise": round(noise, 3), "n": len(gains)}

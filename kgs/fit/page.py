@@ -68,9 +68,9 @@ def write_fit_page(
     known = {run: _levels(metrics) for run, metrics in runs.items()}
     pictures = list[Picture]()
     for i in each(range(len(shown)), "page", "view"):
-        name, seen = shown.names[i], {run: draw(shown.camera(i))[0].clamp(0, 1) for run, draw in renders.items()}
+        name, camera = shown.names[i], shown.camera(i)
         level = [f"{run} {known[run][name]:.2f} dB".strip() for run in renders if name in known.get(run, {})]
-        seen = {run: shown.shaded(render) for run, render in seen.items()}
+        seen = {run: shown.as_photo(draw(camera)[0]) for run, draw in renders.items()}
         pictures.append(Picture(name, shown.images[i], seen, ": ".join([name, *([", ".join(level)] if level else [])])))
     found: dict[str, Any] = {}
     with suppress(DataError):

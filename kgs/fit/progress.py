@@ -1,10 +1,12 @@
 """What a fit says while it works: lines, and how far each stage is. Nobody who stops listening can end the work."""
 
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
+VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a next step
 Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
 
@@ -17,6 +19,16 @@ def say(line: str, file: TextIO | None = None) -> None:
     with suppress(OSError, ValueError, AttributeError):  # closed by the reader, closed by the program, none at all
         encoding = stream.encoding or "utf-8"
         print(line.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+def say_next(*steps: str) -> None:
+    """Say what the user may do now."""
+    say("\n  ".join(["next:", *steps]))
+
+
+def as_line(*words: object) -> str:
+    """Words as one types them in a shell."""
+    return shlex.join(map(str, words))
 
 
 @contextmanager

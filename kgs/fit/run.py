@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import import_module
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.ply import save_ply
 
-from .checkpoint import previous
+from .checkpoint import previous, save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
 from .figures import write_curve
@@ -50,14 +52,14 @@ _CONVENTIONS = {
 def fit_scene(
     scene: Scene,
     config: FitConfig,
-    out: Path,
+    out: str | PathLike[str],
     *,
     resume: bool = False,
     lpips: Lpips | None = None,
     request: dict[str, Any] | None = None,
     say: Callable[[str], None] = say,
 ) -> tuple[dict[str, Any], int]:
-    """Fit a scene and write `folder.RESULTS`, test/*.png and the checkpoint.
+    """Fit a scene and write what `kgs fit` leaves: page, splat, film, measures, test pictures and checkpoints.
 
     Results in the folder stay whole until all new ones are there, in `unfinished`. A fit that a signal stopped writes
     its results too, but leaves those of a finished one in their place.
@@ -68,7 +70,8 @@ def fit_scene(
         out: the folder for the results, made if it is not there.
         resume: continue from the folder's checkpoint, if there is one.
         lpips: the perceptual metric, or None to leave it out.
-        request: how the scene was loaded, kept in config.json for `kgs eval`.
+        request: the arguments of `load_scene` by their names, "scene" for its path; without them `kgs eval` refuses the
+            folder.
         say: where lines for the user go.
 
     Returns:
@@ -80,8 +83,11 @@ def fit_scene(
         TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
         OSError: a result cannot be written.
         ValueError: the device cannot be used, or the backend not on it.
-        ModuleNotFoundError: the backend is numba, and it is not installed.
+        ModuleNotFoundError: the backend is numba, and it is not installed; or the extra `app` is not.
     """
+    for package in ("jinja2", "matplotlib"):  # needed after the training only
+        import_module(package)
+    out = Path(out)
     resolve(config.backend, check_device(config.device))
     smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
     for views in (scene.train, scene.test):
@@ -115,12 +121,11 @@ def fit_scene(
             say(f"memory: at most {most_bytes(trainer) / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
-        told, saved = len(trainer.notes), trainer.saved
+        told = len(trainer.notes)
         try:
             if source != new:
                 start_folder(new)
-                trainer.save(new / CHECKPOINT)  # first points may have taken a minute
-                trainer.saved = saved
+                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # first points may have taken a minute
             settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
             write_json(new / "config.json", settings)
@@ -130,14 +135,14 @@ def fit_scene(
             write_exports(trainer, new)
             (new / "test").mkdir(exist_ok=True)
             for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
-                render = trainer.render(scene.test.camera(i))[0].clamp(0, 1)
-                write_png(new / "test" / names[name], scene.test.shaded(render))
+                render = trainer.render(scene.test.camera(i))[0]
+                write_png(new / "test" / names[name], scene.test.as_photo(render))
             metrics = measure(trainer, lpips)
             write_json(new / "metrics.json", metrics)
             fitted = trainer.shown, trainer.near_plane, trainer.render
             write_own_page(new / PAGE, out, trainer.scene, *fitted, metrics, settings)
         except BaseException:
-            if not trainer.saved:
+            if not trainer.saved:  # nothing was trained
                 shutil.rmtree(new, ignore_errors=True)
             raise
         if stopped_by and is_finished(out):

@@ -42,7 +42,7 @@ def measure_seen(trainer: Trainer) -> dict[str, float | None] | None:
     for view in range(len(test)):
         camera = test.camera(view)
         shown = _shown(depth_map(trainer, camera), camera, depths, train.cameras)
-        render = test.shaded(trainer.render(camera)[0].clamp(0, 1).cpu())
+        render = test.as_photo(trainer.render(camera)[0].cpu())
         errors = (render - test.images[view].cpu().to(render)).square().mean(dim=0)
         shares.append(float(shown.float().mean()))
         for name, where in (("psnr", shown), ("psnr_rest", ~shown)):

@@ -8,6 +8,7 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,8 +22,9 @@ from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier, camera_extent
 from kgs.errors import DataError, TrainingDiverged
 from kgs.losses import opacity_l1, photometric_loss
-from kgs.model import GaussianModel
+from kgs.model import PARAMETERS, GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.types import check_kind
 
 from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
 from .config import CHOICES, FitConfig, most_gaussians, timetable
@@ -34,17 +36,21 @@ from .scores import SelectiveDrop, gaussian_scores
 from .starts import FirstPoints, typical_depths
 from .targets import targets
 
-_RATES = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacity"}
-_RATES |= {"sh_dc": "sh_dc", "sh_rest": "sh_rest"}
+# The learning rates by parameter, the means first.
+_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
 
 
 class Trainer:
     """Fits Gaussians to the training views of a scene; the test views are rendered for the curve alone.
 
     Args:
-        scene: posed training and test views.
-        config: steps, drop rate, seed and all other numbers.
-        points: where the Gaussians begin.
+        scene: posed training and test views, of at least 6x6 pixels, 12x12 with `coarse`.
+        config: steps, drop rate, seed and all other numbers, see :class:`FitConfig` for those that do nothing here.
+        points: where the Gaussians begin, at least 4.
+
+    Raises:
+        TypeError: `scene` or `points` is of another kind.
+        ValueError: pictures are too small, points too few, or the device or backend is not there.
 
     Attributes:
         model: the Gaussians.
@@ -57,12 +63,14 @@ class Trainer:
         shown: what :meth:`render` draws: the model, or after :meth:`show` a part of it.
         needs: what was decided of the scene, for metrics.json.
         init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
-        order, stack: the random stream of views, and the views that still come before it is asked again.
-        colors: the random stream of backgrounds.
+        order, colors: the random streams of views and of backgrounds.
+        stack: the views that still come before `order` is asked again.
         poses: the training cameras, where the fit moves them; `scene` has them where they are now.
     """
 
     def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
+        check_kind("scene", scene, Scene)
+        check_kind("points", points, FirstPoints)
         self._prepare(scene, config)
         nearest, median = typical_depths(scene.train, points.points)
         self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)  # of a rig without one, too
@@ -85,8 +93,8 @@ class Trainer:
         self._fingerprint = fingerprint(scene)
         self.poses = MovingPoses(scene.train.cameras.extrinsics, config.steps) if config.refine_poses else None
         self._background = scene.background.to(self.device, torch.float32) if scene.background.any() else None
-        sizes = [scene.train, *([scene.train.halved()] if self.times.coarse else [])]
-        self._views = [targets(views, scene.background, self.device) for views in sizes]
+        self._views = targets(scene.train, scene.background, self.device)
+        self._halved = targets(scene.train.halved(), scene.background, self.device) if self.times.coarse else []
 
     def _build(self, model: GaussianModel) -> None:
         config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
@@ -95,12 +103,12 @@ class Trainer:
         self._part: dict[str, Any] = {}
         groups = [
             {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
-            for name, rate in _RATES.items()  # the means first
+            for name, rate in _RATES.items()
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
         self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=seed + 1) if config.drop else None
-        rules: dict[str, Any] = {"max_bytes": config.max_bytes, "backend": self.backend}
-        self.renderer = GaussianRenderer(self.drop, near_plane=self.near_plane, **rules).train()
+        near, most = self.near_plane, config.max_bytes
+        self.renderer = GaussianRenderer(self.drop, near_plane=near, max_bytes=most, backend=self.backend).train()
         limits = {name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")}
         limits |= {"max_gaussians": self.max_gaussians, "generator": torch.Generator().manual_seed(seed + 2)}
         self.densifier = Densifier(self.model, self.optimizer, self.extent, **limits)
@@ -165,18 +173,11 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the rest of the fit depends on, copied: nested dicts of tensors and plain values."""
-        parts = {
-            "config": self.config.to_dict(),
-            "scene": self._fingerprint,
-            "model": self.model.state_dict(),
-            "optimizer": moments_of(self.optimizer),
-            "densifier": self.densifier.state_dict(),
-            "order": self.order.get_state(),
-            "colors": self.colors.get_state(),
-            "drop": None if self.drop is None else self.drop.get_rng_state(),
-            "poses": None if self.poses is None else self.poses.state_dict(),
-            "shown": self._part,
-        }
+        parts: dict[str, Any] = {"config": self.config.to_dict(), "scene": self._fingerprint, "shown": self._part}
+        parts |= {"model": self.model.state_dict(), "densifier": self.densifier.state_dict()}
+        parts |= {"optimizer": moments_of(self.optimizer), "order": self.order.get_state()}
+        parts |= {"colors": self.colors.get_state(), "drop": None if self.drop is None else self.drop.get_rng_state()}
+        parts |= {"poses": None if self.poses is None else self.poses.state_dict()}
         return copy.deepcopy(parts | {name: getattr(self, name) for name in PLAIN})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -190,7 +191,6 @@ class Trainer:
                 cannot be used any more.
         """
         try:
-            state = {"backend": "torch"} | state  # as before there was another
             longer = check_state(state, self._fingerprint, self.config)
             vars(self).update(copy.deepcopy({name: state[name] for name in PLAIN}))
             self.backend = resolve(self.backend if self.device.type == "cpu" else "auto", self.device)
@@ -214,19 +214,19 @@ class Trainer:
         except (AttributeError, RuntimeError, TypeError) as error:
             raise ValueError(f"state: {error}") from error
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write :meth:`state_dict` to a file; OSError where it cannot be written, and earlier ones are untouched."""
-        save_checkpoint(path, self.state_dict())
+        save_checkpoint(Path(path), self.state_dict())
         self.saved = f"{path} of step {self.step}"
 
     @classmethod
-    def resume(cls, scene: Scene, config: FitConfig, path: Path) -> Self:
+    def resume(cls, scene: Scene, config: FitConfig, path: str | PathLike[str]) -> Self:
         """Continue from a checkpoint bit for bit; where it is damaged from the one before, and `notes` says so.
 
         Raises:
             DataError: both files are damaged, or they belong to another scene or configuration.
         """
-        state, damage = newest_checkpoint(path)
+        state, damage = newest_checkpoint(Path(path))
         trainer = cls.__new__(cls)
         try:
             if config.minutes is not None:
@@ -254,7 +254,7 @@ class Trainer:
         degree = sum(self.step >= step for step in self.times.sh)
         self.model.sh_degree = max(self.model.sh_degree, degree)  # a fit that is trained on keeps what it has
         index, background = self._next_view(), self._background
-        view = self._views[self.step <= self.times.coarse][index]
+        view = (self._halved if self.step <= self.times.coarse else self._views)[index]
         camera = view.camera if self.poses is None else self.poses.camera(view.camera, index)
         target, moments = view.image, view.moments
         if config.training_background == "random":
@@ -296,5 +296,5 @@ class Trainer:
 
     def _next_view(self) -> int:
         if not self.stack:
-            self.stack = torch.randperm(len(self._views[0]), generator=self.order).tolist()
+            self.stack = torch.randperm(len(self._views), generator=self.order).tolist()
         return self.stack.pop()

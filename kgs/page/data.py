@@ -85,31 +85,31 @@ def pack(
     rows = np.flatnonzero(finite & (values["opacities"] >= RasterOptions.alpha_threshold))
     values = {name: value[rows] for name, value in values.items()}
     degree = SH_SIZES.index(values["colors"].shape[1])
-    found, said, lower = Packed({}, b"", ""), list[str](), degree
-    for bits, degrees in ((FINE, [degree]), (COARSE, range(degree, -1, -1))):
-        columns = _compressed(values, cameras, near_plane, bits, degree)
-        for lower in degrees:
-            found = _joined(columns[: len(columns) - 3 * (SH_SIZES[degree] - SH_SIZES[lower])], lower)
-            if len(found.content) <= most_bytes:
-                break
+    found, said = Packed({}, b"", ""), list[str]()
+    for found, said in _attempts(values, cameras, near_plane, degree):
         if len(found.content) <= most_bytes:
-            break
-        said = ["numbers of 8 bits"]
-    if lower < degree:
-        said.append(f"harmonics up to degree {lower} of {degree}")
-    order, kept = np.zeros(0, int), len(rows)
+            return found._replace(left_out=", ".join(said))
+    worth = _worth(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
+    order, kept = np.argsort(-worth, kind="stable"), len(rows)
     while len(found.content) > most_bytes:
-        if not len(order):
-            worth = _worth(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
-            order = np.argsort(-worth, kind="stable")
         kept = min(kept - 1, math.floor(_FIT * kept * most_bytes / len(found.content)))
         if kept < 1:
             raise ValueError(f"most_bytes: expected room for a Gaussian, got {most_bytes} bytes")
         some = {name: value[order[:kept]] for name, value in values.items()}
         found = _joined(_compressed(some, cameras, near_plane, COARSE, 0), 0)
-    if kept < len(rows):
-        said.append(f"{kept} of {len(rows)} Gaussians")
-    return found._replace(left_out=", ".join(said))
+    return found._replace(left_out=", ".join([*said, f"{kept} of {len(rows)} Gaussians"]))
+
+
+def _attempts(
+    values: dict[str, Array], cameras: PinholeCamera, near_plane: float, degree: int
+) -> Iterator[tuple[Packed, list[str]]]:
+    """All Gaussians in ever fewer bytes, and what that cost: bits of the numbers, then degrees of the harmonics."""
+    yield _joined(_compressed(values, cameras, near_plane, FINE, degree), degree), []
+    columns = _compressed(values, cameras, near_plane, COARSE, degree)
+    for lower in range(degree, -1, -1):
+        count = len(columns) - 3 * (SH_SIZES[degree] - SH_SIZES[lower])
+        cost = [f"harmonics up to degree {lower} of {degree}"] if lower < degree else []
+        yield _joined(columns[:count], lower), ["numbers of 8 bits", *cost]
 
 
 def _compressed(

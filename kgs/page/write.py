@@ -81,6 +81,7 @@ def write_page(
         OSError: the file cannot be written.
     """
     import jinja2
+    from markupsafe import Markup
 
     runs, scene = runs or {}, viewer_scene(cameras, names, parts, gaussians.means)
     first = next(iter(runs.values()), {})
@@ -109,26 +110,24 @@ def write_page(
         "versions": facts(first.get("versions") or {"kgs": __version__}),
     }
     environment = jinja2.Environment(loader=jinja2.PackageLoader("kgs.page", "."), autoescape=True, trim_blocks=True)
-    from markupsafe import Markup
-
     folder = resources.files("kgs.page")
     context["files"] = {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES}
     template = environment.get_template("page.html.jinja")
     rules = {"nearPlane": near_plane, "lowPass": RasterOptions.eps2d, "background": background.tolist()}
 
-    def page(**splat: Any) -> bytes:
-        data = json.dumps({"scene": scene, "settings": rules, **splat.pop("data", {})}, separators=(",", ":"))
-        html: str = template.render(**context, **splat, data=Markup(data.replace("<", "\\u003c")))
+    def page(splat: Mapping[str, Any], words: Mapping[str, str]) -> bytes:
+        data = json.dumps({"scene": scene, "settings": rules, **splat}, separators=(",", ":"))
+        html: str = template.render(**context, **words, data=Markup(data.replace("<", "\\u003c")))
         return html.encode(errors="backslashreplace")  # names of files that are no UTF-8
 
-    room = most_bytes - len(page()) - _LAYOUT
+    room = most_bytes - len(page({}, {})) - _LAYOUT
     packed = pack(gaussians, cameras, max(0, room) * 3 // 4, weights, near_plane)
     content = base64.b64encode(packed.content).decode()
     splat = {"layout": packed.layout, "content": content}
-    sizes = {"scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}"}
-    draft = page(data=splat, left_out_here=packed.left_out, page_size="0.00 MB", **sizes)
-    sizes["page_size"] = f"This page has {_megabytes(len(draft))}"
-    write_whole(path, page(data=splat, left_out_here=packed.left_out, **sizes))
+    words = {"scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}"}
+    words |= {"left_out_here": packed.left_out, "page_size": "0.00 MB"}
+    words["page_size"] = f"This page has {_megabytes(len(page(splat, words)))}"
+    write_whole(path, page(splat, words))
     return packed.left_out
 
 

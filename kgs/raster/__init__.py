@@ -24,6 +24,7 @@ An image that needs more than `max_bytes` is made in row slices. Where lists are
 slices, nearest first, with lists for the tiles that still have light alone: what is hidden is not listed or sorted.
 """
 
+import numpy as np
 from torch import Tensor
 
 from kgs.backends import choose, compiled_covers, register
@@ -87,7 +88,7 @@ def composite(  # noqa: D417 - options are described in one place
     options = RasterOptions(
         tile_size=tile_size, alpha_threshold=alpha_threshold, transmittance_stop=transmittance_stop, max_bytes=max_bytes
     )
-    if chunk_size is not None and (not isinstance(chunk_size, int) or chunk_size < 1):
+    if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")

@@ -61,7 +61,7 @@ class _Passes:
         sums: tuple[Tensor, ...] = ()
         done: DepthSlices = []
         for ranks in self.reach.depth_slices(_LAYERS):
-            part = self._slice(inputs, self.reach.lists(spans, *rows, ranks, live), ranks)
+            part = self._slice(inputs, self.reach.lists(spans, *rows, ranks, live))
             sums = sums or part.blank()
             keep_alphas = keep and part.alpha_bytes <= spare
             spare -= part.alpha_bytes * keep_alphas
@@ -92,7 +92,7 @@ class _Passes:
             # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
             total[low:high] += F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
-    def _slice(self, inputs: tuple[Tensor, ...], lists: TileLists, ranks: tuple[int, int]) -> Slice:
+    def _slice(self, inputs: tuple[Tensor, ...], lists: TileLists) -> Slice:
         """A slice with what its steps need of each Gaussian, and a dummy at the end that has no effect."""
         means2d, factors, opacities, features = (x.index_select(0, lists.ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self.projected.eps2d), (0, 1))

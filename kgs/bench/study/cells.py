@@ -47,8 +47,9 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     known = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
     scene, points, seconds = _start(data, *known, preset)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
-    config, drop = _config(**cell), PRESETS[preset].drop  # methods that differ in dropping decide alike
-    trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed=replace(config, drop=drop))
+    config = _config(cell["start"], cell["seed"], cell["fit"])
+    probed = replace(config, drop=PRESETS[preset].drop)  # methods that differ in dropping decide alike
+    trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed)
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
         result["pictures"] = _pictures(scene, trainer)
     return result | {
@@ -94,7 +95,7 @@ def _pictures(scene: Scene, trainer: Trainer) -> list[str]:
 
 @lru_cache(maxsize=1)  # cells of one start follow each other
 def _start(
-    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int, preset: str = "paper"
+    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int, preset: str
 ) -> tuple[Scene, FirstPoints, float]:
     """A scene, its first points, and the processor's seconds that they took."""
     if name == SYNTHETIC:
@@ -109,8 +110,8 @@ def _start(
     return scene, points, time.process_time() - begin
 
 
-def _config(start: str, seed: int, fit: dict[str, Any] | None = None, **_: Any) -> FitConfig:
-    values = {"preset": "paper", "init": "model-points" if start == FULL else start, "seed": seed, **(fit or {})}
+def _config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
+    values = {"preset": "paper", "init": "model-points" if start == FULL else start, "seed": seed, **fit}
     return replace(PRESETS[values.pop("preset")], **values)
 
 

@@ -76,5 +76,6 @@ def _best_others(frame: pd.DataFrame, measure: str) -> Iterable[tuple[str, int, 
     for (scene,), cells in grouped(main_cells(frame), "scene"):
         gains = {name: difference(cells, "method", AUTO, name, measure) for name in cells.method.unique()}
         sign = -1 if measure == LPIPS else 1
-        if found := {sign * gain.mean: name for name, gain in gains.items() if gain.pairs}:
-            yield scene, len(found), found[min(found)], gains[found[min(found)]]
+        if others := {name: sign * gain.mean for name, gain in gains.items() if gain.pairs}:
+            best = min(others, key=others.__getitem__)
+            yield scene, len(others), best, gains[best]

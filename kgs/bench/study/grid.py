@@ -15,6 +15,8 @@ from typing import Any
 from distributed import Client, KilledWorker, LocalCluster, Security, wait
 from distributed.core import rpc
 
+from kgs.fit.folder import held
+
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
 _key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
@@ -155,12 +157,7 @@ def _outcomes(client: Any, work: Work, cells: Sequence[Cell]) -> Iterator[tuple[
 def _alone(path: Path) -> Iterator[None]:
     """Holds the file, made if it is not there, against other runs."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab") as file:
-        try:
-            with suppress(ImportError):  # Windows
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"{path}: expected no other run to write this file, but one does") from error
+    with held(path) as ours:
+        if not ours:
+            raise ValueError(f"{path}: expected no other run to write this file, but one does")
         yield

@@ -40,12 +40,18 @@ class Difference(NamedTuple):
         """
         if not self.pairs:
             return "-"
-        numbers = (self.mean, *self.over_scenes, self.low, self.high)
-        mean, *ends = (f"{round(value, decimals) + 0.0:+.{decimals}f}" for value in numbers)  # + 0.0: no -0.00
-        known = {" over scenes": ends[:2], " over seeds": ends[2:]}
-        labels |= self.scenes > 1
-        found = (f"[{', '.join(part)}]{label * labels}" for label, part in known.items() if part[0] != "+nan")
-        return f"{mean} {', '.join(found)}".rstrip()
+
+        def signed(value: float) -> str:
+            return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no -0.00
+
+        ends = {" over scenes": self.over_scenes, " over seeds": (self.low, self.high)}
+        named = labels or self.scenes > 1
+        known = [
+            f"[{signed(low)}, {signed(high)}]{label if named else ''}"
+            for label, (low, high) in ends.items()
+            if not math.isnan(low)
+        ]
+        return f"{signed(self.mean)} {', '.join(known)}".rstrip()
 
 
 class Noise(NamedTuple):
@@ -91,7 +97,9 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     cells = pd.DataFrame([row["cell"] for row in rows])[[*KEYS, "seed", "fit"]]
     results = pd.json_normalize([row["result"] for row in rows]).reindex(columns=COLUMNS + _OTHERS)
     results[COLUMNS] = results[COLUMNS].astype(float).where(lambda numbers: numbers.abs() < math.inf)
-    for *group, seed in cells.loc[cells.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy():
+    twice = cells.loc[cells.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy()
+    if len(twice):
+        *group, seed = twice[0]
         raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
     order = {name: k for k, name in enumerate([*cells.scene.unique(), *STARTS, *METHODS])}
     places = cells[[*KEYS]].assign(**{key: cells[key].map(order).fillna(len(order)) for key in KEYS if key != "views"})

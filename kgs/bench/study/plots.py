@@ -13,8 +13,8 @@ from .presets import AUTO, FAMILIES, FIXED, MAIN, OFF, PAPER
 
 # Colours of Okabe and Ito, told apart by colour-blind people too; those that share one differ in the marker.
 STYLES = {OFF: ("#000000", "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
-for _colour, _names in zip(("#CC79A7", "#E69F00", "#F0E442", "#009E73"), FAMILIES.values(), strict=True):
-    STYLES = {**{name: (_colour, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
+for _color, _names in zip(("#CC79A7", "#E69F00", "#F0E442", "#009E73"), FAMILIES.values(), strict=True):
+    STYLES = {**{name: (_color, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
 _FILLS = dict(zip(STARTS, ("none", "left", "bottom", "top", "full", "right"), strict=True))  # of a start's markers
 DPI = 110
 
@@ -33,10 +33,10 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
     for place, ((title,), some) in enumerate(grouped(points, "panel"), 1):
         axis = figure.add_subplot(rows, columns, place)
         for (label, start), part in grouped(some.assign(start=some.get("start", "")), "label", "start"):
-            colour, marker = styles[label]
+            color, marker = styles[label]
             look: dict[str, Any] = {"marker": marker, "ls": "" if scattered or named else "-", "alpha": 0.85, "ms": 5}
             fill = _FILLS.get(start, "none" if scattered else "full")
-            bars = axis.errorbar(part.x, part.y, part.get("dy"), part.get("dx"), c=colour, fillstyle=fill, **look)
+            bars = axis.errorbar(part.x, part.y, part.get("dy"), part.get("dx"), c=color, fillstyle=fill, **look)
             found.setdefault(label, bars)
             if scattered:
                 found[f"from {start}"] = axis.plot([], [], "h", color="grey", fillstyle=fill)[0]
@@ -68,20 +68,22 @@ def _forest(frame: pd.DataFrame) -> pd.DataFrame:
     several = main[main.groupby("method").scene.transform("nunique") > 1]
     groups = {f"mean, interval over {what}": several for what in ("scenes", "seeds")}
     groups |= {"{}, {} views, {}".format(*setting): cells for setting, cells in grouped(frame, *KEYS[:3])}
-    lines = [
-        {"label": method, "name": f"{where}: {method} (n = {gain.pairs})", "x": gain.mean, "dx": high - gain.mean}
-        for where, cells in groups.items()
-        for method in cells.method.unique()
-        if (gain := difference(cells, "method", method, OFF)).pairs
-        for high in [gain.over_scenes[1] if where.endswith("scenes") else gain.high]
-    ]
+    lines = []
+    for where, cells in groups.items():
+        for method in cells.method.unique():
+            gain = difference(cells, "method", method, OFF)
+            if gain.pairs:
+                high = gain.over_scenes[1] if where.endswith("scenes") else gain.high
+                name = f"{where}: {method} (n = {gain.pairs})"
+                lines.append({"label": method, "name": name, "x": gain.mean, "dx": high - gain.mean})
     return pd.DataFrame(lines).assign(panel="", y=range(len(lines)))
 
 
 def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
     cells = main_cells(frame, STARTS)
-    known = {"gap": cells["train.psnr"] - cells["test.psnr"], "coadaptation": 1e3 * cells.coadaptation}
-    return _in_panels(cells.assign(x=known.get(x, cells.cpu_seconds), y=cells["test.psnr"]).dropna(subset=["x", "y"]))
+    gap, shared = cells["train.psnr"] - cells["test.psnr"], 1e3 * cells.coadaptation
+    places = {"gap": gap, "coadaptation": shared, "cost": cells.cpu_seconds}
+    return _in_panels(cells.assign(x=places[x], y=cells["test.psnr"]).dropna(subset=["x", "y"]))
 
 
 def _curves(frame: pd.DataFrame) -> pd.DataFrame:

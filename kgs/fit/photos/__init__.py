@@ -5,6 +5,7 @@ Two solvers have to agree, and gates refuse what cannot be believed: see :mod:`k
 
 import shutil
 from collections.abc import Callable
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ SETTINGS = 1  # grows with every change after which the same photos give other f
 
 
 def pose_photos(
-    folder: Path,
-    out: Path,
+    folder: str | PathLike[str],
+    out: str | PathLike[str],
     *,
     seed: int = 0,
     wait: bool = False,
@@ -52,7 +53,9 @@ def pose_photos(
         say: where lines for the user go.
 
     Returns:
-        What photos.json holds, "reused": whether it is a former run's, and "folder": where the scene is.
+        What photos.json holds: "photos" by file name, "matches" of each pair, "size" (width, height), "focal_px",
+        "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others;
+        "reused": whether it is a former run's; and "folder": where the scene is.
 
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
@@ -60,6 +63,7 @@ def pose_photos(
         ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
+    folder, out = Path(folder), Path(out)
     with quiet_pycolmap():  # a missing package is told before any work
         pass
     paths = find_photos(folder)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs.datasets.image_size import jpeg_markers
+from kgs.datasets.image_size import jpeg_markers, tiff_entries
 
 FILM_DIAGONAL = math.hypot(36, 24)  # mm
 _ORIENTATION, _IFD, _FOCAL, _FOCAL_35 = 0x0112, 0x8769, 0x920A, 0xA405
@@ -47,7 +47,7 @@ def read_tiff(data: bytes) -> Exif:
     """The same of the metadata's own bytes, which are a TIFF."""
     try:
         tags = _tags(data)
-    except (struct.error, ValueError, ZeroDivisionError):
+    except (struct.error, ValueError):
         return Exif()
     orientation, focal, density = (int(tags.get(_ORIENTATION, 1)), tags.get(_FOCAL, 0.0), tags.get(_DENSITY, 0.0))
     width, unit = tags.get(_PIXELS_X, 0.0), _UNITS.get(int(tags.get(_DENSITY_UNIT, 2)), 0.0)
@@ -94,12 +94,8 @@ def _tags(data: bytes) -> dict[int, float]:
         start = struct.unpack_from(order + "I", data, 4)[0] if directory == "image" else int(tags.get(_IFD, 0))
         if not start:
             break
-        for at in range(start + 2, start + 2 + 12 * struct.unpack_from(order + "H", data, start)[0], 12):
-            tag, kind, count = struct.unpack_from(order + "HHI", data, at)
-            if kind in _FORMS and count:
-                form = order + _FORMS[kind]
-                inside = struct.calcsize(form) * count <= 4
-                place = at + 8 if inside else struct.unpack_from(order + "I", data, at + 8)[0]
-                number, *divisor = struct.unpack_from(form, data, place)
-                tags.setdefault(tag, number / divisor[0] if divisor and divisor[0] else 0.0 if divisor else number)
+        for tag, (form, count, at) in tiff_entries(data, order, start, _FORMS):
+            if count:
+                number, divisor = (*struct.unpack_from(form, data, at), 1)[:2]
+                tags.setdefault(tag, number / divisor if divisor else 0.0)
     return tags

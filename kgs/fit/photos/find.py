@@ -29,14 +29,13 @@ def find_photos(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = list_photos(folder)
-    kinds = {"others": set(UNREADABLE_SUFFIXES).difference(_readable()), "videos": set(VIDEO_SUFFIXES)}
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
-    found = {kind: [path for path in files if path.suffix.lower() in kinds[kind]] for kind in kinds}
-    if others := found["others"]:
+    videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
+    if others := [path for path in files if path.suffix.lower() in set(UNREADABLE_SUFFIXES).difference(_readable())]:
         wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed(others)}). "
         raise DataError(folder, "", wrong + CONVERT)
-    if not paths and found["videos"]:
-        raise DataError(folder, "", _from_video(found["videos"][0]))
+    if not paths and videos:
+        raise DataError(folder, "", _from_video(videos[0]))
     if not paths:
         deeper = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds_photos(path)]
         if deeper:

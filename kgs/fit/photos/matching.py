@@ -5,6 +5,7 @@ Source: L. Cavalli et al., AdaLAM, ECCV 2020 (matches that agree with their neig
 
 from itertools import combinations
 from pathlib import Path
+from statistics import median_high
 from typing import Any, NamedTuple
 
 import torch
@@ -97,8 +98,8 @@ def lens_of(photos: list[Photo]) -> Any:
     import pycolmap
 
     width, height = photos[0].size
-    known = sorted(photo.focal for photo in photos if photo.focal)
-    focal = known[len(known) // 2] if known else DEFAULT_FOCAL * max(width, height)
+    known = [photo.focal for photo in photos if photo.focal]
+    focal = median_high(known) if known else DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
     camera.has_prior_focal_length = bool(known)
     return camera

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from statistics import median_high
 from typing import Any
 
 import cv2
@@ -134,7 +135,7 @@ def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
         "size": [width, height],
         "focal_px": cameras.focal,
         "focal_35mm": film,
-        "exif_focal_px": sorted(known)[len(known) // 2] if known else None,
+        "exif_focal_px": median_high(known) if known else None,
         "radial_distortion": float(camera.params[3]),
     }
 

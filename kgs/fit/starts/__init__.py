@@ -14,6 +14,7 @@ from kgs.camera import camera_centers, meeting_point
 from kgs.datasets.scene import Views
 from kgs.fit.progress import Stage, silent
 from kgs.neighbours import log_spacing
+from kgs.types import check_kind
 
 from .dense import dense_points
 from .files import read_points
@@ -58,13 +59,17 @@ def first_points(
 ) -> FirstPoints:
     """Find the points a fit starts from.
 
+    Convention:
+        Points in the frame of the views' cameras, OpenCV axes, world units.
+
     Args:
         views: the training views, and only these.
         kind: "dense": points of depth maps that at least two views agree on, drawn at random; where fewer than 1000
             come out, those of "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated
             with the given poses; where fewer than 20 come out, "random" ones with a warning. "random": spread evenly
             over the space that at least two of the views see (one, if there is only one), in the images' mean colours
-            there, at the depths of the SIFT points or else where the cameras look. "file": see :func:`read_points`.
+            there, at the depths of the SIFT points or else where the cameras look. "file": those of a 3DGS PLY file,
+            or of a cloud or mesh that trimesh reads, up to 1 GiB.
         seed: of what is drawn at random.
         count: how many points "random" gives, and "dense" at most; >= 1.
         file: the file of the kind "file".
@@ -77,9 +82,11 @@ def first_points(
         The points; their `kind` is what they are, so "random" where "sift" found too few.
 
     Raises:
+        TypeError: `views` are none, a whole scene for instance.
         ValueError: another kind or draw, `count` below 1, or no file for "file".
         DataError: the file is missing, broken, compressed, too large, or has no points.
     """
+    check_kind("views", views, Views)
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
     if draw not in DRAWS:
