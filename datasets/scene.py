@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kgs.errors import DataError
-from kgs.types import check_tensor
 
 
 def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
@@ -57,9 +56,9 @@ class Views:
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        check_tensor("images", self.images)
-        if not self.images.is_floating_point():
-            raise TypeError(f"images: expected floating point RGB in [0, 1], got {self.images.dtype}")
+        if not isinstance(self.images, Tensor) or not self.images.is_floating_point():
+            given = self.images.dtype if isinstance(self.images, Tensor) else type(self.images).__name__
+            raise TypeError(f"images: expected a tensor of floating point RGB in [0, 1], got {given}")
         if len(set(self.names)) < count:
             raise ValueError("names: expected each once, got two that are equal")
         if self.images.ndim != 4 or self.images.shape[:2] != (count, 3):

@@ -7,7 +7,7 @@ if "torch" not in sys.modules and "GOMP_SPINCOUNT" not in os.environ:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is loaded: threads that wait yield their core
 
 from .camera import PosedCamera, cameras
-from .densify import Densifier, DensifyReport, camera_extent
+from .densify import Densifier, DensifyReport
 from .drop import DropGaussian, drop_gaussian
 from .errors import DataError, TrainingDiverged
 from .model import GaussianModel
@@ -16,6 +16,7 @@ from .projection import project
 from .raster import composite
 from .rasterization import rasterization
 from .renderer import GaussianRenderer
+from .rig import camera_extent
 from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering
 
 __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization", "project", "composite"]

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from .camera import camera_centers
 from .covariance import rotation_matrices
 from .model import GaussianModel
-from .types import ProjectedGaussians, check_kind, check_tensor
+from .types import ProjectedGaussians, check_kind
 
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
@@ -245,24 +244,3 @@ class Densifier:
         last = last_gradients.detach()
         counts = torch.zeros_like(last, dtype=torch.int64)
         self._statistics = {"gradient_sums": torch.zeros_like(last), "counts": counts, "last_gradients": last}
-
-
-def camera_extent(extrinsics: Tensor) -> float:
-    """Size of a camera rig: 1.1 times the largest distance of a camera's centre to the mean of the centres.
-
-    Source: the normalisation of NeRF++ (Zhang et al., 2020) as 3D Gaussian Splatting uses it; over training cameras.
-
-    Convention:
-        World-to-camera extrinsics; which way the axes point does not matter.
-
-    Args:
-        extrinsics: matrices [R | t] with a rotation R, `(C, 4, 4)`, C >= 1, else a ValueError.
-
-    Returns:
-        The extent in world units; 0 for a single camera.
-    """
-    check_tensor("extrinsics", extrinsics)
-    if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
-        raise ValueError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
-    centres = camera_centers(extrinsics)
-    return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())

@@ -5,7 +5,7 @@ import math
 import os
 import uuid
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from .errors import DataError
 
@@ -25,6 +25,16 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
     return value
+
+
+def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGuard[float]:
+    """Whether a value of JSON is a number of that size, and no bool; its integers have no limit of their own."""
+    return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON whole or not at all; a ValueError where a number is not finite."""
+    write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -23,7 +23,6 @@ from kornia.losses import ssim_loss
 from torch import Tensor
 
 from kgs.backends import check_backend, choose, compiled_covers, register
-from kgs.types import check_kind
 
 WINDOW, SIGMA = 11, 1.5
 RADIUS = WINDOW // 2
@@ -91,8 +90,8 @@ def photometric_loss(
     _check_images(image, image)
     shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
     moments = target if isinstance(target, TargetMoments) else moments
-    if moments is not None:
-        check_kind("moments", moments, TargetMoments)
+    if moments is not None and not isinstance(moments, TargetMoments):
+        raise TypeError(f"moments: expected TargetMoments, got {type(moments).__name__}")
     known = None if moments is None else (tuple(moments.mean.shape), moments.mean.dtype, moments.mean.device)
     if known not in (None, (shape, image.dtype, image.device)):
         raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")

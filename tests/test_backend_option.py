@@ -8,8 +8,9 @@ from test_cli import one_line, run
 
 from kgs import DataError, backends
 from kgs.fit import FitConfig, Trainer
-from kgs.fit.folder import CHECKPOINT, load_fit
+from kgs.fit.folder import CHECKPOINT
 from kgs.fit.run import fit_scene
+from kgs.fit.saved import load_fit
 from kgs.json_files import read_json
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)

@@ -9,10 +9,10 @@ from kornia.geometry.liegroup import Se3
 
 from kgs.bench import cameras
 from kgs.bench.cameras import DISTANCE, arc_cell, write_arcs
-from kgs.camera import camera_centers
 from kgs.datasets.scene import pinholes
 from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
+from kgs.rig import camera_centers
 
 CELL = {"world": 1, "photos": 3, "spacing": 10.0, "size": (24, 32)}
 

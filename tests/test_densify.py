@@ -9,7 +9,7 @@ from densifiers import LARGE, SMALL, seen
 from densifiers import densifier as make
 from factories import random_model
 
-from kgs.densify import Densifier, DensifyReport, camera_extent
+from kgs.densify import Densifier, DensifyReport
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 
@@ -202,26 +202,6 @@ def test_a_render_that_saw_nothing_is_no_error():
 def test_numbers_out_of_range_are_named(option, value):
     with pytest.raises(ValueError, match=f"{option}: expected"):
         make([SMALL], **{option: value})
-
-
-def test_extent_of_known_cameras():
-    centres = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [2.0, 3.0, 0.0]], dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    extrinsics = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    for i, centre in enumerate(centres):
-        rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
-        extrinsics[i, :3, :3] = rotation
-        extrinsics[i, :3, 3] = -rotation @ centre
-    # mean (2, 1, 0); distances sqrt(5), sqrt(5), 2
-    assert camera_extent(extrinsics) == pytest.approx(1.1 * math.sqrt(5))
-    assert camera_extent(extrinsics.float()) == pytest.approx(1.1 * math.sqrt(5), rel=1e-6)
-    assert camera_extent(extrinsics[:1]) == 0.0
-
-
-@pytest.mark.parametrize("shape", [(4, 4), (0, 4, 4), (2, 3, 4)])
-def test_extent_of_something_else_is_refused(shape):
-    with pytest.raises(ValueError, match="extrinsics: expected shape"):
-        camera_extent(torch.zeros(shape))
 
 
 # -- the mean gradients that scores are made of --------------------------------------------------------------------

@@ -18,8 +18,9 @@ import kgs
 from kgs.export import film
 from kgs.export.cameras import camera_list, upright
 from kgs.fit import exports
-from kgs.fit.outputs import EXPORTS, is_own, write_json
+from kgs.fit.outputs import EXPORTS, is_own
 from kgs.fit.splat_commands import render
+from kgs.json_files import write_json
 
 
 def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:

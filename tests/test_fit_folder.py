@@ -20,9 +20,10 @@ from kgs.errors import DataError, TrainingDiverged
 from kgs.fit import folder, run
 from kgs.fit.checkpoint import load_checkpoint
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.folder import CHECKPOINT, UNFINISHED, load_fit, locked
+from kgs.fit.folder import CHECKPOINT, UNFINISHED, locked
 from kgs.fit.outputs import start_folder
 from kgs.fit.run import fit_scene
+from kgs.fit.saved import load_fit
 from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
 

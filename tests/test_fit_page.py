@@ -15,10 +15,10 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.commands import evaluate
 from kgs.fit.config import FitConfig
-from kgs.fit.folder import load_fit
 from kgs.fit.lpips import Lpips
 from kgs.fit.metrics import in_words
 from kgs.fit.page import refresh_page, spread
+from kgs.fit.saved import load_fit
 from kgs.fit.starts import FirstPoints
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)

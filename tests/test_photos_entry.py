@@ -15,9 +15,9 @@ from kgs.datasets.layouts import nearest_scene
 from kgs.fit import photos
 from kgs.fit.config import FitConfig
 from kgs.fit.minutes import expected_minutes
-from kgs.fit.outputs import write_json
 from kgs.fit.photos import estimate as estimate_module
 from kgs.fit.photos.entry import foretold, is_bare
+from kgs.json_files import write_json
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")

@@ -12,12 +12,13 @@ from start_scenes import texture
 from kgs.cli import main
 from kgs.errors import DataError
 from kgs.fit import photos
-from kgs.fit.outputs import PNG_MARK, start_folder, write_json, write_png
+from kgs.fit.outputs import PNG_MARK, start_folder, write_png
 from kgs.fit.photos import pose_photos
 from kgs.fit.photos.entry import settle
 from kgs.fit.photos.read import blurred, read_photos
 from kgs.fit.photos.write import end_move
 from kgs.fit.progress import silent
+from kgs.json_files import write_json
 
 pytest.importorskip("pycolmap")
 

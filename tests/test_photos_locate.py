@@ -6,12 +6,12 @@ import pytest
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-from kgs.camera import camera_centers
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.photos.locate import locate
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
+from kgs.rig import camera_centers
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import torch
 from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
-from kgs.camera import camera_centers
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import FitConfig, Trainer, fit_scene
 from kgs.fit.commands import evaluate
-from kgs.fit.folder import load_fit
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
+from kgs.fit.saved import load_fit
+from kgs.rig import camera_centers
 
 CONFIG = FitConfig(steps=6, seed=5, init="random", init_points=200, sh_degree=0, evaluations=1, refine_poses=True)
 

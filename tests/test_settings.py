@@ -11,7 +11,7 @@ import pytest
 
 from kgs.errors import DataError
 from kgs.fit.config import FAST, FitConfig
-from kgs.fit.folder import read_settings
+from kgs.fit.saved import read_settings
 
 REQUEST: dict[str, Any] = {"scene": "/photos", "train_views": 3, "downscale": 2.0, "background": "black"}
 

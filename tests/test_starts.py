@@ -24,8 +24,9 @@ from start_scenes import (
 )
 
 from kgs.datasets.scene import Views
+from kgs.fit.pixels import typical_depths
 from kgs.fit.progress import each
-from kgs.fit.starts import FirstPoints, first_points, typical_depths
+from kgs.fit.starts import FirstPoints, first_points
 
 
 @pytest.fixture(scope="module")

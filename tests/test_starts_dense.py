@@ -11,10 +11,10 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
+from kgs.fit.pixels import project_all
 from kgs.fit.starts import _sweep_range, first_points
 from kgs.fit.starts.dense import dense_points
 from kgs.fit.starts.plane_sweep import _neighbours, _semi_global, planes_wanted, sweep_depths, warp
-from kgs.fit.starts.triangulate import project_all
 
 
 @pytest.fixture(scope="module")

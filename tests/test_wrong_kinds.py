@@ -15,11 +15,12 @@ from tiny_scenes import write_colmap
 import kgs
 from kgs import reference
 from kgs.datasets import Views, load_scene, synthetic_scene
-from kgs.densify import Densifier, camera_extent
+from kgs.densify import Densifier
 from kgs.export.film import write_film
 from kgs.export.glb import save_glb
 from kgs.fit import FirstPoints, FitConfig, Trainer, first_points, fit_scene
 from kgs.losses import photometric_loss, target_moments
+from kgs.rig import camera_extent
 
 UPRIGHT = torch.eye(3)
 SCENE = synthetic_scene(train_views=2, test_views=1, size=(16, 16))
@@ -74,9 +75,12 @@ WRONG = {
     ),
     "bytes for colours": (
         lambda: views((255 * SCENE.train.images).byte()),
-        "images: expected floating point RGB in [0, 1], got torch.uint8",
+        "images: expected a tensor of floating point RGB in [0, 1], got torch.uint8",
     ),
-    "an array of photos": (lambda: views(SCENE.train.images.numpy()), "images: expected a torch.Tensor, got ndarray"),
+    "an array of photos": (
+        lambda: views(SCENE.train.images.numpy()),
+        "images: expected a tensor of floating point RGB",
+    ),
     "cameras for their matrices": (
         lambda: camera_extent(SCENE.train.cameras),
         "extrinsics: expected a torch.Tensor, got PinholeCamera",

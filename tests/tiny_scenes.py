@@ -17,7 +17,7 @@ import torch
 
 from kgs.fit.config import FitConfig
 from kgs.fit.lpips import Lpips
-from kgs.fit.outputs import write_json
+from kgs.json_files import write_json
 from kgs.model import GaussianModel
 from kgs.ply import save_ply
 

@@ -9,7 +9,7 @@ from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeGuard
+from typing import Any
 
 import kornia.geometry as kg
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from kgs.datasets.frames import Frame, FrameSet, path_inside
 from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics, read_size
 from kgs.errors import DataError
-from kgs.json_files import read_json
+from kgs.json_files import is_number, read_json
 
 Object = dict[str, Any]
 Said = ChainMap[str, Any]  # what holds for a frame: its own object, then the whole file's
@@ -169,7 +169,7 @@ def _focal(source: Path, axis: str, said: Said, length: float) -> float | None:
 
 
 def _number(path: Path, key: str, said: Mapping[str, Any], default: float | None) -> float:
-    if not _is_finite(value := said.get(key, default)):
+    if not is_number(value := said.get(key, default)):
         raise DataError(path, key, f"expected a finite number, got {_shown(value)}")
     return float(value)
 
@@ -189,7 +189,7 @@ def _opencv_pose(path: Path, frame: Object) -> Tensor:
     rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
-    if len(rows) != 4 or not all(_is_finite(x) for row in rows for x in row):
+    if len(rows) != 4 or not all(is_number(x) for row in rows for x in row):
         raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
     matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
     last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
@@ -197,8 +197,3 @@ def _opencv_pose(path: Path, frame: Object) -> Tensor:
         raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {matrix[0, 3].tolist()}")
     matrix[0, 3] = last
     return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]
-
-
-def _is_finite(value: Any) -> TypeGuard[float]:
-    """Whether a value is a number that float64 holds; JSON's integers have no limit."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300

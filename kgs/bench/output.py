@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from kgs.fit.machine import versions
-from kgs.fit.outputs import write_json
+from kgs.json_files import write_json
 
 Row = dict[str, Any]
 

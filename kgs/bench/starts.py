@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.camera import camera_centers
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
+from kgs.fit.pixels import project_all
 from kgs.fit.starts import first_points
-from kgs.fit.starts.triangulate import project_all
+from kgs.rig import camera_centers
 
 from .output import Row, markdown_table, mean_sd, write_results
 from .scenes import check_scenes

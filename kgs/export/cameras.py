@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 import kgs
-from kgs.camera import common_up
 from kgs.datasets.scene import Views
+from kgs.rig import common_up
 
 
 def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kgs.camera import meeting_point
 from kgs.datasets.scene import Views, pinholes
 from kgs.eight_bits import eight_bits
+from kgs.rig import meeting_point
 
 from .cameras import upright
 

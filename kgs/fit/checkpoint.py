@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
-from kgs.json_files import parse_json
+from kgs.json_files import is_number, parse_json
 
 from .config import FitConfig
 
@@ -216,11 +216,6 @@ def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
         else:
             rest[key] = _take_tensors(item, tensors, f"{path}{key}/")
     return rest
-
-
-def is_number(value: Any, least: float = -1e300, whole: bool = False) -> bool:
-    """Whether a value of JSON is a number of that size, and no bool."""
-    return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
 
 
 _is_count = partial(is_number, least=0, whole=True)

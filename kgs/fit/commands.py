@@ -180,14 +180,13 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit.
     """
-    from kgs.json_files import read_json
+    from kgs.json_files import read_json, write_json
 
-    from .folder import load_fit
     from .lpips import Lpips
     from .machine import check_tools
     from .metrics import in_words, measure_again
-    from .outputs import write_json
     from .page import PAGE, refresh_page
+    from .saved import load_fit
 
     check_tools(device, backend, "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from kgs.datasets.scene import Scene
+from kgs.json_files import write_json
 from kgs.ply import save_ply
 
 from .config import FitConfig
 from .exports import write_exports
 from .figures import write_curve, write_sheet
-from .outputs import write_json
 from .page import PAGE, write_fit_page
 from .progress import each, say
 from .run import choose_points, measure, train

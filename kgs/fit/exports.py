@@ -5,10 +5,10 @@ from pathlib import Path
 from kgs.export.cameras import camera_list, upright
 from kgs.export.film import write_film
 from kgs.export.glb import save_glb
+from kgs.json_files import write_json
 
-from .outputs import write_json
+from .pixels import typical_depths
 from .progress import each
-from .starts import typical_depths
 from .trainer import Trainer
 
 

@@ -1,4 +1,4 @@
-"""The folder of a fit: one fit at a time, an old result that stays whole until the new one is, and what is read again.
+"""The folder of a fit: one fit at a time, and an old result that stays whole until the new one is.
 
 A fit writes to `unfinished`, its checkpoints included. When all is there the folder is renamed to `finished`, and its
 files are moved to their places. Whoever opens the folder after a kill in between ends the move first.
@@ -10,23 +10,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import torch
-from kornia.geometry.camera import PinholeCamera
-from torch import Tensor
-
-from kgs.camera import move_camera
-from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.json_files import read_json
-from kgs.model import GaussianModel
-from kgs.renderer import GaussianRenderer
+from kgs.json_files import read_json, write_json
 
-from .checkpoint import is_number, newest_checkpoint, previous
-from .config import FitConfig
-from .outputs import EXPORTS, is_own, remove_others, write_json
-from .poses import place_cameras
+from .checkpoint import previous
+from .outputs import EXPORTS, is_own, remove_others
 
 CHECKPOINT = "checkpoint.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
@@ -110,71 +99,8 @@ def is_finished(out: Path) -> bool:
         return False
 
 
-def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
-    """The arguments of `load_scene` and the configuration in a fit's config.json; a DataError where it is wrong."""
-    settings = read_json(path)
-    for name in ("request", "fit"):
-        if not isinstance(settings.get(name), dict):
-            raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
-    request = {"points": "none", "hold_out": None, **settings["request"]}  # what older folders do not say
-    for name, expected, is_right in (
-        ("scene", "a path", lambda v: isinstance(v, str) and v and "\0" not in v),
-        ("train_views", "a whole number above 0 or null", lambda v: v is None or is_number(v, 1, whole=True)),
-        ("downscale", "a number of at least 1 or null", lambda v: v is None or is_number(v, 1)),
-        (
-            "hold_out",
-            "0, a whole number above 1 or null",
-            lambda v: v is None or (is_number(v, 0, whole=True) and v != 1),
-        ),
-        ("background", "one of ['black', 'white']", lambda v: v in ("black", "white")),
-        ("points", "one of ['none', 'model-points']", lambda v: v in ("none", "model-points")),
-    ):
-        if name not in request or not is_right(request[name]):
-            got = f"{request[name]!r}"[:60] if name in request else "none"
-            raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
-    try:
-        return request, FitConfig.from_dict(settings["fit"])
-    except ValueError as error:
-        raise DataError(path, "fit", str(error)) from error
-
-
-class SavedFit(NamedTuple):
-    """A fit for pictures and measures, without what training needs."""
-
-    request: dict[str, Any]  # the arguments of `load_scene`
-    config: FitConfig
-    model: GaussianModel  # in the frame of the scene: world coordinates less `Scene.offset`
-    near_plane: float  # in world units
-    step: int  # steps that are done
-    backend: str  # of the fit; on a GPU "auto"
-    poses: Tensor | None  # `(V, 4, 4)` of the training cameras, where the fit moved them
-
-    def placed(self, scene: Scene) -> Scene:
-        """The fit's scene, with the training cameras where the fit has them."""
-        return scene if self.poses is None else place_cameras(scene, self.poses)
-
-    @torch.no_grad()
-    def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
-        """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
-        device, most = self.model.means.device, self.config.max_bytes
-        renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=most, backend=self.backend).eval()
-        image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
-        return image
-
-
-def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
-    """Read what a fit left in its folder; a DataError where config.json or the checkpoint is missing or damaged."""
-    if (out / _FINISHED / _LIST).exists():  # a kill stopped the move
+def end_stopped_move(out: Path) -> None:
+    """End the move of a fit that a kill stopped, if there is one."""
+    if (out / _FINISHED / _LIST).exists():
         with locked(out):
             end_move(out)
-    request, config = read_settings(out / "config.json")
-    path = out / CHECKPOINT
-    state, _ = newest_checkpoint(path)
-    try:
-        model = GaussianModel(**state["model"])
-        model = (model.select(**part) if (part := state.get("shown")) else model).to(device)
-        backend = str(state.get("backend", "torch")) if model.means.device.type == "cpu" else "auto"
-        poses = (state.get("poses") or {}).get("extrinsics")
-        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend, poses)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error

@@ -1,7 +1,6 @@
 """What a command leaves behind: JSON and PNGs, whole or not at all, and never in place of a user's file."""
 
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -10,7 +9,6 @@ import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any
 
 import cv2
 from torch import Tensor
@@ -75,11 +73,6 @@ def start_folder(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
     path.mkdir()
     (path / FOLDER_MARK).touch()
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all."""
-    write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def png_names(views: Iterable[str]) -> dict[str, str]:

@@ -6,10 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.camera import camera_centers, move_camera
+from kgs.camera import move_camera
 from kgs.datasets.scene import Views
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.rig import camera_centers
 
 from .trainer import Trainer
 

@@ -17,9 +17,9 @@ from kgs.json_files import read_json
 from kgs.model import GaussianModel
 from kgs.page import Picture, write_page
 
-from .folder import SavedFit
 from .outputs import is_own
 from .progress import each, say
+from .saved import SavedFit
 from .slim import contributions, left_out
 
 PAGE = "index.html"

@@ -14,8 +14,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
-from kgs.camera import camera_centers, degrees_between
 from kgs.datasets.scene import Scene
+from kgs.rig import camera_centers, degrees_between
 
 from .checkpoint import load_moments, moments_of
 

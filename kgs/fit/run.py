@@ -15,6 +15,7 @@ from typing import Any
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
+from kgs.json_files import write_json
 from kgs.ply import save_ply
 
 from .checkpoint import previous, save_checkpoint
@@ -27,7 +28,7 @@ from .machine import bytes_of, check_device, peak_rss_mb, versions
 from .metrics import evaluate
 from .minutes import steps_within
 from .needs import decide
-from .outputs import check_folder, is_own, png_names, start_folder, write_json, write_png
+from .outputs import check_folder, is_own, png_names, start_folder, write_png
 from .page import PAGE, write_own_page
 from .progress import Stage, each, progress, say, silent
 from .seen import measure_seen

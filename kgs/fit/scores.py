@@ -8,9 +8,9 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.camera import camera_centers
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
+from kgs.rig import camera_centers
 
 
 class SelectiveDrop(DropGaussian):

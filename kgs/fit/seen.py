@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 
-from .starts.triangulate import picture_places, project_all, unproject
+from .pixels import picture_places, project_all, unproject
 from .trainer import Trainer
 
 LEAST = 2  # training views that show a place

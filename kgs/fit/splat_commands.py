@@ -145,7 +145,7 @@ def _load_splat(ply: Path, scene: Any, place: Any, backend: str) -> tuple[Any, A
     from kgs.ply import load_ply
     from kgs.renderer import GaussianRenderer
 
-    from .starts import typical_depths
+    from .pixels import typical_depths
 
     model = load_ply(ply, origin=scene.offset)
     near_plane = Recipe().near_plane * typical_depths(scene.train, model.means)[0]

@@ -19,11 +19,12 @@ from torch import Tensor
 from kgs.backends import resolve
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
-from kgs.densify import Densifier, camera_extent
+from kgs.densify import Densifier
 from kgs.errors import DataError, TrainingDiverged
 from kgs.losses import opacity_l1, photometric_loss
 from kgs.model import PARAMETERS, GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.rig import camera_extent
 from kgs.types import check_kind
 
 from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
@@ -31,13 +32,13 @@ from .config import CHOICES, FitConfig, most_gaussians, timetable
 from .divergence import gradient_fault, scale_fault, step_fault
 from .machine import check_device
 from .metrics import mean_psnr
+from .pixels import typical_depths
 from .poses import MovingPoses, decayed
 from .scores import SelectiveDrop, gaussian_scores
-from .starts import FirstPoints, typical_depths
+from .starts import FirstPoints
 from .targets import targets
 
-# The learning rates by parameter, the means first.
-_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
+_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))  # of learning
 
 
 class Trainer:
@@ -63,8 +64,7 @@ class Trainer:
         shown: what :meth:`render` draws: the model, or after :meth:`show` a part of it.
         needs: what was decided of the scene, for metrics.json.
         init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
-        order, colors: the random streams of views and of backgrounds.
-        stack: the views that still come before `order` is asked again.
+        order, colors, stack: the random streams of views and backgrounds; views that come before `order` is asked.
         poses: the training cameras, where the fit moves them; `scene` has them where they are now.
     """
 

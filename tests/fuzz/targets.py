@@ -24,8 +24,8 @@ from tiny_scenes import (
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
 from kgs.datasets.images import read_image
 from kgs.fit.config import FitConfig, timetable
-from kgs.fit.folder import read_settings
 from kgs.fit.lpips import Lpips
+from kgs.fit.saved import read_settings
 from kgs.fit.starts import FirstPoints
 from kgs.fit.starts.files import read_points
 from kgs.fit.trainer import Trainer

@@ -9,7 +9,7 @@ from itertools import combinations
 
 import torch
 
-from kgs.camera import degrees_between
+from kgs.rig import degrees_between
 
 from .mapping import FEWEST_MATCHES, Cameras, Look
 

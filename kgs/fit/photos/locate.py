@@ -9,9 +9,9 @@ from kornia.feature import match_smnn
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views, pinholes
+from kgs.fit.pixels import matrices, unproject
 from kgs.fit.seen import depth_map
 from kgs.fit.starts.tracks import detect
-from kgs.fit.starts.triangulate import matrices, unproject
 from kgs.fit.trainer import Trainer
 
 KEYPOINTS = 4000  # in each picture

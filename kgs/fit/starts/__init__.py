@@ -10,18 +10,19 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.camera import camera_centers, meeting_point
 from kgs.datasets.scene import Views
+from kgs.fit.pixels import in_views, project_all, seen_depths, unproject
 from kgs.fit.progress import Stage, silent
 from kgs.neighbours import log_spacing
+from kgs.rig import camera_centers, meeting_point
 from kgs.types import check_kind
 
 from .dense import dense_points
 from .files import read_points
 from .tracks import find_tracks
-from .triangulate import project_all, triangulate_certain, unproject
+from .triangulate import triangulate_certain
 
-__all__ = ["FirstPoints", "first_points", "typical_depths"]
+__all__ = ["FirstPoints", "first_points"]
 
 KINDS, DRAWS = ("dense", "sift", "random", "file"), ("uniform", "spread")
 FEWEST_DENSE = 1000
@@ -119,29 +120,8 @@ def first_points(
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
     pixels, depths = project_all(points, views.cameras)
-    return FirstPoints(points.float(), _mean_colors(views, pixels, _inside(pixels, depths, views, near, far)), "random")
-
-
-def typical_depths(views: Views, points: Tensor) -> tuple[float, float]:
-    """The 1st percentile and the median of the points' depths: the scales of a scene.
-
-    Convention:
-        Depth is z in the camera's frame (OpenCV axes), in world units.
-
-    Args:
-        views: the training views.
-        points: `(P, 3)`; P may be 0.
-
-    Returns:
-        Both over the depths of points inside an image, else of all points before a camera; 1.0 where there are none.
-    """
-    points = points.detach().cpu()
-    depths = _seen_depths(points, views)
-    if not len(depths):
-        _, depths = project_all(points, views.cameras)
-        depths = depths[depths > 0]
-    near, median = np.quantile(depths, (0.01, 0.5)).tolist() if len(depths) else (1.0, 1.0)
-    return near, median
+    seen = in_views(pixels, depths, views, near, far)
+    return FirstPoints(points.float(), _mean_colors(views, pixels, seen), "random")
 
 
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
@@ -177,7 +157,7 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
 
 def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
     """Beyond all points in an image: a background that is cut off costs decibels, a few more planes cost nothing."""
-    depths = _seen_depths(points, views)
+    depths = seen_depths(points, views)
     return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 
 
@@ -191,23 +171,11 @@ def _random_points(views: Views, count: int, near: float, far: float, generator:
         depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
         points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
         # A place that k views see is drawn k times as often as one that a single view sees.
-        seeing = _inside(*project_all(points, views.cameras), views, near, far).sum(1)
+        seeing = in_views(*project_all(points, views.cameras), views, near, far).sum(1)
         found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])
         if sum(map(len, found)) >= count:
             break
     return torch.cat(found)[:count]
-
-
-def _inside(pixels: Tensor, depths: Tensor, views: Views, near: float, far: float) -> Tensor:
-    """Whether points `(P, V)` lie in the images of the views, between two depths."""
-    limits = torch.tensor([views.images.shape[-1] - 0.5, views.images.shape[-2] - 0.5], dtype=pixels.dtype)
-    return ((pixels > -0.5) & (pixels < limits)).all(-1) & (depths >= near) & (depths <= far)
-
-
-def _seen_depths(points: Tensor, views: Views) -> Tensor:
-    """Depths of points in the views whose image they lie in, `(D,)`."""
-    pixels, depths = project_all(points, views.cameras)
-    return depths[_inside(pixels, depths, views, 0.0, torch.inf) & (depths > 0)]
 
 
 def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:

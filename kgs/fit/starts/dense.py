@@ -6,10 +6,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.fit.pixels import picture_places, project_all, unproject
 from kgs.fit.progress import Stage, silent
 
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
-from .triangulate import picture_places, project_all, unproject
 
 SCORE = 0.6  # a patch of a point has to match at least so well
 MOST_PIXELS, MOST_PIXELS_OF_ALL, SMALLEST = 250_000, 1_600_000, 64

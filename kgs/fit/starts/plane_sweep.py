@@ -15,11 +15,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.backends import choose, compiled_covers, register
-from kgs.camera import camera_centers
 from kgs.datasets.scene import Views
+from kgs.fit.pixels import matrices
 from kgs.fit.progress import Stage, silent
-
-from .triangulate import matrices
+from kgs.rig import camera_centers
 
 PLANES, MOST_PLANES = 128, 256  # as many as a picture moves by pixels, in these limits
 WINDOW = 7  # pixels, the side of the patches that are compared

@@ -1,4 +1,4 @@
-"""Points from tracks in known cameras, and back: triangulation, projection, and how certain the depth is.
+"""Points from tracks in known cameras, and how certain their depth is.
 
 Source: R. Hartley and A. Zisserman, Multiple View Geometry, section 12.2 (the direct linear transformation).
 """
@@ -8,7 +8,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kgs.camera import camera_centers
+from kgs.fit.pixels import matrices, project_all
+from kgs.rig import camera_centers
 
 from .tracks import Tracks
 
@@ -49,37 +50,3 @@ def triangulate_certain(tracks: Tracks, cameras: PinholeCamera) -> tuple[Tensor,
     cosines = (rays @ rays.mT).masked_fill(~(tracks.seen[:, :, None] & tracks.seen[:, None, :]), 1.0).flatten(1).amin(1)
     certain = agreeing & (cosines.clamp(-1.0, 1.0).acos().rad2deg() >= MIN_ANGLE)
     return points[certain], tracks.select(certain)
-
-
-def project_all(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, float64; pixels mean nothing at depth <= 0."""
-    intrinsics, extrinsics = matrices(cameras)
-    local = torch.einsum("vij,pj->pvi", extrinsics[:, :3, :3], points.double()) + extrinsics[:, :3, 3]
-    image = torch.einsum("vij,pvj->pvi", intrinsics, local)
-    return image[..., :2] / image[..., 2:], local[..., 2]
-
-
-def picture_places(pixels: Tensor, depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Whole pixels x and y `(P,)` of a picture, and whether they are in it, before the camera; x and y are 0 outside.
-
-    Convention:
-        Integer pixel centres, rounded half to even.
-    """
-    places = pixels.round()
-    inside = ((places >= 0) & (places < torch.tensor([width, height]))).all(1) & (depths > 0)
-    x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
-    return x, y, inside
-
-
-def unproject(pixels: Tensor, depths: Tensor, views: Tensor, cameras: PinholeCamera) -> Tensor:
-    """The places in the world `(P, 3)` of pixels `(P, 2)` at depths `(P,)`, each in the camera of its view, float64."""
-    intrinsics, extrinsics = matrices(cameras)
-    rays = convert_points_to_homogeneous(pixels.double())
-    local = (torch.linalg.inv(intrinsics)[views] @ rays[..., None])[..., 0] * depths[:, None]
-    world: Tensor = (local - extrinsics[views, :3, 3])[:, None] @ extrinsics[views, :3, :3]
-    return world[:, 0]
-
-
-def matrices(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Intrinsics `(V, 3, 3)` and world-to-camera extrinsics `(V, 4, 4)` in float64 on the CPU."""
-    return cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu()

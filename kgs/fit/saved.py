@@ -1,0 +1,88 @@
+"""A fit that is done, read again from its folder: its settings, and its Gaussians for pictures and measures."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.camera import move_camera
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError
+from kgs.json_files import is_number, read_json
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
+
+from .checkpoint import newest_checkpoint
+from .config import FitConfig
+from .folder import CHECKPOINT, end_stopped_move
+from .poses import place_cameras
+
+
+def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
+    """The arguments of `load_scene` and the configuration in a fit's config.json; a DataError where it is wrong."""
+    settings = read_json(path)
+    for name in ("request", "fit"):
+        if not isinstance(settings.get(name), dict):
+            raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
+    request = {"points": "none", "hold_out": None, **settings["request"]}  # what older folders do not say
+    for name, expected, is_right in (
+        ("scene", "a path", lambda v: isinstance(v, str) and v and "\0" not in v),
+        ("train_views", "a whole number above 0 or null", lambda v: v is None or is_number(v, 1, whole=True)),
+        ("downscale", "a number of at least 1 or null", lambda v: v is None or is_number(v, 1)),
+        (
+            "hold_out",
+            "0, a whole number above 1 or null",
+            lambda v: v is None or (is_number(v, 0, whole=True) and v != 1),
+        ),
+        ("background", "one of ['black', 'white']", lambda v: v in ("black", "white")),
+        ("points", "one of ['none', 'model-points']", lambda v: v in ("none", "model-points")),
+    ):
+        if name not in request or not is_right(request[name]):
+            got = f"{request[name]!r}"[:60] if name in request else "none"
+            raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
+    try:
+        return request, FitConfig.from_dict(settings["fit"])
+    except ValueError as error:
+        raise DataError(path, "fit", str(error)) from error
+
+
+class SavedFit(NamedTuple):
+    """A fit for pictures and measures, without what training needs."""
+
+    request: dict[str, Any]  # the arguments of `load_scene`
+    config: FitConfig
+    model: GaussianModel  # in the frame of the scene: world coordinates less `Scene.offset`
+    near_plane: float  # in world units
+    step: int  # steps that are done
+    backend: str  # of the fit; on a GPU "auto"
+    poses: Tensor | None  # `(V, 4, 4)` of the training cameras, where the fit moved them
+
+    def placed(self, scene: Scene) -> Scene:
+        """The fit's scene, with the training cameras where the fit has them."""
+        return scene if self.poses is None else place_cameras(scene, self.poses)
+
+    @torch.no_grad()
+    def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
+        """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
+        device, most = self.model.means.device, self.config.max_bytes
+        renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=most, backend=self.backend).eval()
+        image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
+        return image
+
+
+def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
+    """Read what a fit left in its folder; a DataError where config.json or the checkpoint is missing or damaged."""
+    end_stopped_move(out)
+    request, config = read_settings(out / "config.json")
+    path = out / CHECKPOINT
+    state, _ = newest_checkpoint(path)
+    try:
+        model = GaussianModel(**state["model"])
+        model = (model.select(**part) if (part := state.get("shown")) else model).to(device)
+        backend = str(state.get("backend", "torch")) if model.means.device.type == "cpu" else "auto"
+        poses = (state.get("poses") or {}).get("extrinsics")
+        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend, poses)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error
