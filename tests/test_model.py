@@ -212,8 +212,8 @@ def test_a_degree_out_of_range_is_refused(degree):
         (torch.full((5, 3), math.nan), torch.rand(5, 3), ValueError, "points: expected finite"),
         (torch.rand(5, 3), torch.full((5, 3), math.nan), ValueError, "colors: expected finite"),
         (torch.rand(5, 3).half(), torch.rand(5, 3), TypeError, "points: expected float32 or float64"),
-        ([[0.0, 0.0, 0.0]], torch.rand(5, 3), TypeError, "points: expected float32 or float64"),
-        (torch.rand(5, 3), [[0.0, 0.0, 0.0]], TypeError, "colors: expected floating point"),
+        ([[0.0, 0.0, 0.0]], torch.rand(5, 3), TypeError, "points: expected a torch.Tensor, got list"),
+        (torch.rand(5, 3), [[0.0, 0.0, 0.0]], TypeError, "colors: expected a torch.Tensor, got list"),
         (torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), TypeError, "colors: expected floating point"),
     ],
 )

@@ -127,7 +127,7 @@ def test_only_the_built_in_scene_is_shown(folder):
     assert sum(map(len, pictures)) < 40_000
     data = (base64.b64decode(uri.removeprefix("data:image/jpeg;base64,")) for uri in pictures)
     photo, render, difference = (cv2.imdecode(np.frombuffer(one, np.uint8), 1).astype(float) for one in data)
-    expected = cells_module._start(None, "synthetic", 2, None, "sift", 0)[0].test.images[0]
+    expected = cells_module._start(None, "synthetic", 2, None, "sift", 0, "paper")[0].test.images[0]
     assert np.abs(photo[..., ::-1] / 255 - expected.permute(1, 2, 0).numpy()).mean() < 0.03  # of JPEG
     assert np.abs(difference - np.clip(4 * np.abs(render - photo), 0, 255)).mean() < 25  # their noise fourfold
     assert "pictures" not in sparse_cell(tiny_cell(seed=1))
@@ -187,8 +187,8 @@ def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
         return replace(loaded, points=(cloud - loaded.offset).float(), point_colors=torch.zeros(len(cloud), 3))
 
     monkeypatch.setattr(cells_module, "load_scene", with_points)
-    few, first, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 0)
-    _, other, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 1)
+    few, first, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 0, "paper")
+    _, other, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 1, "paper")
     assert len(first.points) == 10_000
     assert not torch.equal(first.points, other.points)
     nearest = torch.cdist(first.points[:100].double() + few.offset, cloud).amin(1)

@@ -47,10 +47,10 @@ def render(
     check_folder(out, (), cameras, make=False)
     clear = background == "transparent"
     scene = _load_cameras(cameras, downscale, background="black" if clear else background)
+    model, renderer = _load_splat(ply, scene, place, backend)
     posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
     names = png_names(name for name, _ in posed)
     check_folder(out, names.values(), scene.root)
-    model, renderer = _load_splat(ply, scene, place, backend)
     outputs, behind = ("image", "alpha") if clear else ("image",), scene.background.to(place)
     for name, camera in each(posed, "pictures", "view"):
         with torch.no_grad():
