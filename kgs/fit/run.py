@@ -7,12 +7,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from kgs.backends import resolve
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.json_files import write_json
@@ -24,7 +22,7 @@ from .exports import write_exports
 from .figures import write_curve
 from .folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
 from .lpips import Lpips
-from .machine import bytes_of, check_device, peak_rss_mb, versions
+from .machine import bytes_of, check_tools, peak_rss_mb, versions
 from .metrics import evaluate
 from .minutes import steps_within
 from .needs import decide
@@ -86,10 +84,8 @@ def fit_scene(
         ValueError: the device cannot be used, or the backend not on it.
         ModuleNotFoundError: the backend is numba, and it is not installed; or the extra `app` is not.
     """
-    for package in ("jinja2", "matplotlib"):  # needed after the training only
-        import_module(package)
+    check_tools(config.device, config.backend, "jinja2", "matplotlib")  # packages that are needed after the training
     out = Path(out)
-    resolve(config.backend, check_device(config.device))
     smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
     for views in (scene.train, scene.test):
         height, width = views.images.shape[-2:]
