@@ -23,7 +23,7 @@ from .study.grid import Cell, run_grid
 from .study.pairs import grouped
 
 SPACINGS = tuple(round(0.6 * 1.275**i, 2) for i in range(20))  # degrees between neighbours, up to 61
-EASY = 2.0, 20.0  # degrees, what the documentation asks for
+EASY = 2.0, 20.0  # degrees between neighbours that overlap and differ
 WRONG = 2.0, 0.1  # degrees in some pair, share of the focal length: more is wrong
 SIZE, DISTANCE = (378, 504), 3.3  # of a photo in pixels, and of the cameras from the middle of the scene
 
