@@ -62,8 +62,12 @@ def synthetic_scene(
     Raises:
         ValueError: the kind is unknown, or a number is out of range.
     """
-    given = {"train_views": train_views, "test_views": test_views, "size": min(size), "seed": seed}
-    for (name, value), least in zip(given.items(), (1, 0, 1, 0), strict=True):
+    for name, value, least in (
+        ("train_views", train_views, 1),
+        ("test_views", test_views, 0),
+        ("size", min(size), 1),
+        ("seed", seed, 0),
+    ):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}")
     stage = _stage(kind, seed)

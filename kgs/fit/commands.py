@@ -8,10 +8,8 @@ from typing import Any, Literal
 
 from kgs.errors import DataError
 
-from .config import DEMO, Backend, FitConfig
+from .config import DEMO, Backend, Background, FitConfig
 from .progress import VIEWER, as_line, say, say_next
-
-_Background = Literal["black", "white"]
 
 
 def demo(
@@ -73,7 +71,7 @@ def fit(
     views: int | None = None,
     hold_out: int | None = None,
     downscale: float | None = None,
-    background: _Background = "black",
+    background: Background = "black",
     preset: Literal["auto", "paper", "plain"] = "auto",
     fast: bool = False,
     resume: bool = False,

@@ -38,6 +38,7 @@ _Positive = Annotated[float, _Range(0, ends="(]")]
 _Weight = Annotated[float, _Range(0)]
 _Share = Annotated[float, _Range(0, 1)]
 Backend = Literal["auto", "torch", "numba"]
+Background = Literal["black", "white"]
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from .config import Backend, Recipe
+from .config import Backend, Background, Recipe
 from .progress import VIEWER, as_line, each, say, say_next
-
-_Background = Literal["black", "white"]
 
 
 def render(
@@ -17,7 +15,7 @@ def render(
     cameras: Path,
     out: Path,
     downscale: float | None = None,
-    background: Literal[_Background, "transparent"] = "black",
+    background: Literal[Background, "transparent"] = "black",
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
@@ -68,7 +66,7 @@ def page(
     cameras: Path,
     out: Path = Path("index.html"),
     downscale: float | None = None,
-    background: _Background = "black",
+    background: Background = "black",
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
