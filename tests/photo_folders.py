@@ -7,14 +7,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from kornia.geometry.camera import PinholeCamera
 from start_scenes import cameras, painted_planes
 
 NAMES = ("IMG_1.png", "IMG_2.png", "IMG_3.png")
 
 
-def planes() -> np.ndarray:
-    """The three views, `(3, H, W, 3)` BGR."""
-    images = painted_planes().images.permute(0, 2, 3, 1).numpy()
+def planes(posed: PinholeCamera | None = None) -> np.ndarray:
+    """The three views, `(3, H, W, 3)` BGR, from `cameras()` unless others are given."""
+    images = painted_planes(posed).images.permute(0, 2, 3, 1).numpy()
     return np.ascontiguousarray((images * 255).round().astype(np.uint8)[..., ::-1])
 
 

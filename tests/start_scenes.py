@@ -48,9 +48,9 @@ def texture(seed: int, tint: tuple[float, float, float], size: int = 900) -> np.
     return grey[..., None] * np.array(tint, dtype=np.float32)
 
 
-def painted_planes() -> Views:
-    """A reddish plane across the images, and a bluish one before it over their upper left."""
-    posed = cameras()
+def painted_planes(posed: PinholeCamera | None = None) -> Views:
+    """A reddish plane across the images of three cameras, and a bluish one before it over their upper left."""
+    posed = cameras() if posed is None else posed
     images = np.zeros((3, HEIGHT, WIDTH, 3), dtype=np.float32)
     for (depth, slope), tint, seed, (left, top, side) in (
         (BACK, BACK_TINT, 1, (-6.0, -6.0, 12.0)),

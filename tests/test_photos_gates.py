@@ -13,14 +13,14 @@ NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}
 
 
-def cameras(focal=800.0, points=(90, 80, 70), turn=0.0, missing=()):
+def cameras(focal=800.0, points=(90, 80, 70), turn=0.0, missing=(), rise=0.1):
     """Three cameras in a row that look along z, the last turned by so many degrees about y."""
     turns = dict(zip(NAMES, (0.0, 0.0, turn), strict=True))
     rotations = {n: cv2.Rodrigues(np.array([0.0, np.radians(t), 0.0]))[0] for n, t in turns.items()}
     centers = {n: np.array([float(i), 0, 0]) for i, n in enumerate(NAMES)}
     counts = {n: count for n, count in zip(NAMES, points, strict=True) if n not in missing}
     rows = ({n: v for n, v in kind.items() if n not in missing} for kind in (rotations, centers))
-    return Cameras(focal, *rows, counts, None)
+    return Cameras(focal, *rows, counts, None, rise)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +59,27 @@ def test_two_solvers_have_to_agree(tmp_path):
     assert judge(tmp_path, [few, first], NAMES, 1000, PAIRS)[0] is first
     with pytest.raises(DataError, match="places between b and c"):  # the weakest link of the strongest tree
         judge(tmp_path, [few, few], NAMES, 1000, PAIRS)
+
+
+def test_the_photos_or_their_exif_have_to_tell_the_focal_length(tmp_path):
+    first, second, given = cameras(rise=0.004), cameras(rise=0.009, points=(99, 99, 99)), cameras(rise=np.inf)
+    for unsure in (first, cameras(rise=-1e-9)):
+        with pytest.raises(DataError, match=r"grow by 0\.9%, less than 1%.*3 to 20 degrees apart"):
+            judge(tmp_path, [unsure, second], NAMES, 1000, PAIRS)
+    nothing = cameras(rise=np.nan)
+    with pytest.raises(DataError, match=r"grow by 0\.0%"):
+        judge(tmp_path, [nothing, nothing], NAMES, 1000, PAIRS)
+    assert judge(tmp_path, [given, given], NAMES, 1000, PAIRS)[0] is given
+    sure = cameras(rise=0.01)
+    assert judge(tmp_path, [second, sure], NAMES, 1000, PAIRS)[0] is sure  # though it sees fewer points
+
+
+def test_two_solvers_have_to_agree_on_the_focal_length(tmp_path):
+    near, far = cameras(focal=700), cameras(focal=690)
+    assert judge(tmp_path, [cameras(), near], NAMES, 1000, PAIRS)[0].focal == 800
+    for found in ([cameras(), far], [far, cameras()]):
+        with pytest.raises(DataError, match=r"differ by a factor of 1\.16, at most 1\.15"):
+            judge(tmp_path, found, NAMES, 1000, PAIRS)
 
 
 def test_groups_links_and_the_table():

@@ -22,7 +22,7 @@ from .write import REPORT, UNFINISHED, WAITING, check_place, end_move, is_kept, 
 
 __all__ = ["pose_photos"]
 
-SETTINGS = 1  # grows with every change after which the same photos give other files
+SETTINGS = 2  # grows with every change after which the same photos give other files
 
 
 def pose_photos(
@@ -54,8 +54,9 @@ def pose_photos(
 
     Returns:
         What photos.json holds: "photos" by file name, "matches" of each pair, "size" (width, height), "focal_px",
-        "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others;
-        "reused": whether it is a former run's; and "folder": where the scene is.
+        "focal_rise" (by what share squared errors grow where the focal length is a quarter off; None where that of the
+        Exif was held), "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates", "seconds"
+        and others; "reused": whether it is a former run's; and "folder": where the scene is.
 
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says

@@ -1,7 +1,8 @@
 """Whether cameras can be believed, and what to tell who took the photos where they cannot.
 
 A low reprojection error proves nothing: few matches fit wrong cameras as well. So the focal length has to be one that
-lenses have, each photo has to see many points, and a second solver, from other keypoints, has to find the same poses.
+lenses have, and the photos have to tell it unless their Exif does; each photo has to see many points; and a second
+solver, from other keypoints, has to find the same.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +17,8 @@ from .mapping import FEWEST_MATCHES, Cameras, Look
 FOCAL_RANGE = 0.4, 3.0  # of the longer side
 FEWEST_POINTS = 50  # that each photo sees
 MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
+MOST_RATIO = 1.15  # of their focal lengths
+LEAST_RISE = 0.01  # of the squared errors where the focal length is a quarter off
 _SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _FLAT = 0.97  # share of matches that one homography explains; of a scene with depth in some pair fewer
 _WITHOUT = "A fit without some photos: take them out of the folder"
@@ -54,6 +57,11 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
         angle = _angle(first, second, pair) if known else 180.0
         worst = max(worst, (angle, pair))
     return worst
+
+
+def focal_ratio(first: Cameras, second: Cameras) -> float:
+    """By what factor, at least 1, the focal length of one solver is longer than that of the other."""
+    return max(first.focal, second.focal) / min(first.focal, second.focal)
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
@@ -111,6 +119,17 @@ def unfit(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Lo
         between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
         advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
     return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
+
+
+def untold(rise: float, names: Sequence[str], pairs: Pairs) -> str:
+    """What to say of photos that fit any focal length, of which Exif says none; `rise` is the largest found."""
+    return (
+        "no cameras that can be trusted: the photos are so close together that they do not tell the focal length, and "
+        f"their Exif does not say it: where it is a quarter off, squared errors grow by {max(0.0, rise):.1%}, less "
+        f"than {LEAST_RISE:.0%}, and the depth of the scene is as unsure. What helps: larger steps to the side or up, "
+        "so that neighbours are 3 to 20 degrees apart; or the photos as the camera wrote them, since messengers and "
+        f"many editors drop Exif.\n{table(names, pairs)}"
+    )
 
 
 def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs) -> str:

@@ -4,6 +4,8 @@ Source: J. Schoenberger and J.-M. Frahm, Structure-from-motion revisited, CVPR 2
 were measured (docs/photos.md). Each step runs on one thread, so that the same photos give the same bits.
 """
 
+import copy
+import math
 import signal
 import threading
 from collections.abc import Iterator, Mapping
@@ -20,6 +22,7 @@ FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 
 _PEAKS = 0.25  # of COLMAP's threshold for keypoints
 _MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
 _LONGEST = 1000  # pixels; COLMAP's own keypoints are as good in smaller photos, and take a minute less
+_OFF = 1.25  # by how much a focal length is made wrong to see whether points still fit
 
 
 class Cameras(NamedTuple):
@@ -30,6 +33,7 @@ class Cameras(NamedTuple):
     centers: dict[str, NDArray[np.float64]]  # (3,) each, in the world
     points: dict[str, int]  # how many points a photo sees
     reconstruction: Any  # pycolmap's
+    focal_rise: float  # share by which squared errors grow with a wrong focal length; infinite where it was given
 
 
 class Look(NamedTuple):
@@ -151,11 +155,19 @@ def solve(database: Path, images: Path, work: Path, seed: int, names: Mapping[st
         with suppress(RuntimeError, ValueError):  # the mapper gives up
             found = pycolmap.incremental_mapping(database, images, work, options)
             best = max(found.values(), key=lambda scene: scene.num_reg_images(), default=None)
-            return None if best is None else cameras_of(best, names)
+            if best is not None:
+                adjusted, least = _adjusted(best)
+                return cameras_of(adjusted, names, _rise(adjusted, least))
     return None
 
 
-def cameras_of(reconstruction: Any, names: Mapping[str, str]) -> Cameras:
+def hold_focal(cameras: Cameras, focal: float, names: Mapping[str, str]) -> Cameras:
+    """The cameras of the same photos with this focal length in pixels, all else adjusted to it; `names` as of `solve`.
+    """
+    return cameras_of(_adjusted(cameras.reconstruction, focal)[0], names, math.inf)
+
+
+def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
     """The cameras of a reconstruction by the names that `names` gives its images, in their order there."""
     images = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     placed = {name: images[image] for image, name in names.items() if image in images}
@@ -166,7 +178,37 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str]) -> Cameras:
         {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
         {name: int(image.num_points3D) for name, image in placed.items()},
         reconstruction,
+        focal_rise,
     )
+
+
+def _adjusted(reconstruction: Any, focal: float | None = None) -> tuple[Any, float]:
+    """A copy, adjusted until nothing improves, and half its sum of squared errors in pixels; `focal` is held if given.
+
+    The mapper stops earlier: where photos hardly tell the focal length that is up to 10 % of it.
+    """
+    scene = copy.deepcopy(reconstruction)
+    with quiet_pycolmap() as pycolmap:
+        options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+        options.print_summary, options.ceres.solver_options.num_threads = False, 1
+        if focal is not None:
+            options.refine_focal_length = False
+            next(iter(scene.cameras.values())).focal_length = focal
+        for image in scene.reg_image_ids():
+            config.add_image(image)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        done = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
+    return scene, float(done.ceres_summary.final_cost) if done.num_residuals else 0.0
+
+
+def _rise(reconstruction: Any, least: float) -> float:
+    """By what share the sum of squared errors grows with a focal length 1.25 times too long or too short: the lesser.
+
+    All else is adjusted to that. Near 0 the photos do not tell the focal length: the scene is stretched instead.
+    """
+    focal = next(iter(reconstruction.cameras.values())).focal_length
+    wrong = min(_adjusted(reconstruction, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
+    return wrong / max(least, np.finfo(np.float64).tiny) - 1
 
 
 def _two_views(pycolmap: Any, seed: int) -> Any:

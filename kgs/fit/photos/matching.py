@@ -93,15 +93,21 @@ def _open(database: Path) -> Any:
     return pycolmap.Database.open(database)
 
 
+def exif_focal(photos: list[Photo]) -> float | None:
+    """The focal length in pixels as the files say, None where none does."""
+    known = [photo.focal for photo in photos if photo.focal]
+    return median_high(known) if known else None
+
+
 def lens_of(photos: list[Photo]) -> Any:
     """What is known of the one lens of all photos, as pycolmap has it."""
     import pycolmap
 
     width, height = photos[0].size
-    known = [photo.focal for photo in photos if photo.focal]
-    focal = median_high(known) if known else DEFAULT_FOCAL * max(width, height)
+    known = exif_focal(photos)
+    focal = known or DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
-    camera.has_prior_focal_length = bool(known)
+    camera.has_prior_focal_length = known is not None
     return camera
 
 

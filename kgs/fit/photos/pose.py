@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from statistics import median_high
 from typing import Any
 
 import cv2
@@ -22,15 +21,19 @@ from .exif import FILM_DIAGONAL
 from .gates import (
     FEWEST_POINTS,
     FOCAL_RANGE,
+    LEAST_RISE,
     MOST_DEGREES,
+    MOST_RATIO,
     Pairs,
     disagreement,
+    focal_ratio,
     objections,
     refusal,
     unfit,
+    untold,
 )
-from .mapping import Cameras, looks, quiet_pycolmap, solve, verify, write_own_matches
-from .matching import lens_of, write_matches
+from .mapping import Cameras, hold_focal, looks, quiet_pycolmap, solve, verify, write_own_matches
+from .matching import exif_focal, lens_of, write_matches
 from .read import Photo, blurred, read_photos
 from .write import IMAGES, MODEL, level_and_scale, write_images, write_model
 
@@ -67,6 +70,9 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
             seconds["cameras"] = lap()
             own.result()
         found.append(solve(second, images, work / "model", seed, known))
+        if held := exif_focal(photos) if any(c and c.focal_rise < LEAST_RISE for c in found) else None:
+            say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
+            found = [cameras and hold_focal(cameras, held, known) for cameras in found]
         seconds["second solver"] = lap()
         chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
         level_and_scale(chosen)
@@ -77,6 +83,7 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
     say(f"cameras: {len(photos)} photos placed, {chosen.reconstruction.num_points3D()} points, {error:.2f} pixels off")
     return {
         **_lens(chosen, photos),
+        "focal_rise": None if held else chosen.focal_rise,
         "photos": {
             photo.path.name: {
                 "image": png[photo.path.name],
@@ -95,6 +102,8 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
             "focal_over_longer_side": list(FOCAL_RANGE),
             "least_points_of_a_photo": FEWEST_POINTS,
             "most_degrees": MOST_DEGREES,
+            "most_focal_ratio": MOST_RATIO,
+            "least_focal_rise": LEAST_RISE,
             "passed": True,
         },
         "seconds": seconds,
@@ -117,25 +126,32 @@ def judge(
         if missing := [name for name in names if cameras is None or name not in cameras.points]:
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
             raise DataError(folder, "", refusal([reason], names, pairs))
-    degrees, pair = disagreement(*[cameras for cameras in found if cameras])
+    sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE]
+    if not sure:
+        raise DataError(folder, "", untold(max(cameras.focal_rise for cameras in good), names, pairs))
+    both = [cameras for cameras in found if cameras]
+    (degrees, pair), ratio = disagreement(*both), focal_ratio(*both)
     if degrees > MOST_DEGREES:
         reason = (
             f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
         )
         raise DataError(folder, "", refusal([reason], names, pairs))
-    return max(good, key=lambda cameras: min(cameras.points.values())), degrees
+    if ratio > MOST_RATIO:
+        reason = f"two solvers' focal lengths differ by a factor of {ratio:.3g}, at most {MOST_RATIO:g} is right"
+        raise DataError(folder, "", refusal([reason], names, pairs))
+    return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
 
 
 def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
     """What the report says of size and lens."""
     camera = next(iter(cameras.reconstruction.cameras.values()))
-    (width, height), known = photos[0].size, [photo.focal for photo in photos if photo.focal]
+    width, height = photos[0].size
     film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
     return {
         "size": [width, height],
         "focal_px": cameras.focal,
         "focal_35mm": film,
-        "exif_focal_px": median_high(known) if known else None,
+        "exif_focal_px": exif_focal(photos),
         "radial_distortion": float(camera.params[3]),
     }
 
