@@ -162,8 +162,7 @@ def solve(database: Path, images: Path, work: Path, seed: int, names: Mapping[st
 
 
 def hold_focal(cameras: Cameras, focal: float, names: Mapping[str, str]) -> Cameras:
-    """The cameras of the same photos with this focal length in pixels, all else adjusted to it; `names` as of `solve`.
-    """
+    """The same photos' cameras with this focal length in pixels, all else adjusted to it; `names` as of `solve`."""
     return cameras_of(_adjusted(cameras.reconstruction, focal)[0], names, math.inf)
 
 
