@@ -29,7 +29,7 @@ SIZE, DISTANCE = (378, 504), 3.3  # of a photo in pixels, and of the cameras fro
 
 
 def cameras(*, out: Path, quick: bool = False, processes: int | None = None, scheduler: str | None = None) -> int:
-    """How often cameras are found, refused, or accepted although they are wrong (a quarter of an hour; can go on).
+    """How often cameras are found, refused, or accepted although they are wrong (half an hour; can go on).
 
     For example:
       kgs bench cameras -o cameras-quick --quick
