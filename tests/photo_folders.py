@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from kornia.geometry.camera import PinholeCamera
-from start_scenes import cameras, painted_planes
+from start_scenes import CENTERS, cameras, painted_planes
 
 NAMES = ("IMG_1.png", "IMG_2.png", "IMG_3.png")
 
@@ -28,6 +28,15 @@ def write_planes(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for name, image in zip(NAMES, planes(), strict=True):
         cv2.imwrite(str(folder / name), image)
+    return folder
+
+
+def write_close(folder: Path, film: int = 0) -> Path:
+    """The same from places a degree apart, which fit any focal length; `film`: what Exif says of it, in mm."""
+    folder.mkdir(parents=True)
+    for name, image in zip(NAMES, planes(cameras(0.2 * CENTERS, -0.02)), strict=True):
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        (folder / name.replace("png", "jpg")).write_bytes(with_exif(data, exif(film=film)))
     return folder
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from photo_folders import NAMES, exif, planes, poses, with_exif, write_planes
-from start_scenes import CENTERS, WIDTH, cameras, focal_length
+from photo_folders import NAMES, planes, poses, write_close, write_planes
+from start_scenes import WIDTH, focal_length
 
 from kgs.datasets import load_scene
 from kgs.errors import DataError
@@ -134,20 +134,10 @@ def test_a_second_run_uses_what_is_there(posed, monkeypatch):
     }.items() <= before.items()
 
 
-@pytest.mark.parametrize("film", [0, 30])
-def test_photos_that_are_close_together_need_the_focal_length_of_their_exif(tmp_path, film):
-    """A degree apart: any focal length fits, with the depth of the scene stretched."""
-    for name, image in zip(NAMES, planes(cameras(0.2 * CENTERS, -0.02)), strict=True):
-        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-        (tmp_path / "photos").mkdir(exist_ok=True)
-        (tmp_path / "photos" / name.replace("png", "jpg")).write_bytes(with_exif(data, exif(film=film)))
-    if not film:
-        with pytest.raises(DataError, match=r"do not tell the focal length(?s:.)*Matches of each pair"):
-            pose_photos(tmp_path / "photos", tmp_path / "out")
-        return
-    lines = []
-    report = pose_photos(tmp_path / "photos", tmp_path / "out", say=lines.append)
-    assert report["focal_px"] == report["exif_focal_px"] == pytest.approx(film * WIDTH / 34.6, rel=1e-3)
+def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_path):
+    lines, folder = [], write_close(tmp_path / "photos", film=30)
+    report = pose_photos(folder, tmp_path / "out", say=lines.append)
+    assert report["focal_px"] == report["exif_focal_px"] == pytest.approx(30 * WIDTH / 34.6, rel=1e-3)
     assert report["focal_rise"] is None
     assert any("the Exif says 208 pixels" in line for line in lines)
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from photo_folders import exif, planes, with_exif, write_planes
+from photo_folders import exif, planes, with_exif, write_close, write_planes
 from start_scenes import texture
 
 from kgs.cli import main
@@ -151,6 +151,11 @@ def test_a_camera_that_only_turned(folder, refused):
     turns = [cv2.Rodrigues(np.array([0.02 * i, 0.12 * i, 0.0]))[0] for i in range(3)]
     save(folder, [cv2.warpPerspective(wall, lens @ turn @ np.linalg.inv(far), (240, 180)) for turn in turns])
     refused(folder, "a camera that only turned on the spot, explains all matches", "step to the side", "Matches of")
+
+
+def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
+    message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
+    refused(write_close(tmp_path / "photos"), *message)
 
 
 def test_a_blurred_photo_is_told(folder):
