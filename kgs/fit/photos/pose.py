@@ -70,7 +70,9 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
             seconds["cameras"] = lap()
             own.result()
         found.append(solve(second, images, work / "model", seed, known))
-        if held := exif_focal(photos) if any(c and c.focal_rise < LEAST_RISE for c in found) else None:
+        told = all(cameras is None or cameras.focal_rise >= LEAST_RISE for cameras in found)
+        held = None if told else exif_focal(photos)
+        if held:
             say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
             found = [cameras and hold_focal(cameras, held, known) for cameras in found]
         seconds["second solver"] = lap()
