@@ -22,7 +22,7 @@ from .write import REPORT, UNFINISHED, WAITING, check_place, end_move, is_kept, 
 
 __all__ = ["pose_photos"]
 
-SETTINGS = 2  # grows with every change after which the same photos give other files
+SETTINGS = 3  # grows with every change after which the same photos give other files
 
 
 def pose_photos(

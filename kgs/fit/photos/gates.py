@@ -18,7 +18,7 @@ FOCAL_RANGE = 0.4, 3.0  # of the longer side
 FEWEST_POINTS = 50  # that each photo sees
 MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
 MOST_RATIO = 1.15  # of their focal lengths
-LEAST_RISE = 0.01  # of the squared errors where the focal length is a quarter off
+LEAST_RISE = 0.03  # of the squared errors where the focal length is a quarter off
 _SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _FLAT = 0.97  # share of matches that one homography explains; of a scene with depth in some pair fewer
 _WITHOUT = "A fit without some photos: take them out of the folder"
@@ -59,9 +59,17 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
     return worst
 
 
-def focal_ratio(first: Cameras, second: Cameras) -> float:
-    """By what factor, at least 1, the focal length of one solver is longer than that of the other."""
-    return max(first.focal, second.focal) / min(first.focal, second.focal)
+def faint_focal(found: Sequence[Cameras]) -> str:
+    """Why no solver's photos tell the focal length; "" if those of one do."""
+    rise = max(0.0, *(cameras.focal_rise for cameras in found))
+    told = rise >= LEAST_RISE
+    return "" if told else f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {LEAST_RISE:.0%}"
+
+
+def unlike_focals(found: Sequence[Cameras]) -> str:
+    """How far the solvers' focal lengths are apart, where that is too far; "" if it is not."""
+    ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
+    return f"two solvers' differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}" if ratio > MOST_RATIO else ""
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
@@ -121,14 +129,13 @@ def unfit(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Lo
     return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
 
 
-def untold(rise: float, names: Sequence[str], pairs: Pairs) -> str:
-    """What to say of photos that fit any focal length, of which Exif says none; `rise` is the largest found."""
+def untold(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
+    """What to say of photos of which neither they nor their Exif tell the focal length; `doubt` says why."""
     return (
-        "no cameras that can be trusted: the photos are so close together that they do not tell the focal length, and "
-        f"their Exif does not say it: where it is a quarter off, squared errors grow by {max(0.0, rise):.1%}, less "
-        f"than {LEAST_RISE:.0%}, and the depth of the scene is as unsure. What helps: larger steps to the side or up, "
-        "so that neighbours are 3 to 20 degrees apart; or the photos as the camera wrote them, since messengers and "
-        f"many editors drop Exif.\n{table(names, pairs)}"
+        "no cameras that can be trusted: the photos do not tell the focal length, as a rule because they are close "
+        f"together, and their Exif does not say it: {doubt}, and the depth of the scene is as unsure. What helps: "
+        "larger steps to the side or up, so that neighbours are 3 to 20 degrees apart; or the photos as the camera "
+        f"wrote them, since messengers and many editors drop Exif.\n{table(names, pairs)}"
     )
 
 

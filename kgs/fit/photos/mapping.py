@@ -22,6 +22,10 @@ FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 
 _PEAKS = 0.25  # of COLMAP's threshold for keypoints
 _MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
 _LONGEST = 1000  # pixels; COLMAP's own keypoints are as good in smaller photos, and take a minute less
+_FIRST_PAIR = 2.0, 0.2  # least degrees between the first two; COLMAP's 16 fail on photos that face one way
+_ROUNDS = 5  # of placing photos with the lens held, and of adjusting it
+_STILL = 0.03  # change of the focal length (of it) and of the distortion after which the lens is held for good
+_BENDS = 0.1  # share of the squared errors that are due to distortion where it is believed
 _OFF = 1.25  # by how much a focal length is made wrong to see whether points still fit
 
 
@@ -129,41 +133,36 @@ def write_own_matches(database: Path, images: Path, names: list[str], lens: Any,
         pycolmap.match_exhaustive(database, **rules, device=cpu)
 
 
-def solve(database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str]) -> Cameras | None:
+def solve(
+    database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str], focal: float | None = None
+) -> Cameras | None:
     """Cameras and points from verified matches, of as many photos as can be placed; None where no pair can be.
 
+    The lens is held while photos are placed, because two of them do not tell it, and adjusted to all of them after
+    that; again, with the lens that came out, until it no longer changes.
+
     Args:
-        database: with verified matches.
+        database: with verified matches, and a first guess of the lens, which is replaced by what comes out.
         images: the folder of the photos.
         work: a folder for what the mapper writes.
         seed: of its random choices.
         names: what each image of the database is called.
+        focal: the focal length in pixels, where it is known; adjusted if None.
     """
-    with quiet_pycolmap() as pycolmap:
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-        options.multiple_models, options.min_model_size, options.extract_colors = False, 2, False
-        options.min_num_matches = 10
-        options.mapper.init_min_tri_angle = 2.0  # degrees; the default, 16, fails on photos that face one way
-        options.mapper.init_min_num_inliers = 20
-        options.mapper.abs_pose_min_num_inliers = 12
-        options.mapper.filter_max_reproj_error = _MAX_ERROR
-        options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = _MAX_ERROR
-        options.mapper.init_max_error, options.mapper.abs_pose_max_error = 2.0, 4.0
-        options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
-        with suppress(RuntimeError, ValueError):  # the mapper gives up
-            found = pycolmap.incremental_mapping(database, images, work, options)
-            best = max(found.values(), key=lambda scene: scene.num_reg_images(), default=None)
-            if best is not None:
-                adjusted, least = _adjusted(best)
-                return cameras_of(adjusted, names, _rise(adjusted, least))
-    return None
-
-
-def hold_focal(cameras: Cameras, focal: float, names: Mapping[str, str]) -> Cameras:
-    """The same photos' cameras with this focal length in pixels, all else adjusted to it; `names` as of `solve`."""
-    return cameras_of(_adjusted(cameras.reconstruction, focal)[0], names, math.inf)
+    best, least = None, 0.0
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
+        lens = file.read_all_cameras()[0]
+        lens.focal_length = focal or lens.focal_length
+        for _ in range(_ROUNDS):
+            file.update_camera(lens)
+            found = _mapped(pycolmap, database, images, work, seed, focal is None)
+            if found is None or (best is not None and _lost(best, found)):
+                break
+            best, least = _settled(found, focal)
+            before, lens.params = np.array(lens.params), _lens(best).params
+            if abs(math.log(lens.params[0] / before[0])) < _STILL and abs(lens.params[3] - before[3]) < _STILL:
+                break
+    return None if best is None else cameras_of(best, names, _rise(best, least) if focal is None else math.inf)
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
@@ -172,7 +171,7 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     placed = {name: images[image] for image, name in names.items() if image in images}
     poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
     return Cameras(
-        float(next(iter(reconstruction.cameras.values())).focal_length),
+        float(_lens(reconstruction).focal_length),
         {name: pose[:, :3] for name, pose in poses.items()},
         {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
         {name: int(image.num_points3D) for name, image in placed.items()},
@@ -181,18 +180,64 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     )
 
 
-def _adjusted(reconstruction: Any, focal: float | None = None) -> tuple[Any, float]:
-    """A copy, adjusted until nothing improves, and half its sum of squared errors in pixels; `focal` is held if given.
+def _mapped(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, free: bool) -> Any:
+    """The reconstruction of most photos with the lens of the database; None where no pair can be placed.
 
-    The mapper stops earlier: where photos hardly tell the focal length that is up to 10 % of it.
+    If `free` the focal length is adjusted on the way where else no pair can be placed.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.multiple_models, options.min_model_size, options.extract_colors = False, 2, False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.min_num_matches = 10
+    options.mapper.init_min_num_inliers = 20
+    options.mapper.abs_pose_min_num_inliers = 12
+    options.mapper.filter_max_reproj_error = _MAX_ERROR
+    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = _MAX_ERROR
+    options.mapper.init_max_error, options.mapper.abs_pose_max_error = 2.0, 4.0
+    options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
+    for options.mapper.init_min_tri_angle in _FIRST_PAIR:
+        with suppress(RuntimeError, ValueError):  # the mapper gives up
+            found = pycolmap.incremental_mapping(database, images, work, options)
+            if found:
+                return max(found.values(), key=lambda scene: scene.num_reg_images())
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = free
+    return None
+
+
+def _lost(best: Any, found: Any) -> bool:
+    """Whether a reconstruction places fewer photos than a former one, or less than half of its points."""
+    return bool(found.num_reg_images() < best.num_reg_images() or 2 * found.num_points3D() < best.num_points3D())
+
+
+def _settled(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
+    """What `_adjusted` gives, with a lens that distorts only where that explains enough of the errors."""
+    straight, most = _adjusted(reconstruction, False, focal)
+    bent, least = _adjusted(reconstruction, True, focal)
+    return (bent, least) if most > (1 + _BENDS) * least else (straight, most)
+
+
+def _adjusted(reconstruction: Any, bent: bool, focal: float | None = None) -> tuple[Any, float]:
+    """A copy, adjusted until nothing improves, and half its sum of squared errors in pixels.
+
+    Args:
+        reconstruction: pycolmap's.
+        bent: whether the lens may distort.
+        focal: its focal length in pixels, held; adjusted if None.
     """
     scene = copy.deepcopy(reconstruction)
     with quiet_pycolmap() as pycolmap:
         options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
         options.print_summary, options.ceres.solver_options.num_threads = False, 1
-        if focal is not None:
-            options.refine_focal_length = False
-            next(iter(scene.cameras.values())).focal_length = focal
+        options.refine_focal_length, options.refine_extra_params = focal is None, bent
+        lens = _lens(scene)
+        lens.params = [
+            lens.focal_length if focal is None else focal,
+            *lens.params[1:3],
+            lens.params[3] if bent else 0.0,
+        ]
         for image in scene.reg_image_ids():
             config.add_image(image)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -205,9 +250,18 @@ def _rise(reconstruction: Any, least: float) -> float:
 
     All else is adjusted to that. Near 0 the photos do not tell the focal length: the scene is stretched instead.
     """
-    focal = next(iter(reconstruction.cameras.values())).focal_length
-    wrong = min(_adjusted(reconstruction, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
+    focal, bent = _lens(reconstruction).focal_length, _bent(reconstruction)
+    wrong = min(_adjusted(reconstruction, bent, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
     return wrong / max(least, np.finfo(np.float64).tiny) - 1
+
+
+def _lens(reconstruction: Any) -> Any:
+    """The one camera, with params focal length, centre (x, y) and radial distortion."""
+    return next(iter(reconstruction.cameras.values()))
+
+
+def _bent(reconstruction: Any) -> bool:
+    return bool(_lens(reconstruction).params[3] != 0)
 
 
 def _two_views(pycolmap: Any, seed: int) -> Any:

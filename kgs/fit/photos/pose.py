@@ -26,13 +26,14 @@ from .gates import (
     MOST_RATIO,
     Pairs,
     disagreement,
-    focal_ratio,
+    faint_focal,
     objections,
     refusal,
     unfit,
+    unlike_focals,
     untold,
 )
-from .mapping import Cameras, hold_focal, looks, quiet_pycolmap, solve, verify, write_own_matches
+from .mapping import Cameras, looks, quiet_pycolmap, solve, verify, write_own_matches
 from .matching import exif_focal, lens_of, write_matches
 from .read import Photo, blurred, read_photos
 from .write import IMAGES, MODEL, level_and_scale, write_images, write_model
@@ -70,11 +71,11 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
             seconds["cameras"] = lap()
             own.result()
         found.append(solve(second, images, work / "model", seed, known))
-        told = all(cameras is None or cameras.focal_rise >= LEAST_RISE for cameras in found)
-        held = None if told else exif_focal(photos)
+        placed = [cameras for cameras in found if cameras]
+        held = exif_focal(photos) if placed and (faint_focal(placed) or unlike_focals(placed)) else None
         if held:
             say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
-            found = [cameras and hold_focal(cameras, held, known) for cameras in found]
+            found = [solve(matched, images, work / "model", seed, known, held) for matched in (first, second)]
         seconds["second solver"] = lap()
         chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
         level_and_scale(chosen)
@@ -128,19 +129,18 @@ def judge(
         if missing := [name for name in names if cameras is None or name not in cameras.points]:
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
             raise DataError(folder, "", refusal([reason], names, pairs))
-    sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE]
-    if not sure:
-        raise DataError(folder, "", untold(max(cameras.focal_rise for cameras in good), names, pairs))
     both = [cameras for cameras in found if cameras]
-    (degrees, pair), ratio = disagreement(*both), focal_ratio(*both)
+    if doubt := faint_focal(both):
+        raise DataError(folder, "", untold(doubt, names, pairs))
+    degrees, pair = disagreement(*both)
     if degrees > MOST_DEGREES:
         reason = (
             f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
         )
         raise DataError(folder, "", refusal([reason], names, pairs))
-    if ratio > MOST_RATIO:
-        reason = f"two solvers' focal lengths differ by a factor of {ratio:.3g}, at most {MOST_RATIO:g} is right"
-        raise DataError(folder, "", refusal([reason], names, pairs))
+    if doubt := unlike_focals(both):
+        raise DataError(folder, "", untold(doubt, names, pairs))
+    sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE] or good
     return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
 
 
