@@ -25,7 +25,8 @@ _LONGEST = 1000  # pixels; COLMAP's own keypoints are as good in smaller photos,
 _FIRST_PAIR = 2.0, 0.2  # least degrees between the first two; COLMAP's 16 fail on photos that face one way
 _ROUNDS = 5  # of placing photos with the lens held, and of adjusting it
 _STILL = 0.03  # change of the focal length (of it) and of the distortion after which the lens is held for good
-_BENDS = 0.1  # share of the squared errors that are due to distortion where it is believed
+_USUAL = 0.05  # radial distortion that cameras have
+_BENDS = 0.1  # share of the squared errors that a larger one has to explain
 _OFF = 1.25  # by how much a focal length is made wrong to see whether points still fit
 
 
@@ -213,31 +214,32 @@ def _lost(best: Any, found: Any) -> bool:
 
 
 def _settled(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
-    """What `_adjusted` gives, with a lens that distorts only where that explains enough of the errors."""
-    straight, most = _adjusted(reconstruction, False, focal)
-    bent, least = _adjusted(reconstruction, True, focal)
-    return (bent, least) if most > (1 + _BENDS) * least else (straight, most)
+    """What `_adjusted` gives, with a distortion that cameras have or that explains enough of the errors; else with 0.
+
+    Photos that hardly tell the focal length trade it against a distortion that no camera has.
+    """
+    straight, most = _adjusted(reconstruction, 0.0, focal)
+    bent, least = _adjusted(reconstruction, None, focal)
+    believed = abs(_lens(bent).params[3]) <= _USUAL or most > (1 + _BENDS) * least
+    return (bent, least) if believed else (straight, most)
 
 
-def _adjusted(reconstruction: Any, bent: bool, focal: float | None = None) -> tuple[Any, float]:
+def _adjusted(reconstruction: Any, distortion: float | None, focal: float | None) -> tuple[Any, float]:
     """A copy, adjusted until nothing improves, and half its sum of squared errors in pixels.
 
     Args:
         reconstruction: pycolmap's.
-        bent: whether the lens may distort.
+        distortion: that of the lens, held; adjusted if None.
         focal: its focal length in pixels, held; adjusted if None.
     """
     scene = copy.deepcopy(reconstruction)
     with quiet_pycolmap() as pycolmap:
         options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
         options.print_summary, options.ceres.solver_options.num_threads = False, 1
-        options.refine_focal_length, options.refine_extra_params = focal is None, bent
+        options.refine_focal_length, options.refine_extra_params = focal is None, distortion is None
         lens = _lens(scene)
-        lens.params = [
-            lens.focal_length if focal is None else focal,
-            *lens.params[1:3],
-            lens.params[3] if bent else 0.0,
-        ]
+        known = lens.params.copy()
+        lens.params = [focal or known[0], *known[1:3], known[3] if distortion is None else distortion]
         for image in scene.reg_image_ids():
             config.add_image(image)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -248,20 +250,17 @@ def _adjusted(reconstruction: Any, bent: bool, focal: float | None = None) -> tu
 def _rise(reconstruction: Any, least: float) -> float:
     """By what share the sum of squared errors grows with a focal length 1.25 times too long or too short: the lesser.
 
-    All else is adjusted to that. Near 0 the photos do not tell the focal length: the scene is stretched instead.
+    All else but the distortion is adjusted to that. Near 0 the photos do not tell the focal length: the scene is
+    stretched instead.
     """
-    focal, bent = _lens(reconstruction).focal_length, _bent(reconstruction)
-    wrong = min(_adjusted(reconstruction, bent, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
+    focal, _, _, distortion = _lens(reconstruction).params
+    wrong = min(_adjusted(reconstruction, distortion, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
     return wrong / max(least, np.finfo(np.float64).tiny) - 1
 
 
 def _lens(reconstruction: Any) -> Any:
     """The one camera, with params focal length, centre (x, y) and radial distortion."""
     return next(iter(reconstruction.cameras.values()))
-
-
-def _bent(reconstruction: Any) -> bool:
-    return bool(_lens(reconstruction).params[3] != 0)
 
 
 def _two_views(pycolmap: Any, seed: int) -> Any:
