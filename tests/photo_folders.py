@@ -31,13 +31,18 @@ def write_planes(folder: Path) -> Path:
     return folder
 
 
-def write_close(folder: Path, film: int = 0) -> Path:
-    """The same from places a degree apart, which fit any focal length; `film`: what Exif says of it, in mm."""
+def write_photos(folder: Path, images: np.ndarray, film: int = 0) -> Path:
+    """JPEGs of these; `film`: the focal length that Exif says, in mm of 35 mm film (0: none)."""
     folder.mkdir(parents=True)
-    for name, image in zip(NAMES, planes(cameras(0.2 * CENTERS, -0.02)), strict=True):
+    for name, image in zip(NAMES, images, strict=True):
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
         (folder / name.replace("png", "jpg")).write_bytes(with_exif(data, exif(film=film)))
     return folder
+
+
+def close() -> np.ndarray:
+    """The same planes from places a degree apart, which fit any focal length."""
+    return planes(cameras(0.2 * CENTERS, -0.02))
 
 
 def exif(order: str = "<", orientation: int = 1, film: int = 0, focal: float = 0, density: float = 0, width: int = 0):

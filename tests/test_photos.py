@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from photo_folders import NAMES, planes, poses, write_close, write_planes
+from photo_folders import NAMES, close, planes, poses, write_photos, write_planes
 from start_scenes import WIDTH, focal_length
 
 from kgs.datasets import load_scene
@@ -135,11 +135,37 @@ def test_a_second_run_uses_what_is_there(posed, monkeypatch):
 
 
 def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_path):
-    lines, folder = [], write_close(tmp_path / "photos", film=30)
+    lines, folder = [], write_photos(tmp_path / "photos", close(), film=30)
     report = pose_photos(folder, tmp_path / "out", say=lines.append)
     assert report["focal_px"] == report["exif_focal_px"] == pytest.approx(30 * WIDTH / 34.6, rel=1e-3)
     assert report["focal_rise"] is None
     assert any("the Exif says 208 pixels" in line for line in lines)
+
+
+def test_photos_that_tell_the_focal_length_are_believed_more_than_their_exif(tmp_path):
+    report = pose_photos(write_photos(tmp_path / "photos", planes(), film=40), tmp_path / "out", say=lambda line: None)
+    assert report["exif_focal_px"] > 1.3 * focal_length(WIDTH)
+    assert report["focal_px"] == pytest.approx(focal_length(WIDTH), rel=0.05)
+
+
+@pytest.mark.parametrize("strength", [0.03, -0.1])
+def test_the_distortion_of_the_lens_is_found(tmp_path, strength):
+    images = np.stack([distorted(image, strength) for image in planes()])
+    report = pose_photos(write_photos(tmp_path / "photos", images), tmp_path / "out", say=lambda line: None)
+    assert report["radial_distortion"] == pytest.approx(strength, abs=0.02)
+    assert report["focal_px"] == pytest.approx(focal_length(WIDTH), rel=0.05)
+
+
+def distorted(image: np.ndarray, strength: float) -> np.ndarray:
+    """What a lens shows of a pinhole's image that takes points at u to u (1 + strength |u|^2), u over focal length."""
+    height, width = image.shape[:2]
+    center, focal = np.array([width / 2 - 0.5, height / 2 - 0.5]), focal_length(width)
+    shown = (np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - center) / focal
+    straight = shown
+    for _ in range(30):
+        straight = shown / (1 + strength * np.sum(straight**2, axis=-1, keepdims=True))
+    places = (straight * focal + center).astype(np.float32)
+    return cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from photo_folders import exif, planes, with_exif, write_close, write_planes
+from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 from start_scenes import texture
 
 from kgs.cli import main
@@ -155,7 +155,7 @@ def test_a_camera_that_only_turned(folder, refused):
 
 def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
     message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
-    refused(write_close(tmp_path / "photos"), *message)
+    refused(write_photos(tmp_path / "photos", close()), *message)
 
 
 def test_a_blurred_photo_is_told(folder):

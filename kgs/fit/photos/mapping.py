@@ -161,7 +161,7 @@ def solve(
                 break
             best, least = _settled(found, focal)
             before, lens.params = np.array(lens.params), _lens(best).params
-            if abs(math.log(lens.params[0] / before[0])) < _STILL and abs(lens.params[3] - before[3]) < _STILL:
+            if abs(lens.params[0] / before[0] - 1) < _STILL and abs(lens.params[3] - before[3]) < _STILL:
                 break
     return None if best is None else cameras_of(best, names, _rise(best, least) if focal is None else math.inf)
 
