@@ -67,15 +67,15 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
             seconds["matches"] = lap()
             if against := unfit(names, pairs, looks(first, known)):
                 raise DataError(folder, "", against)
-            found = [solve(first, images, work / "model", seed, known)]
+            other = beside.submit(lambda: (own.result(), solve(second, images, work / "second", seed, known))[1])
+            found = [solve(first, images, work / "first", seed, known)]
             seconds["cameras"] = lap()
-            own.result()
-        found.append(solve(second, images, work / "model", seed, known))
+            found.append(other.result())
         placed = [cameras for cameras in found if cameras]
         held = exif_focal(photos) if placed and (faint_focal(placed) or unlike_focals(placed)) else None
         if held:
             say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
-            found = [solve(matched, images, work / "model", seed, known, held) for matched in (first, second)]
+            found = [solve(matched, images, work / "held", seed, known, held) for matched in (first, second)]
         seconds["second solver"] = lap()
         chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
         level_and_scale(chosen)
