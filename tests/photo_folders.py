@@ -40,9 +40,9 @@ def write_photos(folder: Path, images: np.ndarray, film: int = 0) -> Path:
     return folder
 
 
-def close() -> np.ndarray:
-    """The same planes from places a degree apart, which fit any focal length."""
-    return planes(cameras(0.2 * CENTERS, -0.02))
+def close(degrees: float) -> np.ndarray:
+    """The same planes from places so far apart: half a degree fits any focal length, one most."""
+    return planes(cameras(0.2 * degrees * CENTERS, -0.02 * degrees))
 
 
 def exif(order: str = "<", orientation: int = 1, film: int = 0, focal: float = 0, density: float = 0, width: int = 0):

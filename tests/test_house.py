@@ -217,7 +217,7 @@ def test_no_file_is_longer_than_300_lines():
 def test_the_source_stays_small():
     sizes = {name: lines(path) for name, path in SOURCES.items()}
     compiled = sum(size for name, size in sizes.items() if within(name, "kgs.compiled"))
-    assert sum(sizes.values()) - compiled <= 16_060
+    assert sum(sizes.values()) - compiled <= 16_150
     assert compiled <= 1_620
     assert sum(size for name, size in sizes.items() if within(name, "kgs.bench")) <= 2_280
 

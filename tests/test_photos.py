@@ -135,7 +135,7 @@ def test_a_second_run_uses_what_is_there(posed, monkeypatch):
 
 
 def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_path):
-    lines, folder = [], write_photos(tmp_path / "photos", close(), film=30)
+    lines, folder = [], write_photos(tmp_path / "photos", close(1), film=30)
     report = pose_photos(folder, tmp_path / "out", say=lines.append)
     assert report["focal_px"] == report["exif_focal_px"] == pytest.approx(30 * WIDTH / 34.6, rel=1e-3)
     assert report["focal_rise"] is None

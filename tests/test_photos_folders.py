@@ -155,7 +155,7 @@ def test_a_camera_that_only_turned(folder, refused):
 
 def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
     message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
-    refused(write_photos(tmp_path / "photos", close()), *message)
+    refused(write_photos(tmp_path / "photos", close(0.5)), *message)
 
 
 def test_a_blurred_photo_is_told(folder):

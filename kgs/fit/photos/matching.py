@@ -22,7 +22,7 @@ KEYPOINTS = 4096, 8192, 24_576  # of one photo at least and at most; of all phot
 _CONTRAST = 0.01
 _CHUNK = 512  # keypoints compared at once: bounds the memory
 _FEWEST = 8  # matches of a pair that are worth verifying
-DEFAULT_FOCAL = 0.8  # of the longer side, where the files do not say it: phones have 0.7 to 0.8; twice too long does less harm than too short
+DEFAULT_FOCAL = 0.8  # of the longer side, where the files do not say it: as of phones (0.7 to 0.8)
 
 
 class Framed(NamedTuple):
