@@ -69,7 +69,8 @@ def faint_focal(found: Sequence[Cameras]) -> str:
 def unlike_focals(found: Sequence[Cameras]) -> str:
     """How far the solvers' focal lengths are apart, where that is too far; "" if it is not."""
     ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
-    return f"two solvers' differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}" if ratio > MOST_RATIO else ""
+    unlike = ratio > MOST_RATIO
+    return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}" if unlike else ""
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
