@@ -160,7 +160,7 @@ def solve(
             if found is None or (best is not None and _lost(best, found)):
                 break
             best, least = _settled(found, focal)
-            before, lens.params = np.array(lens.params), _lens(best).params
+            before, lens.params = np.array(lens.params), lens_found(best).params
             if abs(lens.params[0] / before[0] - 1) < _STILL and abs(lens.params[3] - before[3]) < _STILL:
                 break
     return None if best is None else cameras_of(best, names, _rise(best, least) if focal is None else math.inf)
@@ -172,7 +172,7 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     placed = {name: images[image] for image, name in names.items() if image in images}
     poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
     return Cameras(
-        float(_lens(reconstruction).focal_length),
+        float(lens_found(reconstruction).focal_length),
         {name: pose[:, :3] for name, pose in poses.items()},
         {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
         {name: int(image.num_points3D) for name, image in placed.items()},
@@ -218,10 +218,11 @@ def _settled(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
 
     Photos that hardly tell the focal length trade it against a distortion that no camera has.
     """
-    straight, most = _adjusted(reconstruction, 0.0, focal)
     bent, least = _adjusted(reconstruction, None, focal)
-    believed = abs(_lens(bent).params[3]) <= _USUAL or most > (1 + _BENDS) * least
-    return (bent, least) if believed else (straight, most)
+    if abs(lens_found(bent).params[3]) <= _USUAL:
+        return bent, least
+    straight, most = _adjusted(reconstruction, 0.0, focal)
+    return (bent, least) if most > (1 + _BENDS) * least else (straight, most)
 
 
 def _adjusted(reconstruction: Any, distortion: float | None, focal: float | None) -> tuple[Any, float]:
@@ -237,7 +238,7 @@ def _adjusted(reconstruction: Any, distortion: float | None, focal: float | None
         options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
         options.print_summary, options.ceres.solver_options.num_threads = False, 1
         options.refine_focal_length, options.refine_extra_params = focal is None, distortion is None
-        lens = _lens(scene)
+        lens = lens_found(scene)
         known = lens.params.copy()
         lens.params = [focal or known[0], *known[1:3], known[3] if distortion is None else distortion]
         for image in scene.reg_image_ids():
@@ -253,12 +254,12 @@ def _rise(reconstruction: Any, least: float) -> float:
     All else but the distortion is adjusted to that. Near 0 the photos do not tell the focal length: the scene is
     stretched instead.
     """
-    focal, _, _, distortion = _lens(reconstruction).params
+    focal, _, _, distortion = lens_found(reconstruction).params
     wrong = min(_adjusted(reconstruction, distortion, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
     return wrong / max(least, np.finfo(np.float64).tiny) - 1
 
 
-def _lens(reconstruction: Any) -> Any:
+def lens_found(reconstruction: Any) -> Any:
     """The one camera, with params focal length, centre (x, y) and radial distortion."""
     return next(iter(reconstruction.cameras.values()))
 

@@ -33,7 +33,7 @@ from .gates import (
     unlike_focals,
     untold,
 )
-from .mapping import Cameras, looks, quiet_pycolmap, solve, verify, write_own_matches
+from .mapping import Cameras, lens_found, looks, quiet_pycolmap, solve, verify, write_own_matches
 from .matching import exif_focal, lens_of, write_matches
 from .read import Photo, blurred, read_photos
 from .write import IMAGES, MODEL, level_and_scale, write_images, write_model
@@ -146,7 +146,6 @@ def judge(
 
 def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
     """What the report says of size and lens."""
-    camera = next(iter(cameras.reconstruction.cameras.values()))
     width, height = photos[0].size
     film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
     return {
@@ -154,7 +153,7 @@ def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
         "focal_px": cameras.focal,
         "focal_35mm": film,
         "exif_focal_px": exif_focal(photos),
-        "radial_distortion": float(camera.params[3]),
+        "radial_distortion": float(lens_found(cameras.reconstruction).params[3]),
     }
 
 
