@@ -10,13 +10,13 @@ from .camera import PosedCamera, cameras
 from .densify import Densifier, DensifyReport
 from .drop import DropGaussian, drop_gaussian
 from .errors import DataError, TrainingDiverged
+from .geometry import camera_extent
+from .io.ply import load_ply, save_ply
 from .model import GaussianModel
-from .ply import load_ply, save_ply
 from .projection import project
 from .raster import composite
 from .rasterization import rasterization
 from .renderer import GaussianRenderer
-from .rig import camera_extent
 from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering
 
 __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization", "project", "composite"]

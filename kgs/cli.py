@@ -20,8 +20,8 @@ from typing import Annotated, Any, get_type_hints
 from .errors import DataError, TrainingDiverged
 from .fit.commands import demo, evaluate, fit
 from .fit.config import FAST, PRESETS, FitConfig, Recipe
-from .fit.progress import say
 from .fit.splat_commands import page, render
+from .io.console import say
 
 _COMMANDS: dict[str, Callable[..., Any]] = {"demo": demo, "fit": fit, "render": render, "eval": evaluate, "page": page}
 _BENCHES = {
@@ -103,7 +103,7 @@ def _exit_code(words: list[str]) -> int:
 def _find(words: list[str]) -> tuple[Callable[..., Any], str, list[str]]:
     """The function that does what the first words ask for, what it is called, and the words that are left."""
     if words[:1] == ["--version"]:
-        from .fit.machine import versions
+        from .machine import versions
 
         found = versions()
         found.setdefault("numba", "is not installed: the extra fast brings it")

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .geometry import log_spacing
 from .harmonics import SH_C0
 from .memory import empty
-from .neighbours import log_spacing
 from .types import SH_SIZES, Gaussians, check_tensor
 
 INITIAL_OPACITY = 0.1

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import settings
-from start_scenes import painted_planes
+from init_point_scenes import painted_planes
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
 import kgs.losses  # noqa: F401  # has a stage to register
 from kgs import backends
 from kgs.datasets import synthetic_scene
-from kgs.export import film
-from kgs.fit.starts import FirstPoints
+from kgs.init_points import FirstPoints
+from kgs.io import film
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))

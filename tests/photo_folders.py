@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from init_point_scenes import CENTERS, cameras, painted_planes
 from kornia.geometry.camera import PinholeCamera
-from start_scenes import CENTERS, cameras, painted_planes
 
 NAMES = ("IMG_1.png", "IMG_2.png", "IMG_3.png")
 

@@ -8,10 +8,10 @@ from test_cli import one_line, run
 
 from kgs import DataError, backends
 from kgs.fit import FitConfig, Trainer
-from kgs.fit.folder import CHECKPOINT
 from kgs.fit.run import fit_scene
 from kgs.fit.saved import load_fit
-from kgs.json_files import read_json
+from kgs.io.json_files import read_json
+from kgs.io.results_folder import CHECKPOINT
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
 
@@ -77,6 +77,6 @@ def test_numba_that_is_not_installed_is_one_line_before_any_work(installed, fold
 
 
 def test_versions_say_where_numba_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr("kgs.fit.machine.versions", lambda: {"kgs": "1"})
+    monkeypatch.setattr("kgs.machine.versions", lambda: {"kgs": "1"})
     assert run("--version") == 0
     assert "numba is not installed" in capsys.readouterr().out

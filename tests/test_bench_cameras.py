@@ -12,7 +12,7 @@ from kgs.bench.cameras import DISTANCE, arc_cell, write_arcs
 from kgs.datasets.scene import pinholes
 from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
-from kgs.rig import camera_centers
+from kgs.geometry import camera_centers
 
 CELL = {"world": 1, "photos": 3, "spacing": 10.0, "size": (24, 32)}
 

@@ -16,7 +16,7 @@ from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.errors import DataError
-from kgs.fit.pixels import unproject
+from kgs.geometry import unproject
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 24, 40, 32.0, 4.0
 

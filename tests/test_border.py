@@ -5,16 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from start_scenes import as_views
+from init_point_scenes import as_views
 
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.border import border_light
 from kgs.fit.config import FitConfig
-from kgs.fit.metrics import evaluate
 from kgs.fit.run import choose_points
 from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
 from kgs.losses import photometric_loss
+from kgs.metrics.evaluate import evaluate
 
 
 @pytest.fixture(scope="module")

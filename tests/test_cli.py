@@ -17,7 +17,7 @@ import pytest
 import kgs
 from kgs import cli
 from kgs.fit.config import FAST, PAPER, FitConfig
-from kgs.fit.folder import RESULTS
+from kgs.io.results_folder import RESULTS
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)

@@ -7,12 +7,12 @@ import torch
 from compiled_checks import avx_assembly
 
 from kgs.backends import choose
-from kgs.fit.starts import tracks
+from kgs.init_points import tracks
 
 nb = pytest.importorskip("numba")
 
 from kgs.compiled import matching as kernels  # noqa: E402  # needs numba
-from kgs.fit.starts import tracks_compiled  # noqa: E402
+from kgs.init_points import tracks_compiled  # noqa: E402
 
 
 def keypoints(n, m, seed=0):

@@ -9,7 +9,7 @@ from compiled_checks import avx_assembly
 
 from kgs.backends import choose
 from kgs.datasets.synthetic import synthetic_scene
-from kgs.fit.starts import plane_sweep
+from kgs.init_points import plane_sweep
 
 nb = pytest.importorskip("numba")
 

@@ -15,12 +15,12 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
-from kgs.export import film
-from kgs.export.cameras import camera_list, upright
 from kgs.fit import exports
-from kgs.fit.outputs import EXPORTS, is_own
 from kgs.fit.splat_commands import render
-from kgs.json_files import write_json
+from kgs.io import film
+from kgs.io.cameras import camera_list, upright
+from kgs.io.json_files import write_json
+from kgs.io.outputs import EXPORTS, is_own
 
 
 def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ import torch
 from factories import random_views
 
 from kgs.datasets.scene import Views
-from kgs.fit.figures import write_curve, write_sheet
-from kgs.fit.machine import check_device, peak_rss_mb, revision, versions
+from kgs.io.figures import write_curve, write_sheet
+from kgs.machine import check_device, peak_rss_mb, revision, versions
 
 CURVE = [{"step": k, "seconds": 0.1 * k, "test_psnr": 20.0 + k, "train_psnr": None} for k in range(3)]
 

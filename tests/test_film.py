@@ -14,9 +14,9 @@ from browser import Browser
 from torch import Tensor
 
 from kgs.datasets.scene import Views, pinholes
-from kgs.export import film
-from kgs.export.film import tour, write_film
-from kgs.fit.outputs import is_own
+from kgs.io import film
+from kgs.io.film import tour, write_film
+from kgs.io.outputs import is_own
 
 
 def looking_at(target: Tensor, places: Tensor) -> Tensor:

@@ -15,11 +15,11 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.commands import evaluate
 from kgs.fit.config import FitConfig
-from kgs.fit.lpips import Lpips
-from kgs.fit.metrics import in_words
-from kgs.fit.page import refresh_page, spread
 from kgs.fit.saved import load_fit
-from kgs.fit.starts import FirstPoints
+from kgs.init_points import FirstPoints
+from kgs.metrics.evaluate import in_words
+from kgs.metrics.lpips import Lpips
+from kgs.page.fit_page import refresh_page, spread
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
 REQUEST = {"train_views": 3, "downscale": None, "background": "black"}

@@ -91,7 +91,7 @@ def test_imports_go_one_way():
     }
     small = (
         "kgs.errors",
-        "kgs.json_files",
+        "kgs.io.json_files",
         "kgs.backends",
         "kgs.compiled",
     )  # of the core, what losses and datasets may use
@@ -121,11 +121,11 @@ print(*sorted(set(sys.modules) - before))
 import kgs.fit.config
 print("heavy:", *{"cv2", "trimesh", "matplotlib", "tyro"} & set(sys.modules))
 sys.modules["resource"] = None
-import kgs.fit.run, kgs.fit.machine
+import kgs.fit.run, kgs.machine
 from pathlib import Path
 exists = Path.exists
 Path.exists = lambda path: False if str(path).startswith("/proc") else exists(path)
-print(kgs.fit.machine.peak_rss_mb())
+print(kgs.machine.peak_rss_mb())
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     return done.stdout.splitlines()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kgs.errors import DataError
-from kgs.fit.lpips import Lpips
+from kgs.metrics.lpips import Lpips
 
 ALEXNET = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
 SHIFT = np.array([-0.030, -0.088, -0.188])

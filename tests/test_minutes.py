@@ -10,10 +10,10 @@ from kgs import DataError
 from kgs.fit import FitConfig, Trainer, fit_scene
 from kgs.fit.checkpoint import load_checkpoint
 from kgs.fit.config import FAST, Recipe
-from kgs.fit.folder import CHECKPOINT
 from kgs.fit.minutes import expected_minutes, steps_within
 from kgs.fit.run import choose_points
-from kgs.json_files import read_json
+from kgs.io.json_files import read_json
+from kgs.io.results_folder import CHECKPOINT
 
 # The time ends with the last step.
 CONFIG = FitConfig(minutes=0.1, init="random", init_points=60, keep_all=True, recipe=Recipe(grad_threshold=1e-5))

@@ -10,9 +10,9 @@ import torch
 
 import kgs
 from kgs.errors import DataError
-from kgs.fit.figures import write_curve
-from kgs.fit.outputs import check_folder, is_own, png_names, remove_others, write_png
-from kgs.json_files import write_json, write_whole
+from kgs.io.figures import write_curve
+from kgs.io.json_files import write_json, write_whole
+from kgs.io.outputs import check_folder, is_own, png_names, remove_others, write_png
 
 CURVE = [{"step": 1, "seconds": 0.1, "test_psnr": 20.0, "train_psnr": None}]
 

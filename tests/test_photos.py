@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from init_point_scenes import WIDTH, focal_length
 from photo_folders import NAMES, close, planes, poses, write_photos, write_planes
-from start_scenes import WIDTH, focal_length
 
 from kgs.datasets import load_scene
 from kgs.errors import DataError

@@ -17,7 +17,7 @@ from kgs.fit.config import FitConfig
 from kgs.fit.minutes import expected_minutes
 from kgs.fit.photos import estimate as estimate_module
 from kgs.fit.photos.entry import foretold, is_bare
-from kgs.json_files import write_json
+from kgs.io.json_files import write_json
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")

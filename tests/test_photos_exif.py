@@ -10,7 +10,7 @@ from photo_folders import exif, planes, with_exif
 
 from kgs.fit.photos.exif import Exif, read_exif
 from kgs.fit.photos.read import read_photos
-from kgs.fit.progress import silent
+from kgs.io.console import silent
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 

@@ -6,19 +6,19 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from init_point_scenes import texture
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
-from start_scenes import texture
 
 from kgs.cli import main
 from kgs.errors import DataError
 from kgs.fit import photos
-from kgs.fit.outputs import PNG_MARK, start_folder, write_png
 from kgs.fit.photos import pose_photos
 from kgs.fit.photos.entry import settle
 from kgs.fit.photos.read import blurred, read_photos
 from kgs.fit.photos.write import end_move
-from kgs.fit.progress import silent
-from kgs.json_files import write_json
+from kgs.io.console import silent
+from kgs.io.json_files import write_json
+from kgs.io.outputs import PNG_MARK, start_folder, write_png
 
 pytest.importorskip("pycolmap")
 

@@ -12,7 +12,7 @@ from kgs.fit.photos import find, read
 from kgs.fit.photos.find import find_photos, list_photos
 from kgs.fit.photos.heic import is_heic
 from kgs.fit.photos.read import read_photos
-from kgs.fit.progress import silent
+from kgs.io.console import silent
 
 pi_heif = pytest.importorskip("pi_heif")
 

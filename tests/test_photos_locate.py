@@ -11,7 +11,7 @@ from kgs.fit.config import FitConfig
 from kgs.fit.photos.locate import locate
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.rig import camera_centers
+from kgs.geometry import camera_centers
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from kgs import GaussianRenderer
+from kgs.io.ply import load_ply, save_ply
 from kgs.model import GaussianModel
-from kgs.ply import load_ply, save_ply
 
 
 def same(one, two):

@@ -15,7 +15,7 @@ from kgs.fit.commands import evaluate
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
 from kgs.fit.saved import load_fit
-from kgs.rig import camera_centers
+from kgs.geometry import camera_centers
 
 CONFIG = FitConfig(steps=6, seed=5, init="random", init_points=200, sh_degree=0, evaluations=1, refine_poses=True)
 

@@ -11,7 +11,7 @@ from kgs.cli import main
 from kgs.datasets import synthetic_scene
 from kgs.fit import Trainer, first_points
 from kgs.fit.config import PAPER
-from kgs.fit.metrics import evaluate
+from kgs.metrics.evaluate import evaluate
 
 pytestmark = pytest.mark.slow
 

@@ -18,8 +18,8 @@ from kgs.fit import run
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.run import CHECKPOINT, fit_scene, train
-from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
+from kgs.init_points import FirstPoints
 
 CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
 

@@ -9,9 +9,9 @@ import torch
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.overfitting import BINS, coadaptation, count_over_threshold
-from kgs.fit.starts import first_points
 from kgs.fit.trainer import Trainer
 from kgs.harmonics import SH_C0
+from kgs.init_points import first_points
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 

@@ -16,11 +16,11 @@ import kgs
 from kgs import reference
 from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.densify import Densifier
-from kgs.export.film import write_film
-from kgs.export.glb import save_glb
 from kgs.fit import FirstPoints, FitConfig, Trainer, first_points, fit_scene
+from kgs.geometry import camera_extent
+from kgs.io.film import write_film
+from kgs.io.glb import save_glb
 from kgs.losses import photometric_loss, target_moments
-from kgs.rig import camera_extent
 
 UPRIGHT = torch.eye(3)
 SCENE = synthetic_scene(train_views=2, test_views=1, size=(16, 16))

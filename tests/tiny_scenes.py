@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from kgs.fit.config import FitConfig
-from kgs.fit.lpips import Lpips
-from kgs.json_files import write_json
+from kgs.io.json_files import write_json
+from kgs.io.ply import save_ply
+from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel
-from kgs.ply import save_ply
 
 __all__ = ["write_blender", "write_colmap", "write_llff", "write_nerfstudio", "write_photos"]
 __all__ += ["write_config", "write_image", "write_lpips", "write_ply"]

@@ -18,7 +18,7 @@ from torch import Tensor
 from kgs.datasets.frames import Frame, FrameSet, path_inside
 from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics, read_size
 from kgs.errors import DataError
-from kgs.json_files import is_number, read_json
+from kgs.io.json_files import is_number, read_json
 
 Object = dict[str, Any]
 Said = ChainMap[str, Any]  # what holds for a frame: its own object, then the whole file's

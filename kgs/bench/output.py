@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from kgs.fit.machine import versions
-from kgs.json_files import write_json
+from kgs.io.json_files import write_json
+from kgs.machine import versions
 
 Row = dict[str, Any]
 

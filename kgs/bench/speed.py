@@ -15,8 +15,8 @@ from torch import Tensor
 
 from kgs.backends import resolve
 from kgs.camera import move_camera
-from kgs.fit.machine import check_device, peak_rss_mb
 from kgs.losses import photometric_loss, target_moments
+from kgs.machine import check_device, peak_rss_mb
 from kgs.projection import project
 from kgs.raster import composite
 from kgs.raster.tiles import bin_to_tiles

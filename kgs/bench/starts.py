@@ -13,9 +13,8 @@ from torch import Tensor
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.fit.pixels import project_all
-from kgs.fit.starts import first_points
-from kgs.rig import camera_centers
+from kgs.geometry import camera_centers, project_points
+from kgs.init_points import first_points
 
 from .output import Row, markdown_table, mean_sd, write_results
 from .scenes import check_scenes
@@ -138,7 +137,7 @@ def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     found = torch.zeros_like(truth, dtype=torch.bool)
     limits = torch.tensor([truth.shape[2], truth.shape[1]])
     for view, exact in enumerate(truth):
-        pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
+        pixels, depths = (part[:, 0] for part in project_points(points, views.camera(view)))
         for offset in product(range(-REACH, REACH + 1), repeat=2):
             places = pixels.round() + torch.tensor(offset)
             inside = ((places >= 0) & (places < limits)).all(1) & ((places - pixels).norm(dim=1) <= REACH)
@@ -150,7 +149,7 @@ def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
 
 def _view_errors(points: Tensor, views: Views, truth: Tensor, view: int) -> Tensor:
     """Depth over the surface's depth less 1 in one view, `(P,)`; NaN where the point is not in its image."""
-    pixels, depths = (part[:, 0] for part in project_all(points, views.camera(view)))
+    pixels, depths = (part[:, 0] for part in project_points(points, views.camera(view)))
     inverse = torch.where(truth[view] > 0, 1 / truth[view], 0.0)
     height, width = inverse.shape
     limits = torch.tensor([width, height]) - 0.5

@@ -1,4 +1,4 @@
-"""Matches of keypoints along epipolar lines, by the rules of `kgs.fit.starts.tracks`; what differs is rounding.
+"""Matches of keypoints along epipolar lines, by the rules of `kgs.init_points.tracks`; what differs is rounding.
 
     lines           (N, 3), of the first view's keypoints in the second, normals of length 1
     places          (2, M), x and y of the second view's keypoints

@@ -1,4 +1,4 @@
-"""Costs of a plane sweep, by the formulas of `kgs.fit.starts.plane_sweep`; planes are the lanes, so they come last.
+"""Costs of a plane sweep, by the formulas of `kgs.init_points.plane_sweep`; planes are the lanes, so they come last.
 
     image, mean, variance   (H, W), the latter two over the window around a pixel
     warped                  (P, 2, H, W), another view's image by P planes of the sweep, and ones warped alike

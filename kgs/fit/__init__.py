@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 from .config import FitConfig
 
 if TYPE_CHECKING:
+    from kgs.init_points import FirstPoints, first_points
+
     from .run import fit_scene
-    from .starts import FirstPoints, first_points
     from .trainer import Trainer
 
 __all__ = ["FirstPoints", "FitConfig", "Trainer", "first_points", "fit_scene"]

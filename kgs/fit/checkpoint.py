@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
-from kgs.json_files import is_number, parse_json
+from kgs.io.json_files import is_number, parse_json
 
 from .config import FitConfig
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from kgs.errors import DataError
+from kgs.io.console import VIEWER, as_line, say, say_next
 
 from .config import DEMO, Backend, Background, FitConfig
-from .progress import VIEWER, as_line, say, say_next
 
 
 def demo(
@@ -37,10 +37,10 @@ def demo(
         backend: as of kgs fit.
     """
     from kgs.datasets import synthetic_scene
+    from kgs.io.outputs import EXPORTS, check_folder
+    from kgs.machine import check_tools
 
     from .demo import run_demo
-    from .machine import check_tools
-    from .outputs import EXPORTS, check_folder
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     if min(size) < 12:  # the window of SSIM
@@ -106,16 +106,16 @@ def fit(
     """
     del preset, fast  # kgs.cli has read them: they are the defaults of `config`
     from kgs.datasets.layouts import CAMERAS_REPORT
+    from kgs.io.outputs import check_folder, is_own
+    from kgs.io.results_folder import UNFINISHED, is_finished, taken
+    from kgs.machine import check_tools
+    from kgs.metrics.evaluate import in_words
+    from kgs.metrics.lpips import Lpips
 
-    from .folder import UNFINISHED, is_finished, taken
-    from .lpips import Lpips
-    from .machine import check_tools
-    from .metrics import in_words
     from .minutes import expected_minutes
-    from .outputs import check_folder, is_own
     from .photos.entry import add_estimate, find_scene, is_bare, settle
+    from .prune import left_out
     from .run import fit_scene
-    from .slim import left_out
 
     if config.init_file is not None and not config.init_file.is_file():
         raise DataError(config.init_file, "", "expected a point cloud for --init-file, found no such file")
@@ -178,12 +178,12 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit.
     """
-    from kgs.json_files import read_json, write_json
+    from kgs.io.json_files import read_json, write_json
+    from kgs.machine import check_tools
+    from kgs.metrics.evaluate import in_words, measure_again
+    from kgs.metrics.lpips import Lpips
+    from kgs.page.fit_page import PAGE, refresh_page
 
-    from .lpips import Lpips
-    from .machine import check_tools
-    from .metrics import in_words, measure_again
-    from .page import PAGE, refresh_page
     from .saved import load_fit
 
     check_tools(device, backend, "jinja2")

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from kgs.datasets.scene import Scene
-from kgs.json_files import write_json
-from kgs.ply import save_ply
+from kgs.io.console import each, say
+from kgs.io.figures import write_curve, write_sheet
+from kgs.io.json_files import write_json
+from kgs.io.ply import save_ply
+from kgs.page.fit_page import PAGE, write_fit_page
 
 from .config import FitConfig
 from .exports import write_exports
-from .figures import write_curve, write_sheet
-from .page import PAGE, write_fit_page
-from .progress import each, say
 from .run import choose_points, measure, train
 from .trainer import Trainer
 

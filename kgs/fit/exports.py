@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from kgs.export.cameras import camera_list, upright
-from kgs.export.film import write_film
-from kgs.export.glb import save_glb
-from kgs.json_files import write_json
+from kgs.geometry import typical_depths
+from kgs.io.cameras import camera_list, upright
+from kgs.io.console import each
+from kgs.io.film import write_film
+from kgs.io.glb import save_glb
+from kgs.io.json_files import write_json
 
-from .pixels import typical_depths
-from .progress import each
 from .trainer import Trainer
 
 
@@ -17,6 +17,6 @@ def write_exports(trainer: Trainer, folder: Path) -> None:
     scene, model = trainer.scene, trainer.shown
     write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset))
     save_glb(folder / "splat.glb", model, upright(scene.train.cameras.extrinsics), scene.offset)
-    depth = typical_depths(scene.train, model.means)[1]
+    depth = typical_depths(model.means, scene.train.cameras)[1]
     if note := write_film(folder / "turntable.webm", trainer.render, scene.train, depth, each):
         trainer.notes.append(note)

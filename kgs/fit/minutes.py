@@ -8,10 +8,10 @@ import numpy as np
 
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
+from kgs.init_points import FirstPoints
+from kgs.machine import check_device
 
 from .config import FitConfig, Timetable, most_gaussians, timetable
-from .machine import check_device
-from .starts import FirstPoints
 from .trainer import Trainer
 
 _SHARE, _FEWEST = 0.04, 20  # of the steps in the miniature, and how many at least

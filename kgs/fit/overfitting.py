@@ -8,9 +8,9 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 from kgs.datasets.scene import Views
+from kgs.geometry import camera_centers
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.rig import camera_centers
 
 from .trainer import Trainer
 

@@ -15,7 +15,7 @@ from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from kgs.datasets.scene import Scene
-from kgs.rig import camera_centers, degrees_between
+from kgs.geometry import camera_centers, degrees_between
 
 from .checkpoint import load_moments, moments_of
 

@@ -13,25 +13,25 @@ from typing import Any
 
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.json_files import write_json
-from kgs.ply import save_ply
+from kgs.init_points import FirstPoints, first_points
+from kgs.io.console import Stage, each, progress, say, silent
+from kgs.io.figures import write_curve
+from kgs.io.json_files import write_json
+from kgs.io.outputs import check_folder, is_own, png_names, start_folder, write_png
+from kgs.io.ply import save_ply
+from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
+from kgs.machine import bytes_of, check_tools, peak_rss_mb, versions
+from kgs.metrics.coverage import measure_seen
+from kgs.metrics.evaluate import evaluate
+from kgs.metrics.lpips import Lpips
+from kgs.page.fit_page import PAGE, write_own_page
 
 from .checkpoint import previous, save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
-from .figures import write_curve
-from .folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
-from .lpips import Lpips
-from .machine import bytes_of, check_tools, peak_rss_mb, versions
-from .metrics import evaluate
 from .minutes import steps_within
-from .needs import decide
-from .outputs import check_folder, is_own, png_names, start_folder, write_png
-from .page import PAGE, write_own_page
-from .progress import Stage, each, progress, say, silent
-from .seen import measure_seen
-from .slim import slim
-from .starts import FirstPoints, first_points
+from .probes import decide
+from .prune import slim
 from .trainer import Trainer
 
 _SAVE_SECONDS = 60.0

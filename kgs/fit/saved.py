@@ -10,13 +10,13 @@ from torch import Tensor
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.json_files import is_number, read_json
+from kgs.io.json_files import is_number, read_json
+from kgs.io.results_folder import CHECKPOINT, end_stopped_move
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
 from .checkpoint import newest_checkpoint
 from .config import FitConfig
-from .folder import CHECKPOINT, end_stopped_move
 from .poses import place_cameras
 
 

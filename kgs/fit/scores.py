@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
-from kgs.rig import camera_centers
+from kgs.geometry import camera_centers
 
 
 class SelectiveDrop(DropGaussian):

@@ -4,8 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from kgs.io.console import VIEWER, as_line, each, say, say_next
+
 from .config import Backend, Background, Recipe
-from .progress import VIEWER, as_line, each, say, say_next
 
 
 def render(
@@ -37,9 +38,8 @@ def render(
     import torch
 
     from kgs.camera import move_camera
-
-    from .machine import check_tools
-    from .outputs import check_folder, png_names, write_png
+    from kgs.io.outputs import check_folder, png_names, write_png
+    from kgs.machine import check_tools
 
     place = check_tools(device, backend)
     check_folder(out, (), cameras, make=False)
@@ -91,11 +91,10 @@ def page(
     from kgs.camera import move_camera
     from kgs.datasets import load_scene
     from kgs.errors import DataError
-
-    from .machine import check_tools, versions
-    from .metrics import evaluate
-    from .outputs import is_own
-    from .page import MOST_PICTURES, spread, write_fit_page
+    from kgs.io.outputs import is_own
+    from kgs.machine import check_tools, versions
+    from kgs.metrics.evaluate import evaluate
+    from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
     place = check_tools(device, backend, "jinja2")
     if out.suffix != ".html":
@@ -140,11 +139,10 @@ def _load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any
 
 def _load_splat(ply: Path, scene: Any, place: Any, backend: str) -> tuple[Any, Any]:
     """The Gaussians in the frame of the scene, and a renderer whose near plane follows from them."""
-    from kgs.ply import load_ply
+    from kgs.geometry import typical_depths
+    from kgs.io.ply import load_ply
     from kgs.renderer import GaussianRenderer
 
-    from .pixels import typical_depths
-
     model = load_ply(ply, origin=scene.offset)
-    near_plane = Recipe().near_plane * typical_depths(scene.train, model.means)[0]
+    near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     return model.to(place), GaussianRenderer(near_plane=near_plane, backend=backend).eval()

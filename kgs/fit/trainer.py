@@ -21,21 +21,20 @@ from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
 from kgs.errors import DataError, TrainingDiverged
+from kgs.geometry import camera_extent, typical_depths
+from kgs.init_points import FirstPoints
 from kgs.losses import opacity_l1, photometric_loss
+from kgs.machine import check_device
+from kgs.metrics.evaluate import mean_psnr
 from kgs.model import PARAMETERS, GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.rig import camera_extent
 from kgs.types import check_kind
 
 from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
 from .config import CHOICES, FitConfig, most_gaussians, timetable
 from .divergence import gradient_fault, scale_fault, step_fault
-from .machine import check_device
-from .metrics import mean_psnr
-from .pixels import typical_depths
 from .poses import MovingPoses, decayed
 from .scores import SelectiveDrop, gaussian_scores
-from .starts import FirstPoints
 from .targets import targets
 
 _RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))  # of learning
@@ -72,7 +71,7 @@ class Trainer:
         check_kind("scene", scene, Scene)
         check_kind("points", points, FirstPoints)
         self._prepare(scene, config)
-        nearest, median = typical_depths(scene.train, points.points)
+        nearest, median = typical_depths(points.points, scene.train.cameras)
         self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)  # of a rig without one, too
         self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
         model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)

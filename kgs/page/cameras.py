@@ -8,7 +8,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs.rig import camera_centers, common_up
+from kgs.geometry import camera_centers, common_up
 
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # height of a pyramid, in typical distances between neighbours; at most a tenth of the view's depth

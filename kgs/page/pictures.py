@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from kgs.eight_bits import eight_bits
+from kgs.io.images import eight_bits
 
 GAIN = 4  # by which differences are shown stronger
 _SIDES = (1008, 756, 504, 378, 252)  # pixels of the longer side, the first that fits

@@ -11,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs import __version__
-from kgs.json_files import write_whole
+from kgs.io.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 
 from .cameras import viewer_scene

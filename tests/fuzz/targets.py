@@ -24,12 +24,12 @@ from tiny_scenes import (
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
 from kgs.datasets.images import read_image
 from kgs.fit.config import FitConfig, timetable
-from kgs.fit.lpips import Lpips
 from kgs.fit.saved import read_settings
-from kgs.fit.starts import FirstPoints
-from kgs.fit.starts.files import read_points
 from kgs.fit.trainer import Trainer
-from kgs.ply import load_ply
+from kgs.init_points import FirstPoints
+from kgs.init_points.files import read_points
+from kgs.io.ply import load_ply
+from kgs.metrics.lpips import Lpips
 
 __all__ = ["READERS"]
 

@@ -21,7 +21,7 @@ from trials import is_cheap, try_files
 from kgs.datasets import Views, load_scene
 from kgs.datasets.images import read_image
 from kgs.errors import DataError
-from kgs.fit.starts.files import read_points
+from kgs.init_points.files import read_points
 
 SIDE = 8000
 

@@ -16,15 +16,15 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import CHOICES, PRESETS, FitConfig
-from kgs.fit.lpips import Lpips
-from kgs.fit.machine import peak_rss_mb, revision
-from kgs.fit.metrics import MEASURES
-from kgs.fit.needs import decide
 from kgs.fit.overfitting import coadaptation, count_over_threshold
+from kgs.fit.probes import decide
+from kgs.fit.prune import slim
 from kgs.fit.run import choose_points, measure
-from kgs.fit.slim import slim
-from kgs.fit.starts import FirstPoints
 from kgs.fit.trainer import Trainer
+from kgs.init_points import FirstPoints
+from kgs.machine import peak_rss_mb, revision
+from kgs.metrics.evaluate import MEASURES
+from kgs.metrics.lpips import Lpips
 from kgs.page.pictures import Picture, encoded
 
 FULL = "full-model"  # a start that no fit may have: the upper bound

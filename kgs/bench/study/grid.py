@@ -15,7 +15,7 @@ from typing import Any
 from distributed import Client, KilledWorker, LocalCluster, Security, wait
 from distributed.core import rpc
 
-from kgs.fit.folder import held
+from kgs.io.results_folder import held
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from scipy import stats
 
-from kgs.fit.metrics import MEASURES
+from kgs.metrics.evaluate import MEASURES
 
 from .presets import METHODS, SCENES
 

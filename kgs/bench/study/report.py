@@ -13,7 +13,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader
 from kgs import __version__
 from kgs.bench.output import markdown_table
 from kgs.bench.scenes import SYNTHETIC
-from kgs.fit.machine import revision
+from kgs.machine import revision
 
 from .findings import findings
 from .pairs import COLUMNS, KEYS, ORIGIN, cells_frame

@@ -9,10 +9,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from kgs.fit.folder import locked
-from kgs.fit.outputs import start_folder
-from kgs.fit.progress import Stage, say, silent
-from kgs.json_files import read_json
+from kgs.io.console import Stage, say, silent
+from kgs.io.json_files import read_json
+from kgs.io.outputs import start_folder
+from kgs.io.results_folder import locked
 
 from .find import find_photos
 from .mapping import quiet_pycolmap
@@ -49,7 +49,7 @@ def pose_photos(
         out: the folder for the results, made if it is not there.
         seed: of what the solvers draw. The same photos and seed give the same files, but for the times in photos.json.
         wait: leave new files in `out/finished-photos` where `out` holds a fit, which belongs to the former cameras.
-        stage: shows how far each part is, as `kgs.fit.progress.each` does.
+        stage: shows how far each part is, as `kgs.io.console.each` does.
         say: where lines for the user go.
 
     Returns:

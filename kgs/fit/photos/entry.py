@@ -11,13 +11,13 @@ from kgs.datasets.layouts import CAMERAS_REPORT, nearest_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import FAST, FitConfig, most_gaussians
-from kgs.fit.folder import locked
-from kgs.fit.machine import bytes_of
 from kgs.fit.minutes import expected_minutes
-from kgs.fit.page import refresh_page
-from kgs.fit.progress import each, say
 from kgs.fit.saved import load_fit
-from kgs.json_files import read_json, write_json
+from kgs.io.console import each, say
+from kgs.io.json_files import read_json, write_json
+from kgs.io.results_folder import locked
+from kgs.machine import bytes_of
+from kgs.page.fit_page import refresh_page
 
 LONGEST = 504  # pixels of the longer side in a fit on a CPU
 _PHOTO, _PIXEL = 2.0, 1.3e-6  # seconds for the camera of a photo and for each of its pixels, on an AMD EPYC

@@ -18,9 +18,9 @@ from kgs.datasets.layouts.colmap import load_colmap
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
-from kgs.fit.progress import Stage, silent
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
+from kgs.io.console import Stage, silent
 
 from . import pose_photos
 from .locate import locate
@@ -48,7 +48,7 @@ def estimate(
         config: of each fit, `FAST` for instance.
         longest: pixels of the longer side in each fit.
         background: behind photos with transparency, as of `load_scene`.
-        stage: shows how far it is, as `kgs.fit.progress.each` does.
+        stage: shows how far it is, as `kgs.io.console.each` does.
 
     Returns:
         "psnr" (mean, dB), "sd" and "n" over the photos that could be judged, and "photos": for each its "name" with

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import torch
 
-from kgs.rig import degrees_between
+from kgs.geometry import degrees_between
 
 from .mapping import FEWEST_MATCHES, Cameras, Look
 

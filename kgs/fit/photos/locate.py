@@ -9,10 +9,10 @@ from kornia.feature import match_smnn
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views, pinholes
-from kgs.fit.pixels import matrices, unproject
-from kgs.fit.seen import depth_map
-from kgs.fit.starts.tracks import detect
 from kgs.fit.trainer import Trainer
+from kgs.geometry import camera_matrices, unproject
+from kgs.init_points.tracks import detect
+from kgs.metrics.coverage import depth_map
 
 KEYPOINTS = 4000  # in each picture
 RATIO = 0.85  # of the distances to the nearest and the second nearest descriptor, both ways
@@ -29,7 +29,7 @@ def locate(trainer: Trainer, photos: Views) -> PinholeCamera | None:
     Convention:
         Kornia's, as of `Views`: world-to-camera, integer pixel centres; the world is that of the fit.
     """
-    train, (intrinsics, _) = trainer.scene.train, matrices(photos.cameras)
+    train, (intrinsics, _) = trainer.scene.train, camera_matrices(photos.cameras)
     places, descriptors = detect(photos, 0, KEYPOINTS)
     points, pixels = list[torch.Tensor](), list[torch.Tensor]()
     for view in range(len(train)):

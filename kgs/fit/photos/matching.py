@@ -13,7 +13,7 @@ from kornia.feature import laf_from_center_scale_ori, match_adalam
 from torch import Tensor
 
 from kgs.fit.keypoints import root_sift
-from kgs.fit.progress import Stage
+from kgs.io.console import Stage
 
 from .read import Photo
 

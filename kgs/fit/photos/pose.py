@@ -13,9 +13,9 @@ import cv2
 import torch
 
 from kgs.errors import DataError
-from kgs.fit.machine import versions
-from kgs.fit.outputs import png_names
-from kgs.fit.progress import Stage
+from kgs.io.console import Stage
+from kgs.io.outputs import png_names
+from kgs.machine import versions
 
 from .exif import FILM_DIAGONAL
 from .gates import (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kgs.datasets.images import Intrinsics, read_bytes, read_image, read_size
 from kgs.errors import DataError
-from kgs.fit.progress import Stage
+from kgs.io.console import Stage
 
 from .exif import FILM_DIAGONAL, Exif, read_exif, turn
 from .find import CONVERT, listed

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.errors import DataError
-from kgs.fit.outputs import is_own, write_png
-from kgs.json_files import read_json, write_json
+from kgs.io.json_files import read_json, write_json
+from kgs.io.outputs import is_own, write_png
 
 from .mapping import Cameras, quiet_pycolmap
 from .read import Photo

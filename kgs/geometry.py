@@ -1,0 +1,185 @@
+"""Points, pixels and poses: projections of many points, where cameras stand, how far apart points are."""
+
+import math
+
+import numpy as np
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from torch import Tensor
+
+from .types import check_tensor
+
+NEIGHBOURS = 3
+MIN_RELATIVE_SPACING = 1e-3
+
+
+def camera_matrices(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
+    """Intrinsics `(V, 3, 3)` and world-to-camera extrinsics `(V, 4, 4)` in float64 on the CPU."""
+    return cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu()
+
+
+def camera_centers(extrinsics: Tensor) -> Tensor:
+    """The centres of cameras in the world, `(C, 3)` float64 on the CPU, from world-to-camera matrices `(C, 4, 4)`."""
+    poses = extrinsics.detach().double().cpu()
+    return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
+
+
+def camera_extent(extrinsics: Tensor) -> float:
+    """Size of a camera rig: 1.1 times the largest distance of a camera's centre to the mean of the centres.
+
+    Source: the normalisation of NeRF++ (Zhang et al., 2020) as 3D Gaussian Splatting uses it; over training cameras.
+
+    Convention:
+        World-to-camera extrinsics; which way the axes point does not matter.
+
+    Args:
+        extrinsics: matrices [R | t] with a rotation R, `(C, 4, 4)`, C >= 1, else a ValueError.
+
+    Returns:
+        The extent in world units; 0 for a single camera.
+    """
+    check_tensor("extrinsics", extrinsics)
+    if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
+        raise ValueError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
+    centres = camera_centers(extrinsics)
+    return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
+
+
+def common_up(extrinsics: Tensor) -> Tensor:
+    """The mean up direction of cameras `(C, 4, 4)`, `(3,)` float64 of length 1; the first one's where they disagree."""
+    ups = -extrinsics[:, 1, :3].detach().double().cpu()
+    mean = ups.mean(dim=0)
+    up = mean if mean.norm() > 0.1 else ups[0]
+    unit: Tensor = up / up.norm()
+    return unit
+
+
+def meeting_point(extrinsics: Tensor) -> Tensor | None:
+    """The point nearest to all optical axes, `(3,)` float64; None where axes are near-parallel, or it is behind one.
+
+    Convention:
+        World-to-camera extrinsics, OpenCV axes, `(V, 4, 4)`. Axes within about 5 degrees count as parallel.
+    """
+    poses = torch.linalg.inv(extrinsics.double().cpu())
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    if torch.linalg.eigvalsh(across.mean(0))[0] <= 0.005:
+        return None
+    meeting = torch.linalg.solve(across.sum(0), (across @ centers[..., None]).sum(0)[:, 0])
+    in_front = (((meeting - centers) * axes).sum(1) > 0).all()
+    return meeting if bool(in_front) else None
+
+
+def degrees_between(rotations: Tensor, others: Tensor) -> Tensor:
+    """The angles by which rotations `(..., 3, 3)` differ, `(...)`; |R - S| is 2 sqrt(2) times the sine of its half."""
+    sines: Tensor = torch.linalg.matrix_norm(rotations - others) / 8**0.5
+    return 2 * sines.clamp(max=1).asin().rad2deg()
+
+
+def project_points(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
+    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, float64; pixels mean nothing at depth <= 0."""
+    intrinsics, extrinsics = camera_matrices(cameras)
+    local = torch.einsum("vij,pj->pvi", extrinsics[:, :3, :3], points.double()) + extrinsics[:, :3, 3]
+    image = torch.einsum("vij,pvj->pvi", intrinsics, local)
+    return image[..., :2] / image[..., 2:], local[..., 2]
+
+
+def unproject(pixels: Tensor, depths: Tensor, views: Tensor, cameras: PinholeCamera) -> Tensor:
+    """World points `(P, 3)` of pixels `(P, 2)` at depths `(P,)`, each in the camera `views (P,)`; float64."""
+    intrinsics, extrinsics = camera_matrices(cameras)
+    rays = convert_points_to_homogeneous(pixels.double())
+    local = (torch.linalg.inv(intrinsics)[views] @ rays[..., None])[..., 0] * depths[:, None]
+    world: Tensor = (local - extrinsics[views, :3, 3])[:, None] @ extrinsics[views, :3, :3]
+    return world[:, 0]
+
+
+def nearest_pixels(pixels: Tensor, depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The columns and rows `(P,)` of the nearest pixels, and whether they lie in the image, in front of the camera.
+
+    Columns and rows are 0 for points outside.
+
+    Convention:
+        Integer pixel centres, rounded half to even.
+    """
+    places = pixels.round()
+    inside = ((places >= 0) & (places < torch.tensor([width, height]))).all(1) & (depths > 0)
+    x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
+    return x, y, inside
+
+
+def inside_images(pixels: Tensor, depths: Tensor, cameras: PinholeCamera, near: float, far: float) -> Tensor:
+    """Whether projected points `(P, V)` lie in the images of their cameras, at depths from near to far."""
+    size = torch.stack([cameras.width, cameras.height], -1).to(pixels)
+    within = ((pixels > -0.5) & (pixels < size - 0.5)).all(-1)
+    return within & (depths >= near) & (depths <= far)
+
+
+def depths_in_images(points: Tensor, cameras: PinholeCamera) -> Tensor:
+    """Depths of points in the cameras whose image they lie in, `(D,)`."""
+    pixels, depths = project_points(points, cameras)
+    return depths[inside_images(pixels, depths, cameras, 0.0, torch.inf) & (depths > 0)]
+
+
+def typical_depths(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
+    """The 1st percentile and the median of the points' depths: the scales of a scene.
+
+    Convention:
+        Depth is z in the camera's frame (OpenCV axes), in world units.
+
+    Args:
+        points: `(P, 3)`; P may be 0.
+        cameras: the training cameras.
+
+    Returns:
+        Both over the depths of points inside an image, else of all points in front of a camera; 1.0 where there are
+        none.
+    """
+    points = points.detach().cpu()
+    depths = depths_in_images(points, cameras)
+    if not len(depths):
+        _, depths = project_points(points, cameras)
+        depths = depths[depths > 0]
+    if not len(depths):
+        return 1.0, 1.0
+    near, median = np.quantile(depths, (0.01, 0.5)).tolist()  # torch.quantile refuses more than 16 million values
+    return near, median
+
+
+def log_spacing(points: Tensor) -> Tensor:
+    """Logarithm of the root mean squared distance to the three nearest points, float64 `(N,)`.
+
+    The initial scale of Gaussians. It is at least a thousandth of the cloud's median spacing, because points may
+    coincide. Where points coincide in groups of four or more and more than half of the places hold three or more (the
+    triangles of an STL), distances are those between places.
+
+    Args:
+        points: `(N, 3)`, N >= 4, finite, not all in one place; else a ValueError.
+    """
+    if len(points) <= NEIGHBOURS:
+        raise ValueError(f"points: expected at least {NEIGHBOURS + 1} to take a spacing from, got {len(points)}")
+    points = points.double()
+    centred = points - points.mean(dim=0)
+    size = centred.abs().amax()
+    if not 0.0 < float(size) < math.inf:
+        raise ValueError(f"points: expected points in different places, got a cloud of half size {float(size):g}")
+    centred = centred / size  # float32 then suffices to find the neighbours, whatever the unit and place of the cloud
+    centred = centred.masked_fill(centred.abs() < 1e-100, 0.0)  # its square would be 0
+    squared = _mean_squared_distance(centred)
+    if not bool(squared.all()):
+        places, inverse, counts = centred.unique(dim=0, return_inverse=True, return_counts=True)
+        if 2 * int((counts >= NEIGHBOURS).sum()) > len(places):
+            squared = _mean_squared_distance(places).index_select(0, inverse)
+    typical = squared[squared > 0].median()
+    return 0.5 * squared.clamp(min=MIN_RELATIVE_SPACING**2 * typical).log() + size.log()
+
+
+def _mean_squared_distance(points: Tensor) -> Tensor:
+    """The mean squared distance to the nearest three points, or to all others where they are fewer, `(N,)`."""
+    import cv2
+
+    data = points.float().cpu().numpy()  # the index refers to this array, it makes no copy
+    index = cv2.flann_Index(data, {"algorithm": 4})  # type: ignore[attr-defined]  # an exact k-d tree; not in the stubs
+    found, _ = index.knnSearch(data, min(NEIGHBOURS + 1, len(data)), params={})
+    ids = torch.from_numpy(found[:, 1:]).long().to(points.device)  # the first is the point itself or its double
+    return (points[ids] - points[:, None, :]).square().sum(dim=-1).mean(dim=-1)

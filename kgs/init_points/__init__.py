@@ -1,0 +1,194 @@
+"""First points of a fit, from the training views alone: nothing here ever sees a test view."""
+
+import warnings
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.datasets.scene import Views
+from kgs.geometry import (
+    camera_centers,
+    depths_in_images,
+    inside_images,
+    log_spacing,
+    meeting_point,
+    project_points,
+    unproject,
+)
+from kgs.io.console import Stage, silent
+from kgs.types import check_kind
+
+from .dense import dense_points
+from .files import read_points
+from .tracks import find_tracks
+from .triangulate import triangulate_certain
+
+__all__ = ["FirstPoints", "first_points"]
+
+KINDS, DRAWS = ("dense", "sift", "random", "file"), ("uniform", "spread")
+FEWEST_DENSE = 1000
+FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
+MAX_SPACING = 4.0  # of a point, in medians of all
+# Quantiles are NumPy's: torch.quantile refuses more than 16 million values.
+
+
+@dataclass(frozen=True)
+class FirstPoints:
+    """What a fit starts from.
+
+    Args:
+        points: in the frame of the views, `(P, 3)` float32 on the CPU.
+        colors: RGB in [0, 1], `(P, 3)` float32.
+        kind: where the points come from: "dense", "sift", "random", "file", or the scene's `init_kind`.
+    """
+
+    points: Tensor
+    colors: Tensor
+    kind: str
+
+
+def first_points(
+    views: Views,
+    kind: str = "dense",
+    *,
+    seed: int = 0,
+    count: int = 10_000,
+    file: str | PathLike[str] | None = None,
+    origin: Tensor | None = None,
+    stage: Stage = silent,
+    backend: str = "auto",
+    draw: str = "uniform",
+) -> FirstPoints:
+    """Find the points a fit starts from.
+
+    Convention:
+        Points in the frame of the views' cameras, OpenCV axes, world units.
+
+    Args:
+        views: the training views, and only these.
+        kind: "dense": points of depth maps that at least two views agree on, drawn at random; where fewer than 1000
+            come out, those of "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated
+            with the given poses; where fewer than 20 come out, "random" ones with a warning. "random": spread evenly
+            over the space that at least two of the views see (one, if there is only one), in the images' mean colours
+            there, at the depths of the SIFT points or else where the cameras look. "file": those of a 3DGS PLY file,
+            or of a cloud or mesh that trimesh reads, up to 1 GiB.
+        seed: of what is drawn at random.
+        count: how many points "random" gives, and "dense" at most; >= 1.
+        file: the file of the kind "file".
+        origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
+        stage: shows how far the work is: :func:`kgs.io.console.each`, or nothing.
+        backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
+        draw: of "dense" points: "uniform", or "spread" evenly over the pictures.
+
+    Returns:
+        The points; their `kind` is what they are, so "random" where "sift" found too few.
+
+    Raises:
+        TypeError: `views` are none, a whole scene for instance.
+        ValueError: another kind or draw, `count` below 1, or no file for "file".
+        DataError: the file is missing, broken, compressed, too large, or has no points.
+    """
+    check_kind("views", views, Views)
+    if kind not in KINDS:
+        raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
+    if draw not in DRAWS:
+        raise ValueError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}")
+    if kind == "file":
+        if file is None:
+            raise ValueError("file: expected a path for the kind 'file', got None")
+        return FirstPoints(*read_points(Path(file), origin), kind)
+    points, tracks = triangulate_certain(find_tracks(views, stage, backend), views.cameras)
+    good = _within_typical_depths(points, tracks.seen, views.cameras)
+    points, tracks = points[good], tracks.select(good)
+    if len(points) >= FEWEST_POINTS:
+        good = _in_company(points, tracks.seen, views.cameras)
+        points, tracks = points[good], tracks.select(good)
+    near, far = _depth_range(points, views.cameras)
+    generator = torch.Generator().manual_seed(seed)
+    if kind == "dense":
+        near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
+        dense, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw)
+        if agreed >= min(FEWEST_DENSE, count):
+            return FirstPoints(dense, colors, kind)
+        message = f"first points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
+        warnings.warn(message, stacklevel=2)
+    if kind in ("dense", "sift"):
+        if len(points) >= FEWEST_POINTS:
+            return FirstPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), "sift")
+        message = f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
+        warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
+    points = _random_points(views, count, near, far, generator)
+    pixels, depths = project_points(points, views.cameras)
+    seen = inside_images(pixels, depths, views.cameras, near, far)
+    return FirstPoints(points.float(), _mean_colors(views, pixels, seen), "random")
+
+
+def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
+    """Whether all views of a point have it between half the 1st and twice the 99th percentile of all depths."""
+    _, depths = project_points(points, cameras)
+    if not seen.any():
+        return torch.zeros(len(points), dtype=torch.bool)
+    least, most = np.quantile(depths[seen], (0.01, 0.99)).tolist()
+    good: Tensor = ((depths > 0.5 * least) & (depths < 2.0 * most)) | ~seen
+    return good.all(1)
+
+
+def _in_company(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
+    """Whether the points' spacing in the image is usual; a false match, alone, would cover much of the images."""
+    _, depths = project_points(points, cameras)
+    spacing = log_spacing(points).exp() * (cameras.fx.double().cpu() / depths).masked_fill(~seen, 0.0).amax(1)
+    return spacing < MAX_SPACING * spacing.median()
+
+
+def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
+    """Nearest and farthest depth to expect: from points if there are any, else from the cameras."""
+    if len(points) > 1:
+        _, depths = project_points(points, cameras)
+        least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
+        return 0.8 * least, 1.25 * most
+    centers, axes = camera_centers(cameras.extrinsics), cameras.extrinsics[:, 2, :3].double().cpu()
+    if (meeting := meeting_point(cameras.extrinsics)) is not None:
+        depths = ((meeting - centers) * axes).sum(1)
+        return 0.3 * float(depths.min()), 2.0 * float(depths.max())
+    baseline = float(torch.cdist(centers, centers).max()) or 1.0
+    return baseline, 20.0 * baseline
+
+
+def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
+    """Beyond all points in an image: a background that is cut off costs decibels, a few more planes cost nothing."""
+    depths = depths_in_images(points, views.cameras)
+    return 0.85 * float(depths.min()), 1.3 * float(depths.max())
+
+
+def _random_points(views: Views, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
+    """Points of even density where at least two views see; where there is no such place, where one sees."""
+    size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
+    found: list[Tensor] = []
+    for fewest in [min(2, len(views))] * 50 + [1] * 50:
+        draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
+        view = (torch.rand(4 * count, generator=generator) * len(views)).long()
+        depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
+        points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
+        # A place that k views see is drawn k times as often as one that a single view sees.
+        seeing = inside_images(*project_points(points, views.cameras), views.cameras, near, far).sum(1)
+        found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])
+        if sum(map(len, found)) >= count:
+            break
+    return torch.cat(found)[:count]
+
+
+def _mean_colors(views: Views, pixels: Tensor, seen: Tensor) -> Tensor:
+    """The mean of the images' colours at pixels `(P, V, 2)`, over the views where `seen` `(P, V)`."""
+    images = views.images.cpu()
+    span = torch.tensor([max(images.shape[-1] - 1, 1), max(images.shape[-2] - 1, 1)])
+    grid = (2.0 * pixels / span - 1.0).transpose(0, 1)[:, :, None].to(images.dtype)
+    samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)[..., 0]
+    weights = (seen / seen.sum(1, keepdim=True)).T[:, None].to(images.dtype)
+    return torch.where(weights > 0, weights * samples, 0.0).sum(0).T.clamp(0.0, 1.0).contiguous()

@@ -1,0 +1,149 @@
+"""Feature tracks of posed images: SIFT keypoints, matched along the epipolar lines, joined over the views.
+
+Source: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004 (the ratio test).
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Self
+
+import cv2
+import numpy as np
+import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from kornia.geometry.epipolar import fundamental_from_projections
+from torch import Tensor
+
+from kgs.backends import choose, compiled_covers, register
+from kgs.datasets.scene import Views
+from kgs.fit.keypoints import root_sift
+from kgs.io.console import Stage, silent
+
+SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
+MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
+CHUNK = 256  # keypoints matched at once: bounds the memory
+MAX_RATIO = 0.8  # of the best descriptor distance to the second best
+MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival must still be alike
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """T scene points as V views see them; on the CPU."""
+
+    pixels: Tensor  # `(T, V, 2)`, float64; the first pixel's centre is (0, 0)
+    seen: Tensor  # `(T, V)`: whether a view sees a point
+
+    def select(self, rows: Tensor) -> Self:
+        """Some of the points, by a mask or by numbers."""
+        return type(self)(self.pixels[rows], self.seen[rows])
+
+
+def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> Tracks:
+    """Find points that at least two of the views see, where their pixels are usable.
+
+    Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
+    poses), clearly nearer than the second nearest, and alike in itself. The best matches are joined first; one that
+    would give a track two places in one view is left out. Nothing is random: the same images give the same bits.
+    """
+    # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
+    limit = min(max(48_000 // len(views), 1500), 12_000)
+    features = [detect(views, view, limit) for view in stage(range(len(views)), "keypoints", "view")]
+    projections = (views.cameras.intrinsics.double() @ views.cameras.extrinsics.double())[:, :3].cpu()
+    nodes, pixels, owners = _places([places for places, _ in features])
+    links = list[tuple[float, int, int]]()
+    for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
+        (places1, descriptors1), (places2, descriptors2) = features[i], features[j]
+        lines = _lines(places1, projections[i], projections[j])
+        arguments = (lines, places2.float(), descriptors1, descriptors2)
+        distances, rows, columns = choose("matching", backend, *arguments)(*arguments)
+        links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
+    tracks = _join(links, owners)
+    table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
+    seen = torch.zeros(len(tracks), len(views), dtype=torch.bool)
+    for row, track in enumerate(tracks):
+        columns = torch.tensor(list(track))
+        table[row, columns] = pixels[torch.tensor(list(track.values()))]
+        seen[row, columns] = True
+    return Tracks(table, seen)
+
+
+def detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
+    """Places `(N, 2)` in float64 and RootSIFT descriptors `(N, 128)` of the strongest keypoints of one view."""
+    image = views.images[index].permute(1, 2, 0).cpu().numpy()
+    grey = cv2.cvtColor((image.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    mask = None if (usable := views.usable) is None else usable[index].cpu().numpy().astype(np.uint8)
+    factor = 2 if grey.size < SMALL_IMAGE else 1
+    found = root_sift(grey, limit, factor, mask, nOctaveLayers=4, contrastThreshold=0.005)
+    return found.places, found.descriptors
+
+
+def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
+    """The epipolar lines of places in the first view, in the second, `(N, 3)` float32; normals of length 1."""
+    fundamental = fundamental_from_projections(projection1[None], projection2[None])[0]
+    lines = convert_points_to_homogeneous(places) @ fundamental.T
+    unit: Tensor = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
+    return unit
+
+
+def torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
+    """The stage "matching"."""
+    targets = convert_points_to_homogeneous(places).T
+    candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
+    for start in range(0, len(lines), CHUNK):
+        rows, columns = ((lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
+        # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
+        differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
+        candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
+    rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
+    nearest1, rival1 = _nearest(distances, rows, len(lines))
+    nearest2, rival2 = _nearest(distances, columns, len(places))
+    good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)
+    return distances[good], rows[good], columns[good]
+
+
+register("matching", "torch", torch_matches)
+register(
+    "matching", "numba", "kgs.init_points.tracks_compiled:compiled_matches", lambda lines, *_: compiled_covers(lines)
+)
+
+
+def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """For each candidate: is it the nearest of its owner, and the distance of its owner's second nearest."""
+    order = torch.arange(len(distances))
+    infinite = distances.new_full((count,), torch.inf)
+    ties = distances == infinite.scatter_reduce(0, owners, distances, "amin")[owners]
+    first = order.new_full((count,), len(order)).scatter_reduce(0, owners[ties], order[ties], "amin")
+    nearest = first[owners] == order
+    rival = infinite.scatter_reduce(0, owners[~nearest], distances[~nearest], "amin")
+    return nearest, rival[owners]
+
+
+def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
+    """Numbers by keypoint, places and views by number; SIFT repeats a keypoint for each orientation: one place."""
+    numbers, distinct, owners = list[Tensor](), list[Tensor](), list[int]()
+    for view, all_places in enumerate(places):
+        unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)
+        numbers.append(inverse + len(owners))
+        distinct.append(unique)
+        owners += [view] * len(unique)
+    return numbers, torch.cat(distinct), owners
+
+
+def _join(links: list[tuple[float, int, int]], owners: list[int]) -> list[dict[int, int]]:
+    """Join places to tracks (union-find), nearest descriptors first; a track maps each of its views to a place."""
+    parents = list(range(len(owners)))
+    tracks = [{view: place} for place, view in enumerate(owners)]
+
+    def root(place: int) -> int:
+        while parents[place] != place:
+            parents[place] = parents[parents[place]]
+            place = parents[place]
+        return place
+
+    for _, place1, place2 in sorted(links):
+        one, other = root(place1), root(place2)
+        if one != other and not tracks[one].keys() & tracks[other].keys():
+            parents[other] = one
+            tracks[one] |= tracks[other]
+            tracks[other] = {}
+    return [track for track in tracks if len(track) > 1]

@@ -1,0 +1,69 @@
+"""JSON from files of unknown origin (finite numbers, a limit on the size, one kind of error), and whole files."""
+
+import json
+import math
+import os
+import uuid
+from pathlib import Path
+from typing import Any, TypeGuard
+
+from kgs.errors import DataError
+
+_MOST_BYTES = 64 * 2**20
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; a DataError where the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
+        value = parse_json(path.read_bytes())
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise DataError(path, "", f"is no JSON that can be read ({error})") from error
+    if not isinstance(value, dict):
+        raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
+    return value
+
+
+def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGuard[float]:
+    """Whether a value of JSON is a number of that size, and no bool; its integers have no limit of their own."""
+    return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON whole or not at all; a ValueError where a number is not finite."""
+    write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all; a link stays one, and after an OSError what was there is untouched."""
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".kgs-{uuid.uuid4().hex}.tmp")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def parse_json(text: bytes) -> Any:
+    """The value of UTF-8 text, which may begin with a byte order mark.
+
+    Raises:
+        ValueError: it is no JSON (NaN and Infinity are none), nested too deep, or holds a number beyond float64.
+    """
+    try:
+        return json.loads(text.decode("utf-8-sig"), parse_constant=_finite, parse_float=_finite)
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:60]} is not a finite number")
+    return number

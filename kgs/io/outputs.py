@@ -1,0 +1,114 @@
+"""What a command leaves behind: JSON and PNGs, whole or not at all, and never in place of a user's file."""
+
+import hashlib
+import os
+import re
+import shutil
+import unicodedata
+import zlib
+from collections import Counter
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+import cv2
+from torch import Tensor
+
+from kgs.datasets.images import list_images
+from kgs.datasets.layouts import CAMERAS_REPORT
+from kgs.errors import DataError
+
+from .film import MARK as FILM_MARK
+from .images import eight_bits
+from .json_files import write_whole
+
+PNG_MARK = b"Software\0kgs"
+FOLDER_MARK = ".kgs"  # an empty file in a folder that kgs made for a while
+EXPORTS = ("cameras.json", "splat.glb", "turntable.webm")  # for other programs
+_MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
+_MARKS |= {".html": (b'<meta name="generator" content="kgs ',)}
+_MARKS |= {".glb": (b'"generator":"kgs ',), ".webm": (FILM_MARK,)}
+_MARKS |= {suffix: (b"kgs-checkpoint ",) for suffix in (".safetensors", ".pt")}
+_DEEP = (".json", ".webm", ".safetensors")  # the mark may stand far behind
+_SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
+_ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
+_LONGEST = 120  # bytes of a picture's name
+
+
+def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, make: bool = True) -> None:
+    """Make the folder for results, once it is sure that this command can write there and overwrites no user's file.
+
+    `files`, relative to `out`, are what it is going to write; `scene` is a folder whose own photos it must not write
+    beside. With `make` False it only looks. A folder that will not do is a DataError.
+    """
+    advice = "choose another folder with -o"
+    there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
+    if not there.is_dir():
+        raise DataError(out, "", f"expected a folder for results, but {there} is none")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise DataError(out, "", f"results cannot be written there: no permission for {there}")
+    inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
+    has_photos = inside and there == out and not all(map(is_own, list_images(out)))
+    of_photos = ("sparse",) if is_own(out / CAMERAS_REPORT) else ()  # cameras that a former run found
+    if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
+        raise DataError(out, "", f"holds files of a scene: {advice}")
+    for path in (out / name for name in files):
+        if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(path.parent) and not path.parent.is_dir()):
+            raise DataError(path, "", f"was not written by kgs and would be overwritten: {advice}")
+    if make:
+        out.mkdir(parents=True, exist_ok=True)
+
+
+def is_own(path: Path) -> bool:
+    """Whether kgs wrote this file (PNG, PLY, JSON, HTML, glTF, WebM, checkpoint), or made this folder."""
+    if path.is_dir():
+        return (path / FOLDER_MARK).is_file() or not any(path.iterdir())
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        content = file.read(2**26 if path.suffix in _DEEP else 2**12)
+    return any(mark in content for mark in _MARKS.get(path.suffix, ()))
+
+
+def start_folder(path: Path) -> None:
+    """An empty folder by which `is_own` knows kgs again, in the place of a former one of kgs's own."""
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir()
+    (path / FOLDER_MARK).touch()
+
+
+def png_names(views: Iterable[str]) -> dict[str, str]:
+    """A file name of its own, in UTF-8, for a render of each view: folders become part of it, the ending becomes .png.
+
+    Where two views would have the same (capitals do not count), or one is too long, a hash of the view's name is added.
+    """
+    plain = {view: re.sub(r"[\\/\x00-\x1f\ud800-\udfff]", "_", re.sub(_ENDING, "", view)) for view in views}
+    folded = {view: unicodedata.normalize("NFC", stem).casefold() for view, stem in plain.items()}
+    counts = Counter(folded.values())
+    names = {}
+    for view, stem in plain.items():
+        if counts[folded[view]] > 1 or len(os.fsencode(stem)) > _LONGEST:
+            short = os.fsencode(stem)[: _LONGEST - 13].decode(errors="ignore")
+            stem = f"{short}-{hashlib.sha256(os.fsencode(view)).hexdigest()[:12]}"
+        names[view] = f"{stem}.png"
+    return names
+
+
+def write_png(path: Path, image: Tensor) -> None:
+    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs.
+
+    As PNG has it alpha is straight: the colours are not multiplied by it.
+    """
+    ok, content = cv2.imencode(".png", eight_bits(image))
+    if not ok:
+        raise DataError(path, "", "expected an image that can be encoded, got another")
+    chunk = b"tEXt" + PNG_MARK
+    mark = len(PNG_MARK).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    data, header = content.tobytes(), 33  # bytes of the signature and the first chunk
+    write_whole(path, data[:header] + mark + data[header:])
+
+
+def remove_others(folder: Path, keep: Collection[str]) -> None:
+    """Remove the pictures of a former run: PNGs that kgs wrote, but for those named in `keep`."""
+    for path in folder.glob("*.png"):
+        if path.name not in keep and is_own(path):
+            path.unlink()

@@ -1,0 +1,79 @@
+"""What a fit runs on: versions, the commit, memory, and whether the device that is asked for is there."""
+
+import contextlib
+import os
+import platform
+import subprocess
+import sys
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+import kornia
+import torch
+from torch import Tensor
+
+from . import __version__
+from .backends import resolve
+
+# Measured, with room: what libraries load at first use; parameters, gradients, moments and copies of each Gaussian.
+_AT_FIRST_USE, _PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
+
+
+def check_device(name: str) -> torch.device:
+    """The device of that name; ValueError where torch knows none, or it cannot hold a number."""
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()  # the meta device has no numbers
+    except Exception as error:  # RuntimeError, AssertionError or ImportError, by the backend
+        reason = str(error).partition(". ")[0].splitlines()[0]
+        raise ValueError(f"device: expected cpu or a GPU of this machine, got {name!r} ({reason:.120})") from error
+    return device
+
+
+def check_tools(device: str, backend: str, *packages: str) -> torch.device:
+    """The device; an error where it, the backend or a package that a command will need is not there."""
+    place = check_device(device)
+    resolve(backend, place)
+    for package in packages:
+        import_module(package)
+    return place
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides a result; numba is left out where it is not installed."""
+    found = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
+    with contextlib.suppress(PackageNotFoundError):
+        found["numba"] = version("numba")
+    return found | {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+
+
+def revision(path: Path) -> str | None:
+    """The commit that last changed a file or folder, as "1a2b3c4 of 2026-11-22"; None where git does not know it."""
+    options = (("log", "-1", "--format=%h of %cs"), ("status", "--porcelain"))
+    calls = (["git", "-C", str(path.parent), *arguments, "--", path.name] for arguments in options)
+    try:
+        commit, changes = (subprocess.run(c, capture_output=True, text=True, check=True).stdout.strip() for c in calls)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit + (" and later changes" if changes else "") if commit else None
+
+
+def peak_rss_mb() -> int:
+    """Largest resident memory of this process so far, in MiB; 0 where the system does not tell (Windows)."""
+    status = Path("/proc/self/status")
+    if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return round(int(line.split()[1]) / 2**10)
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return 0
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10))
+
+
+def bytes_of(gaussians: int, photos: Tensor) -> int:
+    """What a fit of so many Gaussians to photos `(V, 3, H, W)` takes at most, without the renderer's working memory."""
+    pictures: int = photos[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * photos.nbytes
+    return _AT_FIRST_USE + gaussians * _PER_GAUSSIAN + pictures

@@ -1,0 +1,1 @@
+"""How good a splat is: PSNR, SSIM, LPIPS, and what the training views cover."""

@@ -1,0 +1,75 @@
+"""How good the renders of held-out views are where two training views show the scene, and elsewhere.
+
+What only one training view shows has no measured depth, and what none shows is invented: a mean over both says little.
+"""
+
+import math
+from statistics import fmean
+from typing import Any
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.camera import move_camera
+from kgs.fit.trainer import Trainer
+from kgs.geometry import nearest_pixels, project_points, unproject
+
+LEAST = 2  # training views that show a place
+BEHIND = 1.05  # times the depth that a training view has there: what is farther is hidden from it
+
+
+@torch.no_grad()
+def measure_seen(trainer: Trainer) -> dict[str, float | None] | None:
+    """PSNR of the test views apart, where at least `LEAST` training views show what the fit has there and elsewhere.
+
+    Convention:
+        A pixel's place is where the median depth of the fit puts it. A training view shows it if it lies in the
+        picture and no farther than `BEHIND` times the median depth of the fit there. Pixels without depth count as
+        not shown.
+
+    Returns:
+        "share" of the test pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the
+        views that have such pixels; None where there are none, or where the error is 0. None without test views.
+    """
+    train, test = trainer.scene.train, trainer.scene.test
+    if not len(test):
+        return None
+    depths = [depth_map(trainer, train.camera(view)) for view in range(len(train))]
+    levels: dict[str, list[float]] = {"psnr": [], "psnr_rest": []}
+    shares = []
+    for view in range(len(test)):
+        camera = test.camera(view)
+        shown = _shown(depth_map(trainer, camera), camera, depths, train.cameras)
+        render = test.as_photo(trainer.render(camera)[0].cpu())
+        errors = (render - test.images[view].cpu().to(render)).square().mean(dim=0)
+        shares.append(float(shown.float().mean()))
+        for name, where in (("psnr", shown), ("psnr_rest", ~shown)):
+            if where.any() and (error := float(errors[where].mean())) > 0:
+                levels[name].append(-10 * math.log10(error))
+    means: dict[str, Any] = {name: round(fmean(values), 4) if values else None for name, values in levels.items()}
+    return {"share": round(fmean(shares), 4), **means}
+
+
+def depth_map(trainer: Trainer, camera: PinholeCamera) -> Tensor:
+    """The median depth of what is shown, `(H, W)` on the CPU; 0 where there is nothing."""
+    trainer.renderer.eval()
+    out = trainer.renderer(trainer.shown(), move_camera(camera, trainer.device), outputs=("median_depth",))
+    trainer.renderer.train()
+    depth: Tensor = out.median_depth[0, 0].cpu()
+    return depth
+
+
+def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: PinholeCamera) -> Tensor:
+    """Where at least `LEAST` of the cameras, with these depths, show what one camera has at these, bool `(H, W)`."""
+    height, width = depth.shape
+    pixels = torch.ones_like(depth).nonzero().flip(1)  # (x, y), row by row
+    values = depth.reshape(-1).double()
+    points = unproject(pixels, values, torch.zeros(len(pixels), dtype=torch.int64), camera)
+    places, distances = project_points(points, cameras)
+    count = torch.zeros(len(pixels), dtype=torch.int64)
+    for view, there in enumerate(depths):
+        distance = distances[:, view]
+        x, y, inside = nearest_pixels(places[:, view], distance, *there.mT.shape)
+        count += (values > 0) & inside & (distance <= BEHIND * there[y, x])
+    return (count >= LEAST).reshape(height, width)

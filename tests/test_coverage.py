@@ -1,0 +1,77 @@
+"""PSNR apart for what two training views show and for the rest: against closed forms."""
+
+import math
+
+import pytest
+import torch
+from kornia.metrics import psnr
+
+from kgs.datasets import synthetic_scene
+from kgs.datasets.scene import pinholes
+from kgs.fit.config import FitConfig
+from kgs.fit.run import choose_points
+from kgs.fit.trainer import Trainer
+from kgs.metrics.coverage import _shown, measure_seen
+
+HEIGHT, WIDTH, FOCAL, DEPTH = 10, 40, 20.0, 5.0
+
+
+def rig(*centers):
+    """Cameras side by side that look along z; a shift by one unit moves what is at `DEPTH` by four pixels."""
+    intrinsics = torch.eye(4).repeat(len(centers), 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = FOCAL
+    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+    extrinsics = torch.eye(4).repeat(len(centers), 1, 1)
+    extrinsics[:, 0, 3] = -torch.tensor(centers)
+    return pinholes(intrinsics, extrinsics, (HEIGHT, WIDTH))
+
+
+def wall(depth=DEPTH):
+    return torch.full((HEIGHT, WIDTH), depth)
+
+
+def test_what_two_pictures_hold_is_shown():
+    shown = _shown(wall(), rig(0.0), [wall()] * 2, rig(1.0, 2.0))  # they show what is right of pixels 4 and 8
+    assert not bool(shown[:, :8].any())
+    assert bool(shown[:, 8:].all())
+    assert not bool(_shown(wall(), rig(0.0), [wall()], rig(0.0)).any())  # one view is not enough
+
+
+def test_what_is_hidden_from_a_view_is_not_shown():
+    before = wall()
+    before[:, :10] = 2.0  # something near stands before it in one view
+    shown = _shown(wall(), rig(0.0), [wall(), before], rig(0.0, 0.0))
+    assert not bool(shown[:, :10].any())
+    assert bool(shown[:, 10:].all())
+
+
+def test_a_pixel_without_depth_is_not_shown():
+    empty = wall()
+    empty[2] = 0.0
+    shown = _shown(empty, rig(0.0), [wall()] * 2, rig(0.0, 0.0))
+    assert shown.sum() == (HEIGHT - 1) * WIDTH
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
+    config = FitConfig(steps=30, sh_degree=0, init="sift", evaluations=1)
+    trainer = Trainer(scene, config, choose_points(scene, config))
+    trainer.fit()
+    return trainer
+
+
+def test_both_parts_together_are_the_whole(trainer):
+    found, scene = measure_seen(trainer), trainer.scene
+    assert 0.3 < found["share"] < 1
+    errors = [10 ** (-found[name] / 10) for name in ("psnr", "psnr_rest")]
+    render = trainer.render(scene.test.camera(0)).clamp(0, 1)
+    whole = 10 ** (-float(psnr(render, scene.test.images, 1.0)) / 10)
+    assert found["share"] * errors[0] + (1 - found["share"]) * errors[1] == pytest.approx(whole, rel=1e-3)
+    assert trainer.renderer.training
+    assert all(math.isfinite(value) for value in found.values())
+
+
+def test_without_test_views_there_is_nothing_to_say(trainer, monkeypatch):
+    monkeypatch.setattr(trainer.scene.test.__class__, "__len__", lambda self: 0)
+    assert measure_seen(trainer) is None

@@ -1,0 +1,146 @@
+"""The measures against numpy, in loops and closed forms of their own."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from kgs.datasets.scene import Views
+from kgs.metrics.evaluate import evaluate
+from kgs.metrics.lpips import Lpips
+
+KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
+
+
+def make_views(count=2, height=18, width=23, seed=0):
+    images = torch.rand(count, 3, height, width, generator=torch.Generator().manual_seed(seed))
+    extrinsics = torch.eye(4).repeat(count, 1, 1)
+    extrinsics[:, 0, 3] = torch.arange(count)
+    sizes = [torch.full((count,), size) for size in (height, width)]
+    cameras = PinholeCamera(torch.eye(4).repeat(count, 1, 1), extrinsics, *sizes)
+    return Views(cameras, images, tuple(f"{i}.png" for i in range(count)))
+
+
+def renderer_of(images):
+    """A `render` that looks its image up by the camera's position."""
+    return lambda camera: images[int(camera.extrinsics[0, 0, 3])][None]
+
+
+def distort(images, amount=0.1, seed=1):
+    return images + amount * torch.randn(images.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def numpy_ssim(image, target, mode):
+    """Mean SSIM of two (H, W) float64 images by explicit 11 x 11 windows."""
+    offsets = np.arange(-5, 6)
+    weights = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    weights /= weights.sum()
+
+    def windowed(values):
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, 5, mode=mode), (11, 11))
+        return np.einsum("hwij,ij->hw", windows, weights)
+
+    x, y = windowed(image), windowed(target)
+    xx, yy = windowed(image**2) - x**2, windowed(target**2) - y**2
+    xy = windowed(image * target) - x * y
+    c1, c2 = 0.01**2, 0.03**2
+    return np.mean((2 * x * y + c1) * (2 * xy + c2) / ((x**2 + y**2 + c1) * (xx + yy + c2)))
+
+
+def test_measures_are_numpys_for_each_view_and_their_mean_on_top():
+    views = make_views()
+    renders = distort(views.images)
+    result = evaluate(renderer_of(renders), views)
+    assert set(result) == KEYS
+    for row, name, render, photo in zip(result["views"], views.names, renders, views.images, strict=True):
+        image, target = render.clamp(0, 1).double().numpy(), photo.double().numpy()
+        assert row["name"] == name
+        assert row["psnr"] == pytest.approx(-10 * math.log10(np.mean((image - target) ** 2)), abs=1e-4)
+        for key, mode in (("ssim", "reflect"), ("ssim_zero_padded", "constant")):
+            expected = np.mean([numpy_ssim(image[c], target[c], mode) for c in range(3)])
+            assert row[key] == pytest.approx(expected, abs=1e-5)
+    for key in ("psnr", "ssim", "ssim_zero_padded"):
+        assert result[key] == pytest.approx(np.mean([row[key] for row in result["views"]]), abs=1e-12)
+
+
+def test_the_two_borders_differ():
+    views = make_views(count=1)
+    result = evaluate(renderer_of(distort(views.images)), views)
+    assert abs(result["ssim"] - result["ssim_zero_padded"]) > 1e-3
+
+
+def test_flat_difference_has_its_closed_form():
+    views = make_views(count=1)
+    half = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
+    result = evaluate(renderer_of(half.images + 0.1), half)
+    assert result["psnr"] == pytest.approx(20.0, abs=1e-4)
+    assert result["ssim"] == pytest.approx((2 * 0.5 * 0.6 + 1e-4) / (0.25 + 0.36 + 1e-4), abs=2e-4)
+
+
+def test_renders_are_clamped_before_they_are_measured():
+    views = make_views(count=1)
+    render = distort(views.images, amount=0.5)
+    assert evaluate(renderer_of(render), views) == evaluate(renderer_of(render.clamp(0, 1)), views)
+
+
+def test_result_can_go_to_json_and_an_infinite_psnr_is_none():
+    views = make_views()
+    renders = torch.stack([views.images[0], distort(views.images)[1]])
+    result = json.loads(json.dumps(evaluate(renderer_of(renders), views), allow_nan=False))
+    assert result["psnr"] is None
+    assert result["views"][0]["psnr"] is None
+    assert result["views"][0]["ssim"] == pytest.approx(1.0, abs=1e-6)
+    assert result["views"][1]["psnr"] > 15
+    assert result["lpips_vgg"] is None
+    assert result["views"][1]["lpips_vgg_unscaled"] is None
+
+
+def test_no_views_give_no_numbers():
+    empty = make_views(count=0)
+    assert evaluate(renderer_of(empty.images), empty) == {**dict.fromkeys(KEYS), "views": []}
+
+
+def test_lpips_is_measured_in_both_scalings():
+    views = make_views(count=1)
+    torch.manual_seed(0)
+    lpips = Lpips("vgg16")
+    render = distort(views.images).clamp(0, 1)
+    result = evaluate(renderer_of(render), views, lpips)
+    assert result["lpips_vgg"] == pytest.approx(lpips(render, views.images).item())
+    assert result["lpips_vgg_unscaled"] == pytest.approx(lpips(render, views.images, rescale=False).item())
+    assert result["lpips_vgg"] != pytest.approx(result["lpips_vgg_unscaled"])
+
+
+def test_no_gradient_is_recorded():
+    views = make_views(count=1)
+    recorded = []
+
+    def render(camera):
+        recorded.append(torch.is_grad_enabled())
+        return views.images
+
+    evaluate(render, views)
+    assert recorded == [False]
+
+
+def test_float64_renders_are_measured():
+    views = make_views(count=1)
+    render = distort(views.images)
+    result, double = evaluate(renderer_of(render), views), evaluate(renderer_of(render.double()), views)
+    assert result["psnr"] == pytest.approx(double["psnr"], abs=1e-4)
+
+
+def test_wrong_renders_and_networks_are_named():
+    views = make_views(count=1)
+    with pytest.raises(ValueError, match=r"render: expected shape \(1, 3, 18, 23\) for 0.png"):
+        evaluate(lambda camera: views.images[0], views)
+    for bad in (math.nan, math.inf):
+        broken = views.images.clone()
+        broken[0, 1, 2, 3] = bad
+        with pytest.raises(ValueError, match=r"render: expected finite values for 0.png"):
+            evaluate(renderer_of(broken), views)
+    with pytest.raises(ValueError, match="lpips: expected a network 'vgg16'"):
+        evaluate(renderer_of(views.images), views, Lpips("alexnet"))

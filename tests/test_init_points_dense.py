@@ -1,0 +1,241 @@
+"""Depth maps and dense first points, against the true depths of the synthetic scene and of a plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from kgs.datasets.scene import Views
+from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
+from kgs.geometry import project_points
+from kgs.init_points import _sweep_range, first_points
+from kgs.init_points.dense import dense_points
+from kgs.init_points.plane_sweep import _neighbours, _semi_global, planes_wanted, sweep_depths, warp
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return synthetic_scene(train_views=3, test_views=1, size=(96, 128), seed=0).train
+
+
+@pytest.fixture(scope="module")
+def truth(views: Views) -> torch.Tensor:
+    return synthetic_depths(views.cameras, seed=0)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def span(truth: torch.Tensor) -> tuple[float, float]:
+    return 0.8 * float(truth.min()), 1.25 * float(truth.max())
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
+    for view, found in enumerate(sweep_depths(views, *span)):
+        accepted = found.is_inner & (found.scores > 0.6)
+        errors = (found.depths / truth[view] - 1).abs()
+        assert float(accepted.double().mean()) > 0.6
+        assert float(errors[accepted].median()) < 0.01
+        assert float((errors[accepted] < 0.02).double().mean()) > 0.7
+
+
+def test_points_lie_on_the_surfaces(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
+    points, colors, _ = dense_points(views, *span, 2000, generator())
+    assert points.shape == colors.shape == (2000, 3)
+    assert points.dtype == colors.dtype == torch.float32
+    pixels, depths = project_points(points, views.cameras)
+    x, y = (pixels[..., 0].round().long().clamp(0, 127), pixels[..., 1].round().long().clamp(0, 95))
+    errors = torch.stack([(depths[:, v] / truth[v][y[:, v], x[:, v]] - 1).abs() for v in range(3)]).amin(0)
+    assert float(errors.median()) < 0.01
+    assert float((errors < 0.03).double().mean()) > 0.9
+    seen = torch.stack([views.images[v][:, y[:, v], x[:, v]].mT for v in range(3)])
+    assert float((seen - colors).abs().amax(-1).amin(0).median()) == 0.0  # the colour of the pixel it comes from
+
+
+def test_the_draw_follows_the_seed(views: Views, span: tuple[float, float]) -> None:
+    small = views.halved()
+    first, again, other = (dense_points(small, *span, 300, generator(seed))[0] for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float]) -> None:
+    masks = torch.zeros(3, 1, 96, 128)
+    masks[..., 20:70, 30:100] = 1.0
+    points, *_ = dense_points(replace(views, masks=masks), *span, 2000, generator())
+    pixels, _ = project_points(points, views.cameras)
+    x, y = pixels.round().long().unbind(-1)
+    inside = (x >= 30) & (x < 100) & (y >= 20) & (y < 70)
+    assert len(points) > 300
+    assert bool((inside.sum(1) >= 2).all())
+
+
+def test_planes_out_of_range(views: Views) -> None:
+    for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0)):
+        with pytest.raises(ValueError, match="near, far"):
+            sweep_depths(views, near, far)
+
+
+@pytest.mark.parametrize("count", [2, 10])
+def test_two_views_and_many(count: int) -> None:
+    scene = synthetic_scene(train_views=count, test_views=1, size=(42, 56), seed=0)
+    depths = synthetic_depths(scene.train.cameras, seed=0)
+    points, *_ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
+    assert len(points) > 300
+    assert points.isfinite().all()
+
+
+def test_where_nothing_can_be_compared_others_take_over(views: Views) -> None:
+    with pytest.warns(UserWarning, match=r"agree on 0 points only"), pytest.warns(UserWarning, match="random points"):
+        assert first_points(views.select([0]), "dense", count=200).kind == "random"
+    grey = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
+    with pytest.warns(UserWarning, match="agree on 0"), pytest.warns(UserWarning, match="random points"):
+        assert first_points(grey, "dense", count=200).kind == "random"
+
+
+def test_pictures_that_contradict_each_other_have_no_dense_points(views: Views) -> None:
+    """As mirrors do: each photo shows something else."""
+    noise = torch.rand(views.images.shape, generator=generator(3))
+    with pytest.warns(UserWarning, match="points only; SIFT points"), pytest.warns(UserWarning, match="random points"):
+        assert first_points(Views(views.cameras, noise, views.names), "dense", count=2000).kind == "random"
+
+
+def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
+    """Cameras along a line, at 0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4 and 2 times the depth."""
+    places = torch.tensor([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 2.0]) * 3.0
+    n = len(places)
+    extrinsics = torch.eye(4).repeat(n, 1, 1)
+    extrinsics[:, 0, 3] = -places
+    first = views.camera(0)
+    camera = PinholeCamera(first.intrinsics.repeat(n, 1, 1), extrinsics, first.height.repeat(n), first.width.repeat(n))
+    line = Views(camera, views.images[:1].repeat(n, 1, 1, 1), tuple(f"{k}.png" for k in range(n)))
+    assert sorted(_neighbours(line, 0, 3.0)) == [3, 4, 5, 6]
+    assert _neighbours(line, 7, 3.0)[0] == 6
+
+
+def test_awarp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
+    image = torch.rand(20, 30, generator=generator())
+    homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], [0.002, -0.003, 1.0]], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
+    x, y, z = homography.float() @ torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1)
+    grid = torch.stack([2 * x / z / 29 - 1, 2 * y / z / 19 - 1], -1).reshape(1, 20, 30, 2)
+    inner = (grid.abs() < 1).all(-1)[0]
+    expected = torch.nn.functional.grid_sample(image[None, None], grid, align_corners=True)[0, 0]
+    assert float((warp(image, homography) - expected)[inner].abs().max()) < 0.05  # OpenCV may round to 1/32 pixel
+    homography[2] = torch.tensor([-0.1, 0.0, 1.0])
+    assert not warp(torch.ones(20, 30), homography)[:, 10:].any()
+    assert warp(torch.ones(20, 30), homography)[:, :5].any()
+
+
+def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:
+    near_camera = (
+        torch.linalg.inv(views.camera(0).extrinsics.double())[0] @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
+    )
+    scene = torch.tensor([[0.0, 0.0, 4.0], [0.2, 0.1, 6.0]], dtype=torch.float64)
+    assert _sweep_range(torch.cat([scene, near_camera[None, :3]]), views) == _sweep_range(scene, views)
+
+
+def test_views_from_one_place_have_no_depth(views: Views) -> None:
+    camera = views.camera(0)
+    both = [torch.cat([x, x]) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)]
+    twice = Views(PinholeCamera(*both), views.images[[0, 0]], ("a.png", "b.png"))
+    assert all(not found.is_inner.any() for found in sweep_depths(twice, 1.0, 10.0))
+
+
+def test_dense_is_a_kind_of_first_points(views: Views) -> None:
+    found = first_points(views, "dense")
+    assert found.kind == "dense"
+    assert 1000 <= len(found.points) <= 10_000
+
+
+def test_smoothing_keeps_edges_and_repairs_holes() -> None:
+    """Two flat halves with an edge in the image between them; a third of the pixels say nothing."""
+    planes, height, width = 32, 24, 40
+    truth = torch.full((height, width), 8)
+    truth[:, width // 2 :] = 20
+    grey = (truth == 20).float()
+    cost = (torch.arange(planes)[:, None, None] - truth).abs().clamp(max=5).float() / 5
+    silent = torch.rand(height, width, generator=generator()) < 0.33
+    cost = torch.where(silent, 0.5, cost)
+    found = _semi_global(cost, grey).argmin(0)
+    assert float((found == truth).double().mean()) > 0.99
+    assert float((torch.where(silent, 0.5, cost).argmin(0) == truth).double().mean()) < 0.75
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_smoothing_is_the_same_in_all_directions(tilt: float) -> None:
+    """Turned and mirrored input, turned and mirrored output."""
+    cost = torch.rand(9, 12, 12, generator=generator(3)) + tilt * torch.arange(12)
+    grey = torch.rand(12, 12, generator=generator(4))
+    plain = _semi_global(cost, grey)
+    for move in (lambda x: x.flip(-1), lambda x: x.flip(-2), lambda x: x.mT):
+        assert torch.allclose(move(_semi_global(move(cost), move(grey))), plain, rtol=1e-5)
+
+
+def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float]) -> None:
+    views = views.halved()
+    small = views.cameras.extrinsics.clone()
+    small[:, :3, 3] *= 1e-3
+    cameras = PinholeCamera(views.cameras.intrinsics, small, views.cameras.height, views.cameras.width)
+    (plain, *_), (scaled, *_) = (
+        sweep_depths(views, *span),
+        sweep_depths(Views(cameras, views.images, views.names), 1e-3 * span[0], 1e-3 * span[1]),
+    )
+    same = (scaled.depths / (1e-3 * plain.depths) - 1).abs() < 1e-3
+    assert float(same.double().mean()) > 0.99
+    assert math.isfinite(float(scaled.scores.sum()))
+
+
+# -- how many planes, and which points ------------------------------------------------------------------------------
+
+
+def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
+    """Side by side, a point of depth z is f b / z pixels apart."""
+    intrinsics, extrinsics = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = 500.0
+    extrinsics[1, 0, 3] = -0.3
+    side = torch.full((2,), 64.0)
+    views = Views(PinholeCamera(intrinsics, extrinsics, side, side), torch.rand(2, 3, 64, 64), ("a", "b"))
+    assert planes_wanted(views, 2.0, 10.0) * 127 / 128 == pytest.approx(500 * 0.3 * (1 / 2 - 1 / 10), rel=1e-6)
+    assert planes_wanted(views.select([0]), 2.0, 10.0) == 0.0
+
+
+@pytest.mark.parametrize("draw", ["uniform", "spread"])
+def test_few_points_are_enough_where_many_agree(draw: str) -> None:
+    found = first_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
+    assert found.kind == "dense"
+    assert 450 <= len(found.points) <= 500
+
+
+@pytest.mark.parametrize("count", [50, 400])
+def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
+    spread, *_ = dense_points(views, *span, count, generator(), draw="spread")
+    uniform, *_ = dense_points(views, *span, count, generator(), draw="uniform")
+    assert 0.9 * count <= len(spread) <= count == len(uniform)
+
+    def apart(points: torch.Tensor) -> float:
+        """The lower quartile of the distances to the nearest other point's pixel, in the nearest view."""
+        pixels, _ = project_points(points, views.cameras)
+        distances = torch.cdist(pixels[:, 0], pixels[:, 0]).fill_diagonal_(math.inf)
+        return float(distances.amin(1).quantile(0.25))
+
+    assert apart(spread) > apart(uniform)
+    again, *_ = dense_points(views, *span, count, generator(), draw="spread")
+    assert torch.equal(spread, again)
+
+
+def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
+    every = [dense_points(views, *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")]
+    assert len(every[0]) == len(every[1])
+    assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
+
+
+def test_another_draw_is_refused(views: Views) -> None:
+    with pytest.raises(ValueError, match="draw: expected one of"):
+        first_points(views, draw="even")

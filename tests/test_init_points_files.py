@@ -1,0 +1,140 @@
+"""First points from files: point clouds, meshes and splats; damaged and packed files are refused."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from init_point_scenes import flat
+
+import kgs
+from kgs.errors import DataError
+from kgs.init_points import first_points
+
+
+def test_file_with_colors(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(size=(30, 3)).astype(np.float32), rng.integers(0, 256, (30, 4), dtype=np.uint8)
+    trimesh.PointCloud(points, colors=colors).export(tmp_path / "cloud.ply")
+    result = first_points(flat(), "file", file=tmp_path / "cloud.ply")
+    assert result.kind == "file"
+    assert result.points.dtype == result.colors.dtype == torch.float32
+    np.testing.assert_array_equal(result.points.numpy(), points)
+    np.testing.assert_allclose(result.colors.numpy(), colors[:, :3] / 255, atol=1e-6)
+
+
+def test_file_without_colors_is_grey(tmp_path: Path) -> None:
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
+    for name in ("cloud.ply", "mesh.obj"):
+        result = first_points(flat(), "file", file=tmp_path / name)
+        assert result.points.shape == (3, 3)
+        assert torch.equal(result.colors, torch.full((3, 3), 0.5))
+
+
+@pytest.mark.parametrize("content", [None, b"", b"ply\nformat ascii 1.0\nelement vertex 2\n", b"garbage"])
+def test_broken_file(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "cloud.ply"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=r"cloud\.ply"):
+        first_points(flat(), "file", file=path)
+
+
+def test_file_with_a_point_that_is_not_finite(tmp_path: Path) -> None:
+    trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
+    with pytest.raises(DataError, match="finite"):
+        first_points(flat(), "file", file=tmp_path / "cloud.ply")
+
+
+ENDINGS = (".zip", ".ply.gz", ".gz", ".tar.gz", ".ply")
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]]:
+    """Gigabytes in small files, read in one process: the memory it took up to each of them, and what was said."""
+    header = "ply\nformat ascii 1.0\nelement vertex 8000000\n" + "".join(f"property float {x}\n" for x in "xyz")
+    cloud = f"{header}end_header\n".encode() + b"0 0 0\n" * 8_000_000
+    folder, archive = tmp_path_factory.mktemp("packed"), gzip.compress(cloud)
+    for ending in ENDINGS:
+        if ending == ".zip":
+            with zipfile.ZipFile(folder / "cloud.zip", "w", zipfile.ZIP_DEFLATED) as file:
+                file.writestr("cloud.ply", cloud)
+        else:
+            (folder / f"cloud{ending}").write_bytes(archive)
+    code = (
+        "import json, sys, kgs\nfrom kgs.machine import peak_rss_mb\n"
+        "from kgs.init_points.files import read_points\nfrom pathlib import Path\nbefore = peak_rss_mb()\n"
+        "for path in sys.argv[1:]:\n    try:\n        read_points(Path(path))\n"
+        "    except kgs.DataError as error:\n"
+        "        print(json.dumps([path, peak_rss_mb() - before, str(error)]))"
+    )
+    paths = [str(folder / f"cloud{ending}") for ending in ENDINGS]
+    done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, timeout=100, check=True)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    return {path.removeprefix(str(folder / "cloud")): (memory, said) for path, memory, said in rows}
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_packed_file_is_refused_before_it_is_unpacked(ending: str, packed: dict[str, tuple[int, str]]) -> None:
+    """A few hundred kilobytes can hold gigabytes; whatever the file is called, its memory is bounded."""
+    memory, said = packed[ending]
+    assert memory < 16  # the cloud has 46
+    assert "unpack it first" in said
+
+
+def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points, colors = torch.randn(40, 3, generator=generator), torch.rand(40, 3, generator=generator)
+    kgs.save_ply(tmp_path / "splat.ply", kgs.GaussianModel.from_points(points, colors, sh_degree=2))
+    found = first_points(flat(), "file", file=tmp_path / "splat.ply")
+    assert torch.equal(found.points, points)
+    assert torch.allclose(found.colors, colors, atol=1e-6)
+
+
+def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
+    """At UTM coordinates a float32 is a quarter of a metre."""
+    local = np.random.default_rng(0).normal(size=(20, 3)).round(3)
+    origin = np.array([432_100.25, 5_400_000.5, 120.0])
+    rows = "\n".join(" ".join(f"{x:.4f}" for x in row) for row in local + origin)
+    (tmp_path / "cloud.xyz").write_text(rows)
+    found = first_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
+    np.testing.assert_allclose(found.points.numpy(), local, atol=1e-5)
+
+
+def test_a_file_whose_vertices_have_another_name_has_no_points(tmp_path: Path) -> None:
+    """Colours of no points are no table, which was an IndexError."""
+    content = trimesh.PointCloud(np.ones((5, 3)), colors=np.full((5, 4), 200, np.uint8)).export(file_type="ply")
+    (tmp_path / "cloud.ply").write_bytes(content.replace(b"element vertex", b"element vertey"))
+    with pytest.raises(DataError, match=r"vertices: expected finite points, at least one, got 0"):
+        first_points(flat(), "file", file=tmp_path / "cloud.ply")
+
+
+def test_a_text_is_bounded_before_it_is_read(tmp_path: Path) -> None:
+    """What reads text takes some 75 times its size; binary files of the same size are read."""
+    header = (
+        "ply\nformat {} 1.0\nelement vertex {}\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
+    )
+    count = 2**26 // 12 + 1
+    starts = {
+        "ascii.ply": header.format("ascii", count),
+        "comment.ply": header.format("ascii", count).replace("element", "comment format binary\nelement"),
+        "cloud.xyz": "0 0 0\n" * 2000,
+        "binary.ply": header.format("binary_little_endian", count),
+    }
+    for name, start in starts.items():
+        with open(tmp_path / name, "wb") as file:
+            file.write(start.encode())
+            file.truncate(len(start) + 12 * count)
+    for name in ("ascii.ply", "comment.ply", "cloud.xyz"):
+        with pytest.raises(DataError, match=rf"{name}: is larger than 64 MiB, the most for a text file"):
+            first_points(flat(), "file", file=tmp_path / name)
+    assert len(first_points(flat(), "file", file=tmp_path / "binary.ply").points) == count
