@@ -19,7 +19,7 @@ from kgs.fit.saved import load_fit
 from kgs.init_points import FirstPoints
 from kgs.metrics.evaluate import in_words
 from kgs.metrics.lpips import Lpips
-from kgs.page.fit_page import refresh_page, spread
+from kgs.page.fit_page import refresh_page, spread, write_own_page
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
 REQUEST = {"train_views": 3, "downscale": None, "background": "black"}
@@ -42,7 +42,7 @@ def fitted(tmp_path_factory: Any) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "choose_points", lambda *_: FirstPoints(points, torch.full((150, 3), 0.5), "random"))
         request = REQUEST | {"scene": "/photos/mine/room"}
-        run.fit_scene(scene, CONFIG, out, request=request, say=lambda line: None)
+        run.fit_scene(scene, CONFIG, out, request=request, before_publish=write_own_page, say=lambda line: None)
     return out, scene
 
 
@@ -143,7 +143,8 @@ class Half:
 def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     config = replace(CONFIG, init="random", init_points=50)
     request = REQUEST | {"scene": str(folder)}
-    run.fit_scene(load_scene(folder, 3), config, tmp_path, request=request, say=lambda line: None)
+    scene = load_scene(folder, 3)
+    run.fit_scene(scene, config, tmp_path, request=request, before_publish=write_own_page, say=lambda line: None)
     before = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     monkeypatch.setattr(Lpips, "load", lambda weights: Half())
     evaluate(tmp_path, lpips_weights=tmp_path)

@@ -179,7 +179,7 @@ def test_typical_depths_are_the_first_percentile_and_the_median() -> None:
     points[:, 2] = torch.arange(2.0, 103.0)
     assert typical_depths(points[torch.randperm(101)], views.cameras) == pytest.approx((3.0, 52.0), rel=1e-6)
     behind_and_beside = torch.tensor([[0.0, 0.0, -5.0], [50.0, 0.0, 0.001]]).repeat(50, 1)
-    assert typical_depths(views, torch.cat([points, behind_and_beside])) == pytest.approx((3.0, 52.0), rel=1e-6)
+    assert typical_depths(torch.cat([points, behind_and_beside]), views.cameras) == pytest.approx((3.0, 52.0), rel=1e-6)
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -1.0]])])

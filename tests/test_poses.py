@@ -16,6 +16,7 @@ from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
 from kgs.fit.saved import load_fit
 from kgs.geometry import camera_centers
+from kgs.page.fit_page import write_own_page
 
 CONFIG = FitConfig(steps=6, seed=5, init="random", init_points=200, sh_degree=0, evaluations=1, refine_poses=True)
 
@@ -147,7 +148,13 @@ def test_files_are_about_the_moved_cameras(tmp_path):
     write_llff(tmp_path / "scene")
     request = {"scene": str(tmp_path / "scene"), "train_views": None, "downscale": None, "background": "black"}
     scene = load_scene(tmp_path / "scene")
-    metrics, _ = fit_scene(scene, CONFIG, tmp_path / "out", request=request | {"points": "none", "hold_out": None})
+    metrics, _ = fit_scene(
+        scene,
+        CONFIG,
+        tmp_path / "out",
+        request=request | {"points": "none", "hold_out": None},
+        before_publish=write_own_page,
+    )
     saved = load_fit(tmp_path / "out")
     given, moved = scene.train.cameras.extrinsics, saved.placed(scene).train.cameras.extrinsics
     assert 0 < metrics["poses"]["degrees"] <= metrics["poses"]["most_degrees"]

@@ -15,8 +15,9 @@ from kgs.datasets import synthetic_scene
 from kgs.fit import FirstPoints, FitConfig, Trainer
 from kgs.fit import probes as needs
 from kgs.fit.probes import decide
-from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, slim
+from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
 from kgs.fit.run import choose_points
+from kgs.fit.trainer import Start
 from kgs.reference import render
 
 OPEN = FitConfig(steps=400, init="random", init_points=300)
@@ -134,10 +135,9 @@ def test_the_same_seed_decides_the_same(eight):
 def trained(scene, model, **changes):
     """A trainer whose Gaussians are these."""
     points = FirstPoints(torch.rand(8, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(8, 3), "file")
-    trainer = Trainer(scene, FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes), points)
-    trainer.near_plane = 0.01
-    trainer._build(model)
-    return trainer
+    config = FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes)
+    start = replace(Start.from_points(scene, config, points), model=model, near_plane=0.01)
+    return Trainer(scene, config, start)
 
 
 def in_front(scene, n, sh_degree=0):
@@ -176,7 +176,7 @@ def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scen
     trainer = trained(scene, in_front(scene, 40))
     before = [trainer.render(scene.train.camera(i)) for i in range(3)]
     levels = [trainer.psnr(scene.train.select([i])) for i in range(3)]
-    slim(trainer)
+    prune(trainer)
     found = trainer.needs["gaussians"]
     assert found["fitted"] == 40 == len(trainer.model)
     assert found["kept"] == len(trainer.shown) < 40
@@ -188,7 +188,7 @@ def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scen
 
 def test_keep_all_keeps_all(scene):
     trainer = trained(scene, in_front(scene, 10), keep_all=True)
-    slim(trainer)
+    prune(trainer)
     assert trainer.shown is trainer.model
     assert "gaussians" not in trainer.needs
 
@@ -202,7 +202,7 @@ def test_harmonics_that_no_picture_shows_are_left_out(scene, size, degree):
     trainer = trained(scene, model)
     trainer.model.sh_degree = 3
     before = trainer.render(scene.train.camera(0))
-    slim(trainer)
+    prune(trainer)
     assert trainer.shown.max_sh_degree == trainer.needs["gaussians"]["sh_degree"] == degree
     assert float((trainer.render(scene.train.camera(0)) - before).abs().max()) <= QUANTUM + 0.02
 
@@ -218,13 +218,13 @@ def test_harmonics_without_which_a_view_is_worse_stay(scene):
     noise = 1e-4 * torch.rand(renders.shape, generator=torch.Generator().manual_seed(0))
     trainer = trained(replace(scene, train=replace(scene.train, images=renders + noise)), model)
     trainer.model.sh_degree = 1
-    slim(trainer)
+    prune(trainer)
     assert trainer.needs["gaussians"]["sh_degree"] == 1
 
 
 def test_the_next_step_has_all_gaussians_again(scene):
     trainer = trained(scene, in_front(scene, 40))
-    slim(trainer)
+    prune(trainer)
     trainer.train_step()
     assert trainer.shown is trainer.model
     assert len(trainer.model) == 40

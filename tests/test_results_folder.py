@@ -117,9 +117,7 @@ def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkey
     assert "unfinished" not in os.listdir(done)
 
 
-@pytest.mark.parametrize(
-    "failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json", "write_own_page"]
-)
+@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json"])
 def test_results_that_cannot_be_written_leave_the_old_ones(
     scene: Any, done: Path, monkeypatch: Any, failing: str
 ) -> None:

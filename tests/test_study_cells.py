@@ -138,7 +138,7 @@ def test_only_the_built_in_scene_is_shown(folder):
 def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
     begun = []
 
-    def trainer(scene, config, first):
+    def trainer(scene, config, first, needs):
         begun.append((config.drop, first.points))
         raise InterruptedError  # nothing else of the cell is wanted
 

@@ -21,6 +21,7 @@ from kgs.geometry import camera_extent
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
 from kgs.losses import photometric_loss, target_moments
+from kgs.page.fit_page import write_own_page
 
 UPRIGHT = torch.eye(3)
 SCENE = synthetic_scene(train_views=2, test_views=1, size=(16, 16))
@@ -132,7 +133,7 @@ def test_paths_may_be_text(tmp_path):
     assert Trainer.resume(SCENE, CONFIG, str(tmp_path / "c.safetensors")).step == 1
     render = lambda camera: torch.zeros(1, 3, int(camera.height), int(camera.width))  # noqa: E731
     assert write_film(str(tmp_path / "a.webm"), render, SCENE.train, 1.0) == "" or not (tmp_path / "a.webm").exists()
-    metrics, _ = fit_scene(SCENE, CONFIG, str(tmp_path / "out"))
+    metrics, _ = fit_scene(SCENE, CONFIG, str(tmp_path / "out"), before_publish=write_own_page)
     assert metrics["steps"] == 2
     assert (tmp_path / "out" / "index.html").exists()
 

@@ -24,11 +24,16 @@ if TYPE_CHECKING:
 
 __all__ = ["FirstPoints", "FitConfig", "Trainer", "first_points", "fit_scene"]
 
-_HOMES = {"FirstPoints": "starts", "Trainer": "trainer", "first_points": "starts", "fit_scene": "run"}
+_HOMES = {
+    "FirstPoints": "kgs.init_points",
+    "Trainer": "kgs.fit.trainer",
+    "first_points": "kgs.init_points",
+    "fit_scene": "kgs.fit.run",
+}
 
 
 def __getattr__(name: str) -> Any:
     """The other names are loaded when they are asked for: they bring OpenCV and trimesh with them."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    return getattr(import_module(_HOMES[name]), name)

@@ -124,14 +124,18 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
     return {"training": of(scene.train), "test": of(scene.test), "background": _digest(scene.background)}
 
 
-def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
-    """A KeyError, TypeError or ValueError unless a state is whole and of this fingerprint and configuration.
-
-    Returns what the user should know where the fit goes on for more steps than it was begun with.
-    """
+def check_plain_values(state: dict[str, Any]) -> None:
+    """A KeyError, TypeError or ValueError unless a state has all of its plain values, each in its range."""
     for name, (expected, is_right) in PLAIN.items():
         if not is_right(state[name]):
             raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
+
+
+def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
+    """A KeyError, TypeError or ValueError unless a state is of this fingerprint and configuration.
+
+    Returns what the user should know where the fit goes on for more steps than it was begun with.
+    """
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
     asked["minutes"] = config.minutes or state["config"].get("minutes")  # unless given, the steps say it

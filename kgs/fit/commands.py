@@ -111,6 +111,7 @@ def fit(
     from kgs.machine import check_tools
     from kgs.metrics.evaluate import in_words
     from kgs.metrics.lpips import Lpips
+    from kgs.page.fit_page import write_own_page
 
     from .minutes import expected_minutes
     from .photos.entry import add_estimate, find_scene, is_bare, settle
@@ -138,7 +139,8 @@ def fit(
     minutes = expected_minutes(width * height, config)
     if minutes > 2 and config.device == "cpu" and config.minutes is None:
         say(f"expect about {minutes:.0f} minutes on a CPU; see --fast, --minutes, --downscale")
-    metrics, stopped_by = fit_scene(loaded, config, out, resume=resume, lpips=lpips, request=request)
+    options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
+    metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)
     kept = bool(stopped_by) and is_finished(out)  # the former fit
     if bare and not kept:
         settle(out)

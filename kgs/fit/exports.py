@@ -19,4 +19,4 @@ def write_exports(trainer: Trainer, folder: Path) -> None:
     save_glb(folder / "splat.glb", model, upright(scene.train.cameras.extrinsics), scene.offset)
     depth = typical_depths(model.means, scene.train.cameras)[1]
     if note := write_film(folder / "turntable.webm", trainer.render, scene.train, depth, each):
-        trainer.notes.append(note)
+        trainer.note(note)

@@ -19,14 +19,14 @@ WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)  # pixels that a Gaussian 
 QUANTUM = 0.5 / 255  # what an 8-bit picture does not show
 
 
-def slim(trainer: Trainer) -> None:
+def prune(trainer: Trainer) -> None:
     """Show only what the training views need; the fit itself keeps everything. Nothing is done with `keep_all`.
 
     Of the limits in `WEIGHTS` the highest is taken that changes the PSNR of no training view by more than `TOLERANCE`,
     and of the degrees of harmonics the lowest of which that holds too, and that changes no value of the pictures by
     more than `QUANTUM`.
 
-    `trainer.needs` gets "gaussians": how many were "fitted" and are "kept", the limit "weight", and "sh_degree".
+    It records "gaussians" in `trainer.needs`: how many were "fitted" and "kept", the limit "weight", and "sh_degree".
     """
     if trainer.config.keep_all:
         return
@@ -48,7 +48,7 @@ def slim(trainer: Trainer) -> None:
         if same and _is_close(_levels(trainer), levels):
             break
     found = {"fitted": len(model), "kept": len(trainer.shown), "weight": limit, "sh_degree": degree}
-    trainer.needs["gaussians"] = found
+    trainer.record("gaussians", found)
 
 
 def _is_close(levels: list[float], others: list[float]) -> bool:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
@@ -21,17 +21,16 @@ from kgs.io.outputs import check_folder, is_own, png_names, start_folder, write_
 from kgs.io.ply import save_ply
 from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
 from kgs.machine import bytes_of, check_tools, peak_rss_mb, versions
-from kgs.metrics.coverage import measure_seen
+from kgs.metrics.coverage import measure_coverage
 from kgs.metrics.evaluate import evaluate
 from kgs.metrics.lpips import Lpips
-from kgs.page.fit_page import PAGE, write_own_page
 
 from .checkpoint import previous, save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
 from .minutes import steps_within
 from .probes import decide
-from .prune import slim
+from .prune import prune
 from .trainer import Trainer
 
 _SAVE_SECONDS = 60.0
@@ -48,6 +47,16 @@ _CONVENTIONS = {
 }
 
 
+class Finished(NamedTuple):
+    """A fit whose results are written, but do not yet replace those of a former fit."""
+
+    folder: Path  # where the new results are
+    out: Path  # where they go
+    trainer: Trainer
+    metrics: dict[str, Any]  # what metrics.json holds
+    settings: dict[str, Any]  # what config.json holds
+
+
 def fit_scene(
     scene: Scene,
     config: FitConfig,
@@ -56,9 +65,10 @@ def fit_scene(
     resume: bool = False,
     lpips: Lpips | None = None,
     request: dict[str, Any] | None = None,
+    before_publish: "Callable[[Finished], None] | None" = None,
     say: Callable[[str], None] = say,
 ) -> tuple[dict[str, Any], int]:
-    """Fit a scene and write what `kgs fit` leaves: page, splat, film, measures, test pictures and checkpoints.
+    """Fit a scene and write what `kgs fit` leaves but the page: splat, film, measures, test images and checkpoints.
 
     Results in the folder stay whole until all new ones are there, in `unfinished`. A fit that a signal stopped writes
     its results too, but leaves those of a finished one in their place.
@@ -71,6 +81,8 @@ def fit_scene(
         lpips: the perceptual metric, or None to leave it out.
         request: the arguments of `load_scene` by their names, "scene" for its path; without them `kgs eval` refuses the
             folder.
+        before_publish: called with the finished fit when all other files are written, and before they replace those
+            of a former fit; `kgs.page.fit_page.write_own_page` writes the page there, as `kgs fit` does.
         say: where lines for the user go.
 
     Returns:
@@ -113,8 +125,7 @@ def fit_scene(
             if config.minutes is not None:
                 config = replace(config, steps=steps_within(scene, config, points, begun))
                 say(f"{config.minutes:g} minutes: {config.steps} steps")
-            trainer = Trainer(scene, config, points)
-            trainer.needs |= needs
+            trainer = Trainer(scene, config, points, needs)
             say(f"memory: at most {most_bytes(trainer) / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
@@ -136,14 +147,14 @@ def fit_scene(
                 write_png(new / "test" / names[name], scene.test.as_photo(render))
             metrics = measure(trainer, lpips)
             write_json(new / "metrics.json", metrics)
-            fitted = trainer.shown, trainer.near_plane, trainer.render
-            write_own_page(new / PAGE, out, trainer.scene, *fitted, metrics, settings)
+            if before_publish is not None:
+                before_publish(Finished(new, out, trainer, metrics, settings))
         except BaseException:
             if not trainer.saved:  # nothing was trained
                 shutil.rmtree(new, ignore_errors=True)
             raise
         if stopped_by and is_finished(out):
-            trainer.notes.append(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
+            trainer.note(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
         else:
             publish(out)
         for note in trainer.notes[told:]:
@@ -181,7 +192,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     return {
         "test": evaluate(trainer.render, scene.test, lpips) if len(scene.test) else None,
         "train": evaluate(trainer.render, scene.train, lpips),
-        "seen": measure_seen(trainer),
+        "seen": measure_coverage(scene, trainer.render, trainer.median_depth),
         "curve": trainer.curve,
         "seconds": round(trainer.seconds, 2),
         "peak_rss_mb": peak_rss_mb() or None,
@@ -219,7 +230,7 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
-    """Train to the end with a progress line and checkpoints, each minute and at evaluations; then :func:`slim` it.
+    """Train to the end with a progress line and checkpoints, each minute and at evaluations; then :func:`prune` it.
 
     On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved, and the signal's number returned, else 0. Where a
     checkpoint cannot be written (a full disk) a note says so, and the next one is tried.
@@ -233,7 +244,7 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
             try:
                 trainer.save(checkpoint)
             except OSError as error:
-                trainer.notes.append(f"step {trainer.step}: no checkpoint: {error}")
+                trainer.note(f"step {trainer.step}: no checkpoint: {error}")
 
     with _interruptible() as stopped, progress(trainer.config.steps, title, trainer.step) as advance:
 
@@ -244,7 +255,7 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
             return bool(stopped)
 
         trainer.fit(after_step)
-        slim(trainer)
+        prune(trainer)
         save()
     return stopped[0] if stopped else 0
 

@@ -6,8 +6,9 @@ in one order.
 
 import copy
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Self
@@ -30,14 +31,69 @@ from kgs.model import PARAMETERS, GaussianModel
 from kgs.renderer import GaussianRenderer
 from kgs.types import check_kind
 
-from .checkpoint import PLAIN, check_state, fingerprint, load_moments, moments_of, newest_checkpoint, save_checkpoint
+from .checkpoint import (
+    PLAIN,
+    check_plain_values,
+    check_state,
+    fingerprint,
+    load_moments,
+    moments_of,
+    newest_checkpoint,
+    save_checkpoint,
+)
 from .config import CHOICES, FitConfig, most_gaussians, timetable
 from .divergence import gradient_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
 from .scores import SelectiveDrop, gaussian_scores
 from .targets import targets
 
-_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))  # of learning
+# learning rates of the recipe: `lr_means` is that of the parameter `means`
+_LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a fit begins with.
+
+    Args:
+        model: the Gaussians.
+        init: kind and number of the initial points.
+        extent: of the camera rig, in world units; the learning rate of the centres is proportional to it.
+        near_plane: of the renderer, in world units.
+        depth: the median depth of the initial points, in world units.
+    """
+
+    model: GaussianModel
+    init: dict[str, Any]
+    extent: float
+    near_plane: float
+    depth: float
+
+    @classmethod
+    def from_points(cls, scene: Scene, config: FitConfig, points: FirstPoints) -> Self:
+        """Gaussians at the initial points; a TypeError where these are something else."""
+        check_kind("points", points, FirstPoints)
+        nearest, median = typical_depths(points.points, scene.train.cameras)
+        model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)
+        model.sh_degree = 0
+        return cls(
+            model,
+            init={"kind": points.kind, "points": len(points.points)},
+            extent=max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median),  # also of a single camera
+            near_plane=config.recipe.near_plane * nearest,
+            depth=median,
+        )
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any], config: FitConfig) -> Self:
+        """The Gaussians of :meth:`Trainer.state_dict`; a ValueError where the state is not whole."""
+        with _state_errors():
+            check_plain_values(state)
+            model = GaussianModel(**copy.deepcopy(state["model"]))
+            if model.max_sh_degree != (config.sh_degree or 0) or model.means.dtype != torch.float32:
+                raise ValueError(f"model: expected float32 and harmonics of degree {config.sh_degree}, got others")
+            depth = 1.0 if state["poses"] is None else float(state["poses"]["depth"])
+            return cls(model, copy.deepcopy(state["init"]), state["extent"], state["near_plane"], depth)
 
 
 class Trainer:
@@ -46,7 +102,8 @@ class Trainer:
     Args:
         scene: posed training and test views, of at least 6x6 pixels, 12x12 with `coarse`.
         config: steps, drop rate, seed and all other numbers, see :class:`FitConfig` for those that do nothing here.
-        points: where the Gaussians begin, at least 4.
+        points: the initial points, at least 4; or a `Start`, as `resume` makes of a checkpoint.
+        needs: what was decided about the scene before the fit, see `needs` below.
 
     Raises:
         TypeError: `scene` or `points` is of another kind.
@@ -67,51 +124,63 @@ class Trainer:
         poses: the training cameras, where the fit moves them; `scene` has them where they are now.
     """
 
-    def __init__(self, scene: Scene, config: FitConfig, points: FirstPoints) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: FitConfig,
+        points: FirstPoints | Start,
+        needs: dict[str, Any] | None = None,
+    ) -> None:
         check_kind("scene", scene, Scene)
-        check_kind("points", points, FirstPoints)
-        self._prepare(scene, config)
-        nearest, median = typical_depths(points.points, scene.train.cameras)
-        self.extent = max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median)  # of a rig without one, too
-        self.init: dict[str, Any] = {"kind": points.kind, "points": len(points.points)}
-        model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)
-        model.sh_degree = 0
-        self.near_plane = config.recipe.near_plane * nearest
-        if self.poses is not None:
-            self.poses.depth = median
-        self._build(model)
-
-    def _prepare(self, scene: Scene, config: FitConfig) -> None:
-        """All that follows from the scene and the configuration alone."""
-        self.scene, self.config, self.device = scene, config, check_device(config.device)
+        self.scene = scene
+        self.config = config
+        self.device = check_device(config.device)
         self.backend = resolve(config.backend, self.device)
         self.times = timetable(config)
-        self.step, self.seconds, self.saved = 0, 0.0, ""
+        self.step = 0
+        self.seconds = 0.0
+        self.saved = ""
         self.curve: list[dict[str, float | None]] = []
-        self.notes, self.needs, self.stack = list[str](), dict[str, Any](), list[int]()
+        self.notes: list[str] = []
+        self.needs = dict(needs or {})
+        self.stack: list[int] = []
         self._fingerprint = fingerprint(scene)
-        self.poses = MovingPoses(scene.train.cameras.extrinsics, config.steps) if config.refine_poses else None
         self._background = scene.background.to(self.device, torch.float32) if scene.background.any() else None
         self._views = targets(scene.train, scene.background, self.device)
         self._halved = targets(scene.train.halved(), scene.background, self.device) if self.times.coarse else []
+        self.poses = MovingPoses(scene.train.cameras.extrinsics, config.steps) if config.refine_poses else None
+        self._build(points if isinstance(points, Start) else Start.from_points(scene, config, points))
 
-    def _build(self, model: GaussianModel) -> None:
+    def _build(self, start: Start) -> None:
+        """The model, and everything that refers to its parameters."""
         config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
-        self.max_gaussians = most_gaussians(config, int(self.init["points"]))
-        self.model = self.shown = model.to(self.device)
+        self.init, self.extent, self.near_plane = start.init, start.extent, start.near_plane
+        self.max_gaussians = most_gaussians(config, start.init["points"])
+        self.model = self.shown = start.model.to(self.device)
         self._part: dict[str, Any] = {}
         groups = [
             {"params": [self.model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
-            for name, rate in _RATES.items()
+            for name, rate in _LEARNING_RATES.items()
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
         self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=seed + 1) if config.drop else None
-        near, most = self.near_plane, config.max_bytes
-        self.renderer = GaussianRenderer(self.drop, near_plane=near, max_bytes=most, backend=self.backend).train()
-        limits = {name: getattr(recipe, name) for name in ("grad_threshold", "percent_dense", "prune_opacity")}
-        limits |= {"max_gaussians": self.max_gaussians, "generator": torch.Generator().manual_seed(seed + 2)}
-        self.densifier = Densifier(self.model, self.optimizer, self.extent, **limits)
-        self.order, self.colors = (torch.Generator().manual_seed(seed + stream) for stream in (3, 4))
+        self.renderer = GaussianRenderer(
+            self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes, backend=self.backend
+        ).train()
+        self.densifier = Densifier(
+            self.model,
+            self.optimizer,
+            self.extent,
+            grad_threshold=recipe.grad_threshold,
+            percent_dense=recipe.percent_dense,
+            prune_opacity=recipe.prune_opacity,
+            max_gaussians=self.max_gaussians,
+            generator=torch.Generator().manual_seed(seed + 2),
+        )
+        self.order = torch.Generator().manual_seed(seed + 3)
+        self.colors = torch.Generator().manual_seed(seed + 4)
+        if self.poses is not None:
+            self.poses.depth = start.depth
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
@@ -146,13 +215,22 @@ class Trainer:
             first, most, growing = self.init["points"], self.max_gaussians, self.config.growth * self.config.steps
             share = min(1.0, step / growing) if growing else 1.0
             self.densifier.max_gaussians = first + round(share * (most - first))
-            little = f"--max-gaussians {most} leaves little room beside the {first} first points"
-            if self.densifier.step().capped and share == 1.0 and most < 1.25 * first and little not in self.notes:
-                self.notes.append(little)
+            capped = self.densifier.step().capped
+            if capped and share == 1.0 and most < 1.25 * first:
+                self.note(f"--max-gaussians {most} leaves little room beside the {first} first points")
         if step in self.times.reset:
             self.densifier.reset_opacity(self.config.recipe.reset_opacity)
         self.seconds += time.perf_counter() - start
         return loss
+
+    def note(self, text: str) -> None:
+        """Add a line that a user should read to `notes`, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def record(self, name: str, found: dict[str, Any]) -> None:
+        """Add to `needs` what was found out about the scene, for metrics.json."""
+        self.needs[name] = found
 
     def show(self, rows: Tensor, sh_degree: int) -> None:
         """Draw and measure only the Gaussians at `rows`, bool `(N,)`, until the next step; the fit keeps all."""
@@ -165,6 +243,15 @@ class Trainer:
             image: Tensor = self.renderer(self.shown(), move_camera(camera, self.device), self._background).image
         self.renderer.train()
         return image
+
+    def median_depth(self, camera: PinholeCamera) -> Tensor:
+        """The median depth of what is shown from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
+        self.renderer.eval()
+        with torch.no_grad():
+            out = self.renderer(self.shown(), move_camera(camera, self.device), outputs=("median_depth",))
+        self.renderer.train()
+        depth: Tensor = out.median_depth[0, 0].cpu()
+        return depth
 
     def psnr(self, views: Views) -> float | None:
         """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
@@ -189,15 +276,17 @@ class Trainer:
             ValueError: they are others, or an entry is missing or wrong; the message begins with its name. The trainer
                 cannot be used any more.
         """
-        try:
+        with _state_errors():
+            start = Start.from_state(state, self.config)
             longer = check_state(state, self._fingerprint, self.config)
-            vars(self).update(copy.deepcopy({name: state[name] for name in PLAIN}))
-            self.backend = resolve(self.backend if self.device.type == "cpu" else "auto", self.device)
-            self.notes += longer
-            model = GaussianModel(**state["model"])
-            if model.max_sh_degree != (self.config.sh_degree or 0) or model.means.dtype != torch.float32:
-                raise ValueError(f"model: expected float32 and harmonics of degree {self.config.sh_degree}, got others")
-            self._build(model)
+            self.backend = resolve(state["backend"] if self.device.type == "cpu" else "auto", self.device)
+            self._build(start)
+            self.step = state["step"]
+            self.seconds = state["seconds"]
+            self.curve = copy.deepcopy(state["curve"])
+            self.notes = [*state["notes"], *longer]
+            self.needs = copy.deepcopy(state["needs"])
+            self.stack = list(state["stack"])
             load_moments(self.optimizer, copy.deepcopy(state["optimizer"]))
             self.densifier.load_state_dict(state["densifier"])
             self.order.set_state(state["order"])
@@ -208,10 +297,6 @@ class Trainer:
                 self.drop.set_rng_state(state["drop"])
             if self.poses is not None:
                 self.scene = self.poses.restore(self.scene, state["poses"])
-        except KeyError as error:
-            raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
-        except (AttributeError, RuntimeError, TypeError) as error:
-            raise ValueError(f"state: {error}") from error
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write :meth:`state_dict` to a file; OSError where it cannot be written, and earlier ones are untouched."""
@@ -226,13 +311,12 @@ class Trainer:
             DataError: both files are damaged, or they belong to another scene or configuration.
         """
         state, damage = newest_checkpoint(Path(path))
-        trainer = cls.__new__(cls)
         try:
-            if config.minutes is not None:
-                config = replace(config, steps=state["config"]["steps"])
             decided = {name: state["config"][name] for name in CHOICES if getattr(config, name) is None}
+            if config.minutes is not None:
+                decided["steps"] = state["config"]["steps"]
             config = replace(config, **decided)
-            trainer._prepare(scene, config)
+            trainer = cls(scene, config, Start.from_state(state, config))
             trainer.load_state_dict(state)
         except (KeyError, TypeError) as error:
             raise DataError(path, "config", "expected the configuration of a fit, got another") from error
@@ -241,7 +325,7 @@ class Trainer:
             raise DataError(path, field, reason) from error
         trainer.saved = f"{path} of step {trainer.step}"
         if damage:
-            trainer.notes.append(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
+            trainer.note(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         return trainer
 
     def _descend(self) -> float:
@@ -297,3 +381,14 @@ class Trainer:
         if not self.stack:
             self.stack = torch.randperm(len(self._views), generator=self.order).tolist()
         return self.stack.pop()
+
+
+@contextmanager
+def _state_errors() -> Iterator[None]:
+    """Every error of a state that is not whole as a ValueError that begins with the entry's name."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
+    except (AttributeError, RuntimeError, TypeError) as error:
+        raise ValueError(f"state: {error}") from error

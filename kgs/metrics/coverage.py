@@ -4,6 +4,7 @@ What only one training view shows has no measured depth, and what none shows is 
 """
 
 import math
+from collections.abc import Callable
 from statistics import fmean
 from typing import Any
 
@@ -11,53 +12,50 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.camera import move_camera
-from kgs.fit.trainer import Trainer
+from kgs.datasets.scene import Scene
 from kgs.geometry import nearest_pixels, project_points, unproject
+
+Draw = Callable[[PinholeCamera], Tensor]
 
 LEAST = 2  # training views that show a place
 BEHIND = 1.05  # times the depth that a training view has there: what is farther is hidden from it
 
 
 @torch.no_grad()
-def measure_seen(trainer: Trainer) -> dict[str, float | None] | None:
+def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str, float | None] | None:
     """PSNR of the test views apart, where at least `LEAST` training views show what the fit has there and elsewhere.
 
     Convention:
         A pixel's place is where the median depth of the fit puts it. A training view shows it if it lies in the
-        picture and no farther than `BEHIND` times the median depth of the fit there. Pixels without depth count as
+        image and no farther than `BEHIND` times the median depth of the fit there. Pixels without depth count as
         not shown.
+
+    Args:
+        scene: training and test views.
+        render: from a camera to its image `(1, 3, H, W)`.
+        median_depth: from a camera to its median depth `(H, W)` on the CPU, 0 where there is nothing.
 
     Returns:
         "share" of the test pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the
         views that have such pixels; None where there are none, or where the error is 0. None without test views.
     """
-    train, test = trainer.scene.train, trainer.scene.test
+    train, test = scene.train, scene.test
     if not len(test):
         return None
-    depths = [depth_map(trainer, train.camera(view)) for view in range(len(train))]
+    depths = [median_depth(train.camera(view)) for view in range(len(train))]
     levels: dict[str, list[float]] = {"psnr": [], "psnr_rest": []}
     shares = []
     for view in range(len(test)):
         camera = test.camera(view)
-        shown = _shown(depth_map(trainer, camera), camera, depths, train.cameras)
-        render = test.as_photo(trainer.render(camera)[0].cpu())
-        errors = (render - test.images[view].cpu().to(render)).square().mean(dim=0)
+        shown = _shown(median_depth(camera), camera, depths, train.cameras)
+        image = test.as_photo(render(camera)[0].cpu())
+        errors = (image - test.images[view].cpu().to(image)).square().mean(dim=0)
         shares.append(float(shown.float().mean()))
         for name, where in (("psnr", shown), ("psnr_rest", ~shown)):
             if where.any() and (error := float(errors[where].mean())) > 0:
                 levels[name].append(-10 * math.log10(error))
     means: dict[str, Any] = {name: round(fmean(values), 4) if values else None for name, values in levels.items()}
     return {"share": round(fmean(shares), 4), **means}
-
-
-def depth_map(trainer: Trainer, camera: PinholeCamera) -> Tensor:
-    """The median depth of what is shown, `(H, W)` on the CPU; 0 where there is nothing."""
-    trainer.renderer.eval()
-    out = trainer.renderer(trainer.shown(), move_camera(camera, trainer.device), outputs=("median_depth",))
-    trainer.renderer.train()
-    depth: Tensor = out.median_depth[0, 0].cpu()
-    return depth
 
 
 def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: PinholeCamera) -> Tensor:

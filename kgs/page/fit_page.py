@@ -14,6 +14,7 @@ from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
 from kgs.fit.prune import contributions, left_out
+from kgs.fit.run import Finished
 from kgs.fit.saved import SavedFit
 from kgs.io.console import each, say
 from kgs.io.json_files import read_json
@@ -97,7 +98,22 @@ def write_fit_page(
     )
 
 
-def write_own_page(
+def write_own_page(fit: Finished) -> None:
+    """Write the page of a fit into its folder, see `before_publish` of :func:`kgs.fit.fit_scene`."""
+    trainer = fit.trainer
+    _write_page_of(
+        fit.folder / PAGE,
+        fit.out,
+        trainer.scene,
+        trainer.shown,
+        trainer.near_plane,
+        trainer.render,
+        fit.metrics,
+        fit.settings,
+    )
+
+
+def _write_page_of(
     path: Path,
     out: Path,
     scene: Scene,
@@ -110,8 +126,8 @@ def write_own_page(
     """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
     request = settings["request"]
     title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
-    one: dict[str, Any] = {"settings": settings, "report": scene.root / CAMERAS_REPORT}
-    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **one)
+    report = scene.root / CAMERAS_REPORT
+    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, settings=settings, report=report)
 
 
 def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:
@@ -125,7 +141,7 @@ def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str,
         return saved.render(camera, scene.background)
 
     settings = read_json(out / "config.json")
-    write_own_page(path, out, saved.placed(scene), saved.model, saved.near_plane, render, metrics, settings)
+    _write_page_of(path, out, saved.placed(scene), saved.model, saved.near_plane, render, metrics, settings)
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:

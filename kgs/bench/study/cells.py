@@ -18,7 +18,7 @@ from kgs.errors import DataError
 from kgs.fit.config import CHOICES, PRESETS, FitConfig
 from kgs.fit.overfitting import coadaptation, count_over_threshold
 from kgs.fit.probes import decide
-from kgs.fit.prune import slim
+from kgs.fit.prune import prune
 from kgs.fit.run import choose_points, measure
 from kgs.fit.trainer import Trainer
 from kgs.init_points import FirstPoints
@@ -73,10 +73,9 @@ def fit_and_measure(
     start = time.process_time()
     decided, needs = decide(scene, probed or config, choose_points)
     config = replace(config, **{name: getattr(decided, name) for name in CHOICES})
-    trainer = Trainer(scene, config, points)
-    trainer.needs |= needs
+    trainer = Trainer(scene, config, points, needs)
     trainer.fit()
-    slim(trainer)
+    prune(trainer)
     stored: dict[str, Any] = {"cpu_seconds": round(time.process_time() - start, 2)}
     metrics = measure(trainer, lpips)
     stored |= {"curve": trainer.curve, "gaussians": len(trainer.shown), "needs": trainer.needs}

@@ -12,7 +12,6 @@ from kgs.datasets.scene import Views, pinholes
 from kgs.fit.trainer import Trainer
 from kgs.geometry import camera_matrices, unproject
 from kgs.init_points.tracks import detect
-from kgs.metrics.coverage import depth_map
 
 KEYPOINTS = 4000  # in each picture
 RATIO = 0.85  # of the distances to the nearest and the second nearest descriptor, both ways
@@ -38,7 +37,7 @@ def locate(trainer: Trainer, photos: Views) -> PinholeCamera | None:
             continue
         _, pairs = match_smnn(descriptors, known, RATIO)
         here, there = pairs.unbind(1)
-        depth = depth_map(trainer, train.camera(view))
+        depth = trainer.median_depth(train.camera(view))
         column, row = others[there].round().long().unbind(1)
         depths = depth[row.clamp(0, depth.shape[0] - 1), column.clamp(0, depth.shape[1] - 1)].double()
         found = depths > 0
