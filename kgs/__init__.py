@@ -13,10 +13,9 @@ from .errors import DataError, TrainingDiverged
 from .geometry import camera_extent
 from .io.ply import load_ply, save_ply
 from .model import GaussianModel
-from .projection import project
-from .raster import composite
 from .rasterization import rasterization
 from .renderer import GaussianRenderer
+from .stages import composite, project
 from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering
 
 __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization", "project", "composite"]

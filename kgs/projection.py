@@ -11,66 +11,19 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from .backends import choose, compiled_covers, register
-from .camera import Cameras, Lens, image_size, intrinsics, lenses
+from .camera import Cameras, Lens, lenses
 from .covariance import footprint_factors, rotation_matrices, variances
 from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
-from .types import Gaussians, ProjectedGaussians, RasterOptions, check_kind, check_tensor
+from .types import Gaussians, ProjectedGaussians, RasterOptions
 
 Touches = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-
-
-def project(  # noqa: D417 - options are described in one place
-    gaussians: Gaussians,
-    cameras: Cameras,
-    *,
-    near_plane: float = RasterOptions.near_plane,
-    eps2d: float = RasterOptions.eps2d,
-    alpha_threshold: float = RasterOptions.alpha_threshold,
-    colors: bool = True,
-    backend: str = "auto",
-) -> ProjectedGaussians:
-    """Project Gaussians into every camera of a batch.
-
-    Differentiable once, by `backward`, with respect to all Gaussian parameters, extrinsics and intrinsics. For
-    near_plane, eps2d and alpha_threshold (with 0 all in front of the camera are seen) see :class:`kgs.RasterOptions`.
-
-    Convention:
-        World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
-
-    Args:
-        gaussians: N Gaussians.
-        cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        colors: whether colours are wanted.
-        backend: "auto", or the name of one, see `kgs.backends`.
-
-    Returns:
-        The visible pairs (camera, Gaussian): those that would touch the image if their opacity were 2, or the largest
-        of all if that is more. (The opacity of each is left aside, so that a dropped Gaussian counts as seen.)
-
-    Raises:
-        TypeError: no Gaussians, or cameras of another kind, dtype or device.
-        ValueError: an option is out of range, cameras of different image sizes, or opacities `(C, N)` for another
-            number of cameras.
-    """
-    options = RasterOptions(near_plane=near_plane, eps2d=eps2d, alpha_threshold=alpha_threshold)
-    check_kind("gaussians", gaussians, Gaussians)
-    size = image_size(cameras)
-    for matrix in (cameras.extrinsics, intrinsics(cameras)):
-        check_tensor("cameras", matrix, gaussians.means, " as the Gaussians")
-    shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
-    if shape[:-1] not in ((), (count,)):
-        raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
-    run = choose("projection", backend, gaussians, cameras, size, options, colors)
-    projected: ProjectedGaussians = run(gaussians, cameras, size, options, colors)
-    return projected
 
 
 def project_torch(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
-    """`project` in torch, for every camera, device and dtype; trusts its arguments."""
+    """`kgs.project` in torch, for every camera, device and dtype; trusts its arguments."""
     device, views, finite = gaussians.means.device, lenses(cameras), finite_gaussians(gaussians)
     reach = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
     touches, near = partial(_touches_image, size, options.eps2d, reach), options.near_plane
@@ -82,12 +35,6 @@ def project_torch(
     ids, means2d, factors, depths, radii, opacities, rgb = joined
     tensors = (camera_ids, ids, means2d, factors, depths, radii, opacities, rgb)
     return ProjectedGaussians(*tensors, size, len(parts), len(gaussians), (~finite).sum(), options.eps2d)
-
-
-register("projection", "torch", project_torch)
-register(
-    "projection", "numba", "kgs.projection_compiled:project_compiled", lambda scene, *_: compiled_covers(scene.means)
-)
 
 
 def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:

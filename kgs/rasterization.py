@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from .camera import cameras
-from .projection import project
-from .raster import composite
 from .renderer import blend
+from .stages import composite, project
 from .types import SH_SIZES, Gaussians, RasterOptions, check_tensor
 
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -37,7 +36,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     eps2d: float = RasterOptions.eps2d,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = RasterOptions.tile_size,
+    tile_size: int | None = RasterOptions.tile_size,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
@@ -123,8 +122,8 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     image, own = "RGB" in render_mode, sh_degree is None and colors.ndim == 3
     every = colors.transpose(0, 1).flatten(1) if own else colors  # one that is not finite in some camera is in none
     gaussians = Gaussians(means, quats, scales, opacities, every)
-    rules: dict[str, Any] = {"alpha_threshold": alpha_threshold, "backend": backend}
-    projected = project(gaussians, posed, near_plane=near_plane, eps2d=eps2d, colors=image and not own, **rules)
+    options = RasterOptions(tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes)
+    projected = project(gaussians, posed, options=options, colors=image and not own, backend=backend)
     half = 0.5 if pixel_centers == "half" else 0.0
     means2d = projected.means2d + half
     if means2d.requires_grad:
@@ -138,8 +137,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         raise ValueError(f"backgrounds: expected shape ({count}, {channels}), got {tuple(backgrounds.shape)}")
     if render_mode.endswith("D"):
         features = torch.cat([features, projected.depths[:, None]], 1)
-    rules |= {"tile_size": tile_size, "transmittance_stop": transmittance_stop, "max_bytes": max_bytes}
-    result = composite(projected, features, **rules)
+    result = composite(projected, features, options=options, backend=backend)
     alphas = 1.0 - result.transmittance
     renders, depths = result.features[:, :channels], result.features[:, channels:]
     if image:
@@ -148,7 +146,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         depths = depths / alphas.clamp_min(1e-10)
     names = ("camera_ids", "gaussian_ids", "radii", "depths", "conics", "opacities")
     meta = {name: getattr(projected, name) for name in names} | {"means2d": means2d, "width": width, "height": height}
-    meta |= {"tile_size": tile_size, "n_cameras": count}
+    meta |= {"tile_size": result.tile_size, "n_cameras": count}
     return torch.cat([renders, depths], 1).permute(0, 2, 3, 1), alphas.permute(0, 2, 3, 1), meta
 
 

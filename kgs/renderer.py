@@ -3,24 +3,22 @@
 import dataclasses
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Unpack
 
 import torch
 from torch import Tensor, nn
 
 from .backends import check_backend
 from .camera import Cameras
-from .projection import normals, project
-from .raster import composite
-from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor
+from .projection import normals
+from .stages import composite, project
+from .types import Gaussians, RasterFields, RasterOptions, Rendering, check_kind, check_tensor, raster_options
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 
 
 class GaussianRenderer(nn.Module):
     """Render 3D Gaussians with Kornia cameras, differentiable in everything: Gaussians, poses, intrinsics, background.
-
-    For tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres (a centred image has cx = (W - 1) / 2).
@@ -34,8 +32,11 @@ class GaussianRenderer(nn.Module):
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
         backend: "auto" (the fastest that covers the call), "torch", or "numba" (float32 on a CPU, tiles of 8), see
             `kgs.backends`.
+        options: how Gaussians become pixels; None for the defaults. `renderer.options` may be replaced later.
+        fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Raises:
+        TypeError: both `options` and fields of them are given, or a field does not exist.
         ValueError: an option is out of range, or there is no such backend.
         ModuleNotFoundError: the backend is numba, and it is not installed.
 
@@ -66,21 +67,15 @@ class GaussianRenderer(nn.Module):
     def __init__(
         self,
         opacity_layer: nn.Module | None = None,
-        tile_size: int = RasterOptions.tile_size,
-        near_plane: float = RasterOptions.near_plane,
-        eps2d: float = RasterOptions.eps2d,
-        alpha_threshold: float = RasterOptions.alpha_threshold,
-        transmittance_stop: float = RasterOptions.transmittance_stop,
-        max_bytes: int = RasterOptions.max_bytes,
+        *,
+        options: RasterOptions | None = None,
         backend: str = "auto",
+        **fields: Unpack[RasterFields],
     ) -> None:
         super().__init__()
-        RasterOptions(tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes)
         check_backend(backend)
         self.opacity_layer = nn.Identity() if opacity_layer is None else opacity_layer
-        self.tile_size, self.near_plane, self.eps2d = tile_size, near_plane, eps2d
-        self.alpha_threshold, self.transmittance_stop = alpha_threshold, transmittance_stop
-        self.max_bytes, self.backend = max_bytes, backend
+        self.options, self.backend = raster_options(options, fields), backend
 
     def forward(
         self,
@@ -111,9 +106,8 @@ class GaussianRenderer(nn.Module):
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
             gaussians = dataclasses.replace(gaussians, opacities=opacities)
-        rules: dict[str, Any] = {"alpha_threshold": self.alpha_threshold, "backend": self.backend}
         image = "image" in outputs
-        projected = project(gaussians, cameras, near_plane=self.near_plane, eps2d=self.eps2d, colors=image, **rules)
+        projected = project(gaussians, cameras, options=self.options, colors=image, backend=self.backend)
         if projected.means2d.requires_grad:
             projected.means2d.retain_grad()
         features = {"image": projected.colors}
@@ -122,9 +116,8 @@ class GaussianRenderer(nn.Module):
         if "normal" in outputs:
             features["normal"] = normals(gaussians, cameras, projected)
         values = torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors
-        rules |= {"tile_size": self.tile_size, "transmittance_stop": self.transmittance_stop}
-        rules |= {"max_bytes": self.max_bytes, "median_depth": "median_depth" in outputs}
-        result = composite(projected, values, **rules)
+        median = "median_depth" in outputs
+        result = composite(projected, values, options=self.options, median_depth=median, backend=self.backend)
         ends = accumulate((x.shape[1] for x in features.values()), initial=0)
         found = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
         if "depth" in outputs:
@@ -137,8 +130,9 @@ class GaussianRenderer(nn.Module):
 
     def extra_repr(self) -> str:
         """What `print` shows."""
-        names = ("tile_size", "near_plane", "eps2d", "alpha_threshold", "transmittance_stop")
-        return ", ".join(f"{name}={getattr(self, name):g}" for name in names)
+        options = vars(self.options).items()
+        shown = (f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in options)
+        return ", ".join(shown)
 
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name: str = "background") -> Tensor:

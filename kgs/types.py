@@ -7,7 +7,7 @@ for the device. Two of them are equal where they are the same object.
 import math
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
-from typing import Any, Self
+from typing import Any, Self, TypedDict
 
 import torch
 from torch import Tensor
@@ -22,8 +22,8 @@ class RasterOptions:
     """How Gaussians become pixels: every option with its default and its range, once.
 
     Args:
-        tile_size: side of a tile in pixels, >= 1; the speed depends on it, the image only by rounding (float32: about
-            1e-6 at 16, growing with the square).
+        tile_size: side of a tile in pixels, >= 1; None for the backend's own (8). The speed depends on it, the
+            image only by rounding (float32: about 1e-6 at 16, growing with the square).
         near_plane: Gaussians with z <= near_plane are left out; in world units, >= 0. Below 1e-7 perspective cameras
             are not exact (Kornia does not divide by less than 1e-8).
         eps2d: variance in px^2 added to the diagonal of each footprint, >= 0: the low-pass filter of 3DGS.
@@ -37,7 +37,7 @@ class RasterOptions:
         ValueError: an option is out of range.
     """
 
-    tile_size: int = 8
+    tile_size: int | None = None
     near_plane: float = 0.01
     eps2d: float = 0.3
     alpha_threshold: float = 1 / 255
@@ -47,6 +47,8 @@ class RasterOptions:
     def __post_init__(self) -> None:
         for name in ("tile_size", "max_bytes"):
             value: Any = getattr(self, name)
+            if name == "tile_size" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
                 raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
         ends = {"near_plane": math.inf, "eps2d": math.inf, "alpha_threshold": 1, "transmittance_stop": 1}
@@ -54,6 +56,36 @@ class RasterOptions:
             value = getattr(self, name)
             if not isinstance(value, Real) or not 0.0 <= float(value) < most:
                 raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
+
+
+class RasterFields(TypedDict, total=False):
+    """The fields of `RasterOptions` as keyword arguments."""
+
+    tile_size: int | None
+    near_plane: float
+    eps2d: float
+    alpha_threshold: float
+    transmittance_stop: float
+    max_bytes: int
+
+
+def raster_options(options: RasterOptions | None, fields: RasterFields) -> RasterOptions:
+    """The options of a call, given whole or field by field.
+
+    Raises:
+        TypeError: both are given, `options` is of another type, or a field does not exist.
+        ValueError: a field is out of range.
+    """
+    unknown = sorted(fields.keys() - RasterFields.__annotations__.keys())
+    if unknown:
+        known = ", ".join(RasterFields.__annotations__)
+        raise TypeError(f"{unknown[0]}: unexpected keyword argument, expected options of the rasteriser ({known})")
+    if options is None:
+        return RasterOptions(**fields)
+    check_kind("options", options, RasterOptions)
+    if fields:
+        raise TypeError(f"options: expected options= or keyword arguments, got both ({', '.join(fields)})")
+    return options
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +206,7 @@ class Composited:
     features: Tensor  # sum of w times features, (C, F, H, W)
     transmittance: Tensor  # T behind the last layer, (C, 1, H, W)
     median_depth: Tensor | None  # (C, 1, H, W), without gradient
+    tile_size: int  # side of the tiles that were used, in pixels
 
 
 @dataclass(frozen=True, eq=False)

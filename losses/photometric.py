@@ -22,7 +22,7 @@ from kornia.filters import get_gaussian_kernel1d
 from kornia.losses import ssim_loss
 from torch import Tensor
 
-from kgs.backends import check_backend, choose, compiled_covers, register
+from kgs.backends import Backend, check_backend, choose
 
 WINDOW, SIGMA = 11, 1.5
 RADIUS = WINDOW // 2
@@ -69,7 +69,7 @@ def photometric_loss(
             whole, 0 without such a window. What is outside has no gradient and may be NaN.
         fast: False keeps to Kornia's own operations, as second derivatives need.
         moments: `target_moments(target)` of this very target, to save that work. Used by the fast path only.
-        backend: "auto", "torch" or "numba". Compiled: the fast path without a mask; torch does the rest.
+        backend: "auto", "torch" or "numba". On kernels: the fast path without a mask; torch does the rest.
 
     Returns:
         The loss, 0-d.
@@ -103,8 +103,12 @@ def photometric_loss(
     outside = None if mask is None else _outside(mask, image)
     if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
         raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}")
-    arguments = (image, target, moments, dssim_weight, outside, fast and not target.requires_grad)
-    loss: Tensor = choose("loss", backend, *arguments)(*arguments)
+    fast = fast and not target.requires_grad
+    chosen = choose(backend, "loss", lambda candidate: candidate.covers(image))
+    if not chosen.has_loss or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
+        return _torch_loss(image, target, moments, dssim_weight, outside, fast)
+    moments = target_moments(target) if moments is None else moments
+    loss: Tensor = _PhotometricLoss.apply(image, target, moments.mean, moments.variance, dssim_weight, chosen)
     return loss
 
 
@@ -124,7 +128,7 @@ def target_moments(target: Tensor) -> TargetMoments:
     return TargetMoments(padded, mean, _blur(padded * padded).sub_(mean * mean))
 
 
-def torch_loss(
+def _torch_loss(
     image: Tensor,
     target: Tensor,
     moments: TargetMoments | None,
@@ -132,7 +136,7 @@ def torch_loss(
     outside: Tensor | None,
     fast: bool,
 ) -> Tensor:
-    """The stage "loss"."""
+    """`photometric_loss` in torch, for every call; trusts its arguments."""
     if outside is not None:
         image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
     loss = _mean((image - target).abs(), outside)
@@ -152,7 +156,25 @@ def torch_loss(
     return loss + dssim_weight * (1.0 - mean_ssim)
 
 
-def refuse_second_derivative() -> None:
+class _PhotometricLoss(torch.autograd.Function):
+    """The loss of an image and a target given with its moments, by a backend that makes the gradient in one go."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mean: Tensor, variance: Tensor, weight: float, backend: Backend
+    ) -> Tensor:
+        taps = window_taps(image.dtype)
+        loss, grad = backend.loss_and_gradient(image, target, mean, variance, taps, weight, ctx.needs_input_grad[0])
+        ctx.save_for_backward(grad)
+        return loss
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None]:
+        _refuse_second_derivative()
+        return grad * ctx.saved_tensors[0], None, None, None, None, None
+
+
+def _refuse_second_derivative() -> None:
     """Raise a RuntimeError in a backward pass that is to be differentiated."""
     if torch.is_grad_enabled():  # once_differentiable is silent where the incoming gradient is a constant
         raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
@@ -194,14 +216,10 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        refuse_second_derivative()
+        _refuse_second_derivative()
         padded, target, by_mean, by_square, by_product = ctx.saved_tensors
         pixels = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
         return _fold(pixels.addcmul_(target, _blur_adjoint(by_product))).mul_(grad / ctx.count), None, None, None, None
-
-
-register("loss", "torch", torch_loss)
-register("loss", "numba", "kgs.losses.photometric_compiled:compiled_loss", lambda image, *_: compiled_covers(image))
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:

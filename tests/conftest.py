@@ -14,7 +14,6 @@ from hypothesis import settings
 from init_point_scenes import painted_planes
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
-import kgs.losses  # noqa: F401  # has a stage to register
 from kgs import backends
 from kgs.datasets import synthetic_scene
 from kgs.init_points import FirstPoints
@@ -67,11 +66,8 @@ def _runs_on_torch_again(item: pytest.Function) -> bool:
 def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """Makes "auto" mean one backend, then the other: what the test says holds for both. Bits differ between them."""
     kept = ("torch", request.param)
-    stages = {
-        stage: {name: there[name] for name in there if name in kept} for stage, there in backends._registry.items()
-    }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backends, "_registry", stages)
+        patch.setattr(backends, "BACKENDS", tuple(backend for backend in backends.BACKENDS if backend.name in kept))
         yield request.param
 
 

@@ -72,11 +72,16 @@ SIGNATURES = {
     "kgs.drop_gaussian": {"opacities": ..., "p": 0.2, "training": True, "generator": None},
     "kgs.GaussianRenderer": {
         "opacity_layer": None,
-        "tile_size": 8,
+        "options": None,
+        "backend": "auto",
+    },
+    "kgs.RasterOptions": {
+        "tile_size": None,
         "near_plane": 0.01,
         "eps2d": 0.3,
         "alpha_threshold": 1 / 255,
         "transmittance_stop": 1e-4,
+        "max_bytes": 2**30,
     },
     "kgs.GaussianRenderer.forward": {
         "self": ...,
@@ -118,8 +123,8 @@ def test_signatures(name):
     assert list(found)[: len(expected)] == list(expected)
     for key, default in expected.items():
         assert found[key] == default, key
-    # what comes after may be left out
-    assert all(found[key] is not ... for key in list(found)[len(expected) :])
+    # what comes after may be left out; `fields` are those of RasterOptions, by name
+    assert all(found[key] is not ... for key in list(found)[len(expected) :] if key != "fields")
 
 
 def test_the_values_that_flow_are_frozen():
@@ -128,7 +133,7 @@ def test_the_values_that_flow_are_frozen():
         assert dataclasses.is_dataclass(made)
         assert made.__dataclass_params__.frozen
     assert {"image", "alpha", "depth", "projected"} <= {field.name for field in dataclasses.fields(kgs.Rendering)}
-    assert math.isclose(kgs.GaussianRenderer().alpha_threshold, 1 / 255)
+    assert math.isclose(kgs.GaussianRenderer().options.alpha_threshold, 1 / 255)
 
 
 def test_progress_is_one_until_it_is_set():

@@ -19,11 +19,18 @@ CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
 @pytest.fixture
 def installed(monkeypatch):
     """A "numba" that is torch under another name; sets whether it is installed."""
-    stages = {stage: {"numba": there["torch"], "torch": there["torch"]} for stage, there in backends._registry.items()}
-    monkeypatch.setattr(backends, "_registry", stages)
+
+    class Numba(backends.TorchBackend):
+        name, devices, package = "numba", ("cpu",), ("numba", "fast")
+
+        def covers(self, like):
+            return self.is_installed()
+
+    numba = Numba()
+    monkeypatch.setattr(backends, "BACKENDS", (numba, backends.TorchBackend()))
 
     def set_installed(there):
-        monkeypatch.setattr(backends, "_has_numba", lambda: there)
+        monkeypatch.setattr(numba, "is_installed", lambda: there)
 
     set_installed(True)
     return set_installed

@@ -1,4 +1,4 @@
-"""The registry of stages: who runs what, and what a wrong name is told."""
+"""Backends: which one runs a call, and what a wrong name is told."""
 
 import pytest
 import torch
@@ -8,21 +8,30 @@ import kgs
 from kgs import backends
 
 
+class Half(backends.TorchBackend):
+    """Halves features, for images of 8 rows at most, in tiles of 4."""
+
+    name = "half"
+    tile_size = 4
+
+    def covers_compositing(self, projected, options, chunk_size):
+        return projected.image_size[0] <= 8
+
+    def compositor(self, projected, features, options, median_depth, chunk_size):
+        whole = super().compositor(projected, features, options, median_depth, chunk_size)
+        forward = whole.forward
+        whole.forward = lambda inputs, keep: forward((*inputs[:3], inputs[3] / 2), keep)
+        return whole
+
+
 @pytest.fixture
 def half(monkeypatch):
-    """A backend that halves features, for images of 8 rows at most; it has no projection of its own."""
-    stages = {stage: dict(there) for stage, there in backends._registry.items()}
-    monkeypatch.setattr(backends, "_registry", stages)
-
-    def run(projected, features, *rest):
-        return backends.choose("compositing", "torch", projected, features, *rest)(projected, features / 2, *rest)
-
-    backends.register("compositing", "half", run, lambda projected, *_: projected.image_size[0] <= 8)
+    monkeypatch.setattr(backends, "BACKENDS", (Half(), *backends.BACKENDS))
 
 
-def render(rows, backend):
+def render(rows, backend, **options):
     gaussians = random_gaussians(30, 0, sh_degree=None)  # float64: torch
-    return kgs.GaussianRenderer(backend=backend)(gaussians, random_camera(rows, 12, 0)).image
+    return kgs.GaussianRenderer(backend=backend, **options)(gaussians, random_camera(rows, 12, 0)).image
 
 
 def test_auto_is_torch_where_nothing_else_covers_the_call():
@@ -37,6 +46,14 @@ def test_auto_takes_what_covers_the_call_and_torch_takes_the_rest(half):
     assert torch.equal(render(9, "auto"), render(9, "torch"))
 
 
+@pytest.mark.parametrize(("backend", "own"), [("half", 4), ("torch", 8)])
+def test_the_tile_size_is_the_backends_own_unless_it_is_given(half, backend, own):
+    projected = kgs.project(random_gaussians(30, 0, sh_degree=None), random_camera(8, 12, 0))
+    for given, used in ((None, own), (5, 5)):
+        out = kgs.composite(projected, projected.colors, tile_size=given, backend=backend)
+        assert out.tile_size == used
+
+
 def test_a_backend_by_name_is_refused_where_it_does_not_cover_the_call(half):
     with pytest.raises(ValueError, match=r"backend: 'half' does not cover this call of compositing"):
         render(9, "half")
@@ -48,6 +65,11 @@ def test_an_unknown_backend_is_told_what_there_is(make):
         make(backend="cuda")
 
 
-def test_an_unknown_stage_is_refused():
-    with pytest.raises(ValueError, match="stage: expected one of"):
-        backends.register("lists", "torch", print)
+def test_kernels_beside_the_renderer_are_for_auto_and_numba_alone(half):
+    pytest.importorskip("numba")
+    rows = torch.zeros(3, 2)
+    takes = {name: backends.takes_kernels(name, "rows", rows) for name in backends.available()}
+    assert takes == {"auto": True, "half": False, "numba": True, "torch": False}
+    assert not backends.takes_kernels("auto", "rows", rows.double())
+    with pytest.raises(ValueError, match="backend: 'numba' does not cover this call of rows"):
+        backends.takes_kernels("numba", "rows", rows.double())

@@ -9,6 +9,7 @@ from dataclasses import asdict
 import pytest
 
 from kgs import GaussianRenderer
+from kgs.backends import BACKENDS
 from kgs.bench import precision
 from kgs.bench.precision import DEFAULT, EXACT, EXACT64, KNOBS, SCENES
 from kgs.bench.scenes import exact
@@ -44,9 +45,10 @@ def test_it_writes_tables_and_plots(measured):
 
 
 def test_the_marked_default_is_the_renderers():
-    renderer = GaussianRenderer()
-    for name in ("alpha_threshold", "transmittance_stop", "tile_size"):
-        assert getattr(DEFAULT, name) == getattr(renderer, name)
+    options = GaussianRenderer().options
+    for name in ("alpha_threshold", "transmittance_stop"):
+        assert getattr(DEFAULT, name) == getattr(options, name)
+    assert {backend.tile_size for backend in BACKENDS} == {DEFAULT.tile_size}
 
 
 @pytest.mark.parametrize("error", ["max_error", "rmse", "gradient"])

@@ -20,9 +20,9 @@ from kgs.raster.tiles import bin_to_tiles
 
 pytest.importorskip("numba")
 
-from kgs.compiled import compositing as kernels
-from kgs.compiled.bands import Reach
-from kgs.raster.compiled_passes import _arrays
+from kgs.backends.cpu import compositing_kernels as kernels
+from kgs.backends.cpu.binning import Reach
+from kgs.backends.cpu.compositing import _arrays
 
 THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
 
@@ -276,7 +276,7 @@ SCALAR = rf"\tv?{FLOATS}ss\b|\tf(?:n?m(?:add|sub)|mul|add|sub)\ts\d"
 
 @pytest.mark.parametrize("kernel", [kernels.composite_forward, kernels.composite_backward], ids=["forward", "backward"])
 def test_pixels_are_the_lanes(kernel):
-    """LLVM leaves a loop scalar without a word: see the rules in `kgs.compiled`."""
+    """LLVM leaves a loop scalar without a word: see the rules in `kgs.backends.cpu`."""
     import numba as nb
 
     f, i8 = nb.float32, nb.int64

@@ -13,7 +13,7 @@ from kgs.losses import photometric_loss, target_moments
 
 nb = pytest.importorskip("numba")
 
-from kgs.compiled import loss as kernels  # noqa: E402  # needs numba
+from kgs.backends.cpu import loss, loss_kernels  # noqa: E402  # needs numba
 
 SIZES = [(1, 1, 11, 11), (2, 3, 11, 17), (1, 3, 16, 11), (1, 2, 33, 129), (3, 1, 27, 12), (1, 4, 70, 43)]
 
@@ -21,7 +21,7 @@ SIZES = [(1, 1, 11, 11), (2, 3, 11, 17), (1, 3, 16, 11), (1, 2, 33, 129), (3, 1,
 @pytest.fixture(autouse=True)
 def _many_pieces(monkeypatch):
     """Small pictures in many pieces, as large ones are."""
-    monkeypatch.setattr(kernels, "LEAST", 1)
+    monkeypatch.setattr(loss, "LEAST", 1)
 
 
 def make_pair(shape, seed=0):
@@ -140,5 +140,5 @@ TAPS, SUMS = nb.types.UniTuple(nb.float32, 6), nb.float64[:, ::1]
 )
 def test_loops_over_columns_are_vector_code(name, arguments, operations):
     """All that they compute stands in the assembly for whole AVX registers; single numbers are what is left over."""
-    assembly = avx_assembly(getattr(kernels, name), nb.int64, nb.int64, *arguments)
+    assembly = avx_assembly(getattr(loss_kernels, name), nb.int64, nb.int64, *arguments)
     assert len(re.findall(r"\bv\w*(?:add|sub|mul)\w*ps\b.*[yz]mm", assembly)) >= operations

@@ -6,13 +6,11 @@ import pytest
 import torch
 from compiled_checks import avx_assembly
 
-from kgs.backends import choose
-from kgs.init_points import tracks
+from kgs.init_points import matching
 
 nb = pytest.importorskip("numba")
 
-from kgs.compiled import matching as kernels  # noqa: E402  # needs numba
-from kgs.init_points import tracks_compiled  # noqa: E402
+from kgs.init_points import matching_kernels as kernels  # noqa: E402  # needs numba
 
 
 def keypoints(n, m, seed=0):
@@ -33,7 +31,7 @@ def keypoints(n, m, seed=0):
 
 
 def matches(arguments, backend):
-    return choose("matching", backend, *arguments)(*arguments)
+    return matching.match(*arguments, backend)
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (5, 200), (300, 37), (400, 500), (0, 20), (20, 0), (0, 0)])
@@ -46,8 +44,7 @@ def test_matches_are_torchs(n, m):
 
 
 def test_the_first_of_equal_pairs_has_the_other_as_its_rival(monkeypatch):
-    for module in (tracks, tracks_compiled):
-        monkeypatch.setattr(module, "MAX_RATIO", 1.5)
+    monkeypatch.setattr(matching, "MAX_RATIO", 1.5)
     arguments = (*(x.repeat(2, 1) for x in keypoints(300, 300)[:2]), *(x.repeat(2, 1) for x in keypoints(300, 300)[2:]))
     found, expected = (matches(arguments, backend) for backend in ("numba", "torch"))
     assert len(found[0]) > 50

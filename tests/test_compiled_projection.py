@@ -9,19 +9,18 @@ from projection_checks import DIFFERENTIABLE, assert_alike, list_and_gradients, 
 
 pytest.importorskip("numba")
 
-import kgs.projection_compiled
+import kgs.backends.cpu.projection
 from kgs import GaussianRenderer, project
-from kgs.backends import choose
-from kgs.compiled import binning, projection
-from kgs.compiled.projection import BLOCK
+from kgs.backends.cpu import binning_kernels, projection_kernels
+from kgs.backends.cpu.projection_kernels import BLOCK
 
 
 @pytest.fixture
 def handed_over(monkeypatch):
     """How often the compiled projection asks that of torch."""
     calls = []
-    real = kgs.projection_compiled.project_torch
-    monkeypatch.setattr(kgs.projection_compiled, "project_torch", lambda *a: calls.append(1) or real(*a))
+    real = kgs.backends.cpu.projection.project_torch
+    monkeypatch.setattr(kgs.backends.cpu.projection, "project_torch", lambda *a: calls.append(1) or real(*a))
     return calls
 
 
@@ -203,7 +202,6 @@ def test_float64_is_refused_by_name_and_left_to_torch_by_auto():
     list_and_gradients(gaussians, cameras, "auto", torch.float64)
     with pytest.raises(ValueError, match="backend: 'numba' does not cover this call of projection"):
         list_and_gradients(gaussians, cameras, "numba", torch.float64)
-    assert choose("projection", "auto", gaussians).__name__ == "project_compiled"
 
 
 # -- threads -------------------------------------------------------------------------------------------------------
@@ -243,6 +241,8 @@ def test_a_camera_that_is_changed_before_the_backward_pass_does_not_change_it():
 
 
 def test_kernels_are_compiled_anew_when_any_file_of_theirs_changes():
-    stamps = {k._cache._cache_file._source_stamp[-1] for k in (projection.footprints, binning.sort_by_depth)}
+    stamps = {
+        k._cache._cache_file._source_stamp[-1] for k in (projection_kernels.footprints, binning_kernels.sort_by_depth)
+    }
     assert len(stamps) == 1
     assert len(stamps.pop()) == 64

@@ -7,13 +7,13 @@ import pytest
 import torch
 from compiled_checks import avx_assembly
 
-from kgs.backends import choose
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.init_points import plane_sweep
+from kgs.init_points.sweep_costs import sweep_costs
 
 nb = pytest.importorskip("numba")
 
-from kgs.compiled import sweep as kernels  # noqa: E402  # needs numba
+from kgs.init_points import sweep_kernels as kernels  # noqa: E402  # needs numba
 
 VOLUME, IMAGE = nb.float32[:, :, ::1], nb.float32[:, ::1]
 PRICES = nb.types.UniTuple(nb.float32, 4)
@@ -32,7 +32,7 @@ def pictures(count, height, width, planes, seed=0):
 
 
 def costs(arguments, backend):
-    return choose("sweep", backend, *arguments)(*arguments)
+    return sweep_costs(*arguments, backend)
 
 
 @pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 40, 40)])

@@ -107,8 +107,7 @@ def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
 @pytest.fixture
 def torch_alone(monkeypatch):
     """For what looks inside the torch implementation."""
-    stages = {stage: {"torch": there["torch"]} for stage, there in backends._registry.items()}
-    monkeypatch.setattr(backends, "_registry", stages)
+    monkeypatch.setattr(backends, "BACKENDS", (backends.TorchBackend(),))
 
 
 @pytest.fixture

@@ -14,7 +14,8 @@ from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import project_points
 from kgs.init_points import _sweep_range, first_points
 from kgs.init_points.dense import dense_points
-from kgs.init_points.plane_sweep import _neighbours, _semi_global, planes_wanted, sweep_depths, warp
+from kgs.init_points.plane_sweep import _neighbours, planes_wanted, sweep_depths
+from kgs.init_points.sweep_costs import _semi_global, warp
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from factories import FIELDS, OUTPUTS, batch, leaves, pinhole, posed, random_cam
 from kornia.sensors.camera import CameraModelType
 
 import kgs.reference
-from kgs import DropGaussian, GaussianRenderer, Gaussians
+from kgs import DropGaussian, GaussianRenderer, Gaussians, RasterOptions, composite, project
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -266,6 +267,36 @@ def test_opacities_for_another_number_of_cameras_are_an_error():
     gaussians = dataclasses.replace(random_gaussians(3, 0), opacities=torch.full((2, 3), 0.5).double())
     with pytest.raises(ValueError, match="opacities: expected"):
         GaussianRenderer()(gaussians, random_camera(9, 12, 0))
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_options_are_given_whole_or_field_by_field():
+    options = RasterOptions(near_plane=0.5, alpha_threshold=0.0, max_bytes=2**20)
+    assert GaussianRenderer(options=options).options == options
+    assert GaussianRenderer(**vars(options)).options == options
+    assert GaussianRenderer().options == RasterOptions()
+    gaussians, camera = random_gaussians(30, 0), random_camera(9, 12, 0)
+    image = GaussianRenderer(options=options)(gaussians, camera).image
+    assert torch.equal(image, GaussianRenderer(**vars(options))(gaussians, camera).image)
+    projected = project(gaussians, camera, options=options)
+    assert torch.equal(image, composite(projected, projected.colors, options=options).features)
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_options_given_twice_or_of_another_kind_are_refused():
+    gaussians, camera = random_gaussians(3, 0), random_camera(9, 12, 0)
+    projected = project(gaussians, camera)
+    for call in (
+        GaussianRenderer,
+        partial(project, gaussians, camera),
+        partial(composite, projected, projected.colors),
+    ):
+        with pytest.raises(TypeError, match=r"options: expected options= or keyword arguments, got both \(eps2d\)"):
+            call(options=RasterOptions(), eps2d=0.1)
+        with pytest.raises(TypeError, match="options: expected RasterOptions, got dict"):
+            call(options={"eps2d": 0.1})
+        with pytest.raises(TypeError, match="far_plane: unexpected keyword argument"):
+            call(far_plane=10.0)
 
 
 @pytest.mark.usefixtures("torch_alone")

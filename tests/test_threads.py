@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 
-from kgs.compiled.threads import over
+from kgs.backends.cpu.threads import over
 from kgs.raster.threads import run_all
 
 CPU = torch.device("cpu")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from kornia.sensors.camera import CameraModel, CameraModelType
 import kgs
 from kgs import Gaussians, PosedCamera
 from kgs.harmonics import evaluate_harmonics
+from kgs.types import RasterFields
 
 PARAMS = {
     CameraModelType.PINHOLE: 4,
@@ -201,7 +203,11 @@ def test_options_may_be_numbers_of_numpy():
 
 
 def test_every_default_is_that_of_the_options():
-    for function in (kgs.GaussianRenderer, kgs.project, kgs.composite):
+    for function in (kgs.rasterization, kgs.reference.render):
         for name, parameter in inspect.signature(function).parameters.items():
             if hasattr(kgs.RasterOptions, name):
                 assert parameter.default == getattr(kgs.RasterOptions, name), (function, name)
+
+
+def test_the_fields_of_the_options_may_be_keyword_arguments():
+    assert get_type_hints(RasterFields) == get_type_hints(kgs.RasterOptions)

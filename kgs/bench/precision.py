@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.projection import project
-from kgs.raster import composite
+from kgs.stages import composite, project
 from kgs.types import Gaussians, RasterOptions
 
 from .output import Row, markdown_table, write_plot, write_results
@@ -29,7 +28,7 @@ class Setting:
     alpha_threshold: float = RasterOptions.alpha_threshold
     transmittance_stop: float = RasterOptions.transmittance_stop
     dtype: str = "float32"
-    tile_size: int = RasterOptions.tile_size
+    tile_size: int = 8  # that of both backends
     chunk_size: int | None = None
     backend: str = "auto"
 

@@ -17,10 +17,9 @@ from kgs.backends import resolve
 from kgs.camera import move_camera
 from kgs.losses import photometric_loss, target_moments
 from kgs.machine import check_device, peak_rss_mb
-from kgs.projection import project
-from kgs.raster import composite
 from kgs.raster.tiles import bin_to_tiles
 from kgs.renderer import GaussianRenderer
+from kgs.stages import composite, project
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene

@@ -119,7 +119,8 @@ def page(
     notes = ["Whether the splat was fitted to these photos is not known here."]
     title = f"{ply.stem}, {Path(cameras).resolve().name}"
     words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes}
-    cost = write_fit_page(out, title, scene, model, renderer.near_plane, {"": render}, runs, shown=shown, **words)
+    near_plane = renderer.options.near_plane
+    cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
     level = runs[""]["views"]["psnr"]
     say(f"{out}: {len(model)} Gaussians, {len(scene.train)} photos" + (f", PSNR {level:.4g}" if level else ""))
     if cost:

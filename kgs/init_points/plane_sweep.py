@@ -5,28 +5,22 @@ Processing by Semi-Global Matching and Mutual Information" (PAMI 2008), equation
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import torch
 from kornia.color import rgb_to_grayscale
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.backends import choose, compiled_covers, register
 from kgs.datasets.scene import Views
 from kgs.geometry import camera_centers, camera_matrices
 from kgs.io.console import Stage, silent
 
+from .sweep_costs import sweep_costs
+
 PLANES, MOST_PLANES = 128, 256  # as many as a picture moves by pixels, in these limits
-WINDOW = 7  # pixels, the side of the patches that are compared
 NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
-# Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
-STEP, JUMP, EDGE = 0.06, 0.5, 0.04
-LEAST_JUMP = 1.5 * STEP
-VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
 
 
 @dataclass(frozen=True)
@@ -52,8 +46,7 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, b
     for view in stage(range(len(views)), "depth maps", "view"):
         if others := _neighbours(views, view, 1 / float(inverse.mean())):
             homographies = torch.stack([_homographies(views.cameras, view, other, inverse) for other in others])
-            arguments = (grey[view], grey[others], homographies)
-            costs, scores = choose("sweep", backend, *arguments)(*arguments)
+            costs, scores = sweep_costs(grey[view], grey[others], homographies, backend)
             maps.append(_refine(costs, scores, inverse))
         else:
             unknown = torch.full_like(grey[view], -1.0)
@@ -92,90 +85,6 @@ def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor
     turns[:, :, 2] += inverse[:, None] * shift
     homographies: Tensor = intrinsics[other] @ turns @ torch.linalg.inv(intrinsics[view])
     return homographies
-
-
-def torch_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
-    """The stage "sweep"."""
-    scores = _combine(_scores(image, other, turns) for other, turns in zip(others, homographies, strict=True))
-    return _semi_global(1.0 - scores, image), scores
-
-
-register("sweep", "torch", torch_costs)
-register(
-    "sweep", "numba", "kgs.init_points.plane_sweep_compiled:compiled_costs", lambda image, *_: compiled_covers(image)
-)
-
-
-def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
-    """Normalised cross-correlation of patches, `(D, H, W)`; 0 where the patch leaves the other image."""
-    mean, variance = moments(image)
-    found = torch.empty(len(homographies), *image.shape)
-    for plane, homography in enumerate(homographies):
-        warped, inside = (warp(layer, homography) for layer in (target, torch.ones_like(target)))
-        there, spread = moments(warped)
-        score = (_box(image * warped) - mean * there) * ((variance + VARIANCE) * (spread + VARIANCE)).rsqrt()
-        found[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
-    return found
-
-
-def warp(image: Tensor, homography: Tensor) -> Tensor:
-    """The image at the places that pixels are mapped to, `(H, W)`; 0 outside and behind the camera."""
-    height, width = image.shape
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = torch.from_numpy(cv2.warpPerspective(image.numpy(), homography.numpy(), (width, height), flags=flags))
-    x, y, one = homography[2]
-    if min(x * (width - 1), 0) + min(y * (height - 1), 0) + one > 0:
-        return warped
-    return torch.where(x * torch.arange(width) + (y * torch.arange(height))[:, None] + one > 0, warped, 0.0)
-
-
-def _box(image: Tensor) -> Tensor:  # mean over the window
-    return torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
-
-
-def moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance over the window around each pixel."""
-    mean = _box(image)
-    return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
-
-
-def _combine(scores: Iterator[Tensor]) -> Tensor:
-    """Of the neighbours the best, and the second best with a quarter of the weight: the others may see it hidden."""
-    best, second = next(scores), None
-    for score in scores:
-        lower, best = torch.minimum(best, score), torch.maximum(best, score)
-        second = lower if second is None else torch.maximum(second, lower)
-    return best if second is None else 0.75 * best + 0.25 * second
-
-
-def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
-    """Costs `(D, H, W)` with those of smooth surfaces along eight directions added."""
-    total = torch.zeros_like(cost)
-    for volume, image, result in ((cost, grey, total), (cost.mT, grey.mT, total.mT)):
-        for flip in (False, True):
-            for slant in (-1, 0, 1) if volume is cost else (0,):
-                _add_paths(volume, image, result, flip, slant)
-    return total
-
-
-def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
-    """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right per row."""
-    rows = range(cost.shape[1])
-    before, last = torch.empty(0), -1
-    for row in reversed(rows) if flip else rows:
-        path = cost[:, row].clone()
-        if last >= 0:
-            came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
-            least = came.amin(0)
-            cheapest = torch.minimum(came, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(LEAST_JUMP))
-            cheapest[1:] = torch.minimum(cheapest[1:], came[:-1] + STEP)
-            cheapest[:-1] = torch.minimum(cheapest[:-1], came[1:] + STEP)
-            more = cheapest - least
-            if slant:
-                more[:, 0 if slant > 0 else -1] = 0.0  # paths begin at the border
-            path += more
-        total[:, row] += path
-        before, last = path, row
 
 
 def _refine(cost: Tensor, scores: Tensor, inverse: Tensor) -> DepthMap:

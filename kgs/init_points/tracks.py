@@ -14,16 +14,13 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
-from kgs.backends import choose, compiled_covers, register
 from kgs.datasets.scene import Views
 from kgs.fit.keypoints import root_sift
 from kgs.io.console import Stage, silent
 
+from .matching import match
+
 SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
-MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
-CHUNK = 256  # keypoints matched at once: bounds the memory
-MAX_RATIO = 0.8  # of the best descriptor distance to the second best
-MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival must still be alike
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,7 @@ def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> T
     for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
         (places1, descriptors1), (places2, descriptors2) = features[i], features[j]
         lines = _lines(places1, projections[i], projections[j])
-        arguments = (lines, places2.float(), descriptors1, descriptors2)
-        distances, rows, columns = choose("matching", backend, *arguments)(*arguments)
+        distances, rows, columns = match(lines, places2.float(), descriptors1, descriptors2, backend)
         links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
     tracks = _join(links, owners)
     table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
@@ -83,39 +79,6 @@ def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
     lines = convert_points_to_homogeneous(places) @ fundamental.T
     unit: Tensor = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
     return unit
-
-
-def torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
-    """The stage "matching"."""
-    targets = convert_points_to_homogeneous(places).T
-    candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
-    for start in range(0, len(lines), CHUNK):
-        rows, columns = ((lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
-        # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
-        differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
-        candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
-    rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
-    nearest1, rival1 = _nearest(distances, rows, len(lines))
-    nearest2, rival2 = _nearest(distances, columns, len(places))
-    good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)
-    return distances[good], rows[good], columns[good]
-
-
-register("matching", "torch", torch_matches)
-register(
-    "matching", "numba", "kgs.init_points.tracks_compiled:compiled_matches", lambda lines, *_: compiled_covers(lines)
-)
-
-
-def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """For each candidate: is it the nearest of its owner, and the distance of its owner's second nearest."""
-    order = torch.arange(len(distances))
-    infinite = distances.new_full((count,), torch.inf)
-    ties = distances == infinite.scatter_reduce(0, owners, distances, "amin")[owners]
-    first = order.new_full((count,), len(order)).scatter_reduce(0, owners[ties], order[ties], "amin")
-    nearest = first[owners] == order
-    rival = infinite.scatter_reduce(0, owners[~nearest], distances[~nearest], "amin")
-    return nearest, rival[owners]
 
 
 def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:

@@ -214,7 +214,7 @@ def row_slices(needs: list[int], max_bytes: int) -> list[tuple[int, int]]:
 
 def bin_to_tiles(
     projected: ProjectedGaussians,
-    tile_size: int = RasterOptions.tile_size,
+    tile_size: int = 8,
     alpha_threshold: float = RasterOptions.alpha_threshold,
 ) -> TileLists:
     """The lists of all tiles of all cameras at once, see `Reach`."""

@@ -9,7 +9,7 @@ from projection_checks import assert_alike, list_and_gradients, wide_scene
 pytest.importorskip("numba")
 
 from kgs import Gaussians
-from kgs.compiled.kernel import ONE, ZERO
+from kgs.backends.cpu.kernel import ONE, ZERO
 from kgs.harmonics import SH_C0
 
 

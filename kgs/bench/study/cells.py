@@ -56,7 +56,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
         "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
         "init": {**trainer.init, "seconds": round(seconds, 2)},
-        "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.near_plane),
+        "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.options.near_plane),
         "thresholds": count_over_threshold(trainer, points.points),
         "protocol": metrics["protocol"] | ({"init": _FULL_MODEL} if cell["start"] == FULL else {}),
     }

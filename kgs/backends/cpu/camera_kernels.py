@@ -3,15 +3,15 @@
 import numpy as np
 
 from .kernel import ONE, ZERO, jit
-from .projection import camera_point, color_gradients, point_gradient, rotation, rows, turned_back
+from .projection_kernels import camera_point, color_gradients, point_gradient, rotation, rows, turned_back
 
 
 @jit
 def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, gradients, found):
     """From gradients of what a camera sees, a range of its list, to those of its matrices, one row for each Gaussian.
 
-    `ids` and `gradients` are those of :func:`.projection.footprint_gradients`. Written are `found` `(M, 21)`: world to
-    camera `(3, 4)`, then the intrinsics `(3, 3)`. The 3x3 block of the pose is a rotation.
+    `ids` and `gradients` are those of :func:`.projection_kernels.footprint_gradients`. Written are `found` `(M, 21)`:
+    world to camera `(3, 4)`, then the intrinsics `(3, 3)`. The 3x3 block of the pose is a rotation.
     """
     v, k, limits, centre = camera
     g_means2d, g_factors, g_depths, _, g_rgb = gradients

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .binning import (
+from .binning_kernels import (
     SIZE,
     begin_spans,
     count_rows,
@@ -106,7 +106,7 @@ class Reach:
             count_rows(self.heads[low:high], *spans, self.spans_per_row, self.entries_per_row)
             self._all = spans if len(bounds) == 2 else None
 
-    def _spans(self, begin, end, low, high):
+    def _spans(self, begin: int, end: int, low: int, high: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """Where the spans of each Gaussian start, and the spans of the Gaussians `low` to `high` in some rows."""
         heads, starts = self.heads[low:high], np.empty(high - low + 1, np.int64)
         begin_spans(heads, begin, end, starts)

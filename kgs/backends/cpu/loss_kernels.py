@@ -15,27 +15,9 @@ Ranges are of bands of rows, or of rows, of all channels.
 import numpy as np
 
 from .kernel import ONE, TWO, ZERO, f32, inline, jit, scratch
-from .threads import over
 
 RADIUS, BAND = 5, 32  # of the window; rows of a band
-PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 C1, C2, EPS = f32(0.01**2), f32(0.03**2), f32(1e-12)
-
-
-def loss_and_gradient(threads, taps, image, target, mean_y, variance_y, weight, grad):
-    """The loss, a float; its gradient goes to `grad`, unless that is None."""
-    channels, height, width = image.shape
-    bands, pieces = channels * -(-height // BAND), min(PIECES, -(-image.size // LEAST))
-    maps, sums = np.empty((3, *image.shape), f32), np.zeros((bands, 2))
-    over(threads, bands, ssim_maps, taps, image, target, mean_y, variance_y, maps, sums, pieces=pieces)
-    absolute, ssim = sums.sum(0) / image.size
-    if grad is not None:
-        padded = np.empty((channels, height + 2 * RADIUS, width), f32)
-        bands = channels * -(-padded.shape[1] // BAND)
-        over(threads, bands, ssim_gradient, taps, image, target, maps, padded, pieces=pieces)
-        factors = f32(-weight / image.size), f32(1 / image.size)
-        over(threads, channels * height, total_gradient, image, target, padded, *factors, grad, pieces=pieces)
-    return absolute + weight * (1.0 - ssim)
 
 
 @inline

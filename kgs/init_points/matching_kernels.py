@@ -1,4 +1,4 @@
-"""Matches of keypoints along epipolar lines, by the rules of `kgs.init_points.tracks`; what differs is rounding.
+"""Matches of keypoints along epipolar lines, by the rules of `kgs.init_points.matching`; what differs is rounding.
 
     lines           (N, 3), of the first view's keypoints in the second, normals of length 1
     places          (2, M), x and y of the second view's keypoints
@@ -9,8 +9,8 @@ A distance without a candidate is infinite. Bands of rows have their own columns
 
 import numpy as np
 
-from .kernel import ZERO, f32, jit
-from .threads import over
+from kgs.backends.cpu.kernel import ZERO, f32, jit
+from kgs.backends.cpu.threads import over
 
 BANDS = 16
 INFINITY = f32(np.inf)

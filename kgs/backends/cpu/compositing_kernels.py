@@ -8,7 +8,7 @@ the other, and their moments added.
 
 import numpy as np
 
-from .binning import SIZE, variances
+from .binning_kernels import SIZE, variances
 from .kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
 
 P = SIZE * SIZE

@@ -1,4 +1,4 @@
-"""Costs of a plane sweep, by the formulas of `kgs.init_points.plane_sweep`; planes are the lanes, so they come last.
+"""Costs of a plane sweep, by the formulas of `kgs.init_points.sweep_costs`; planes are the lanes, so they come last.
 
     image, mean, variance   (H, W), the latter two over the window around a pixel
     warped                  (P, 2, H, W), another view's image by P planes of the sweep, and ones warped alike
@@ -12,8 +12,8 @@ Sums over windows are in float64, and all else rounds as written: the results ar
 
 import numpy as np
 
-from .kernel import ONE, ZERO, exact, f32, inline
-from .threads import over
+from kgs.backends.cpu.kernel import ONE, ZERO, exact, f32, inline
+from kgs.backends.cpu.threads import over
 
 HALO, BAND = 3, 16  # of the window; rows of a band
 PATHS = 8  # side by side

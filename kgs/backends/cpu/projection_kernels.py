@@ -1,15 +1,15 @@
 """Projection by pinhole cameras with the colours of harmonics, and its gradient: one Gaussian at a time.
 
 The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; gradients of cameras are in
-:mod:`.cameras`. A camera is a tuple: world to camera `(3, 4)`, intrinsics `(2, 3)`, limits of x / z and y / z `(2, 2)`,
-centre `(3,)`.
+:mod:`.camera_kernels`. A camera is a tuple: world to camera `(3, 4)`, intrinsics `(2, 3)`, limits of x / z and y / z
+`(2, 2)`, centre `(3,)`.
 """
 
 import math
 
 import numpy as np
 
-from .harmonics import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
+from .harmonics_kernels import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
 from .kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
 
 BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do

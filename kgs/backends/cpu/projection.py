@@ -1,4 +1,4 @@
-"""`project` on compiled kernels: float32 on a CPU, pinhole cameras."""
+"""Projection by the kernels: pinhole cameras; others go to torch."""
 
 import math
 from collections.abc import Sequence
@@ -9,18 +9,19 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from .camera import MARGIN, Cameras
-from .compiled.cameras import camera_gradients
-from .compiled.projection import BLOCK, footprint_gradients, footprints
-from .compiled.threads import over
-from .memory import empty
-from .projection import finite_gaussians, project_torch, seen_within
-from .types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.camera import MARGIN, Cameras
+from kgs.memory import empty
+from kgs.projection import finite_gaussians, project_torch, seen_within
+from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+
+from .camera_kernels import camera_gradients
+from .projection_kernels import BLOCK, footprint_gradients, footprints
+from .threads import over
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
 
-def project_compiled(
+def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`kgs.projection.project_torch` on the kernels, where they can do the call."""

@@ -16,11 +16,12 @@ ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
 _LARGEST = np.finfo(np.float32).max
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # without nnan and ninf: see `is_finite`
-_SOURCES = sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
+_FILES = sorted([Path(__file__), *Path(__file__).parent.glob("*_kernels.py")])
+_SOURCES = sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()
 
 
 def _cached(**options: Any) -> Callable[[Any], Any]:
-    """Numba's decorator, whose cache on the disk is that of all files here: kernels have code of others in them."""
+    """Numba's decorator; cached on the disk until any file of kernels changes: they have code of each other in them."""
 
     def decorate(function: Any) -> Any:
         kernel = nb.njit(nogil=True, cache=True, error_model="numpy", **options)(function)
@@ -70,7 +71,7 @@ class _Notice(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """A function is being compiled: of kgs or of anybody."""
-        ours = event.data["dispatcher"].py_func.__module__.startswith(__package__ + ".")
+        ours = event.data["dispatcher"].py_func.__module__.startswith("kgs.")
         if ours and not self.said and sys.stderr is not None and sys.stderr.isatty():  # None: closed by `2>&-`
             print("kgs: compiling, once, about 20 s", file=sys.stderr, flush=True)
             self.said = True

@@ -1,0 +1,82 @@
+"""The backend of numba kernels, for float32 on a CPU.
+
+Each `X_kernels.py` has the kernels of a stage, NumPy arrays in and out, and `X.py` beside it brings them to torch.
+Torch defines what is right; a kernel gives the same within the rounding of float32, and the formulas stand beside the
+torch code that it follows. `import kgs` does not import numba: a stage is imported when it is first used.
+
+Rules that the speed hangs on. Each was measured to cost a factor of 1.5 to 3 where it was broken, silently:
+
+1. Pixels of a tile are the lanes of SIMD. Loops over pixels have a constant length and read and write one flat scratch
+   array at constant distances; other arrays are only read. Else LLVM finds dependences and the loop stays scalar.
+2. An index must be provably >= 0, because indices wrap: a loop that counts down masks its index.
+3. `fastmath` lets sums be reassociated; NaN and infinity keep their meaning.
+4. Literals are float64 in numba: every constant is an `np.float32`.
+5. Reads may miss the caches, writes may not: gathers are loops of their own, and sums by Gaussian are kept for a band
+   of neighbouring tiles.
+6. The number of features is a constant of the compiled kernel: the length of a tuple.
+7. Ranges and bands do not depend on the number of threads, and nothing is summed by two threads: same bits on any
+   number of them.
+"""
+
+import torch
+from torch import Tensor
+
+from kgs.backends.base import Backend, Compositor
+from kgs.camera import Cameras
+from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+
+
+class CpuBackend(Backend):
+    """Kernels for pinhole cameras, tiles of 8 x 8 pixels and the loss; other cameras go to torch, inside the call."""
+
+    name = "numba"
+    devices = ("cpu",)
+    dtypes = (torch.float32,)
+    tile_size = 8  # a constant of the kernels
+    package = ("numba", "fast")
+    has_loss = True
+
+    def covers(self, like: Tensor) -> bool:
+        """Float32 on a CPU, while no graph is traced."""
+        return not torch.compiler.is_compiling() and super().covers(like)
+
+    def covers_compositing(self, projected: ProjectedGaussians, options: RasterOptions, chunk_size: int | None) -> bool:
+        """Tiles of its own size and chunks of its own."""
+        narrow = projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
+        return options.tile_size in (None, self.tile_size) and chunk_size is None and narrow
+
+    def project(
+        self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
+    ) -> ProjectedGaussians:
+        """See `Backend`."""
+        from .projection import project
+
+        return project(gaussians, cameras, size, options, colors)
+
+    def compositor(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool,
+        chunk_size: int | None,
+    ) -> Compositor:
+        """See `Backend`."""
+        from .compositing import CpuCompositing
+
+        return CpuCompositing(projected, features, options, median_depth)
+
+    def loss_and_gradient(
+        self,
+        image: Tensor,
+        target: Tensor,
+        mean: Tensor,
+        variance: Tensor,
+        taps: list[float],
+        dssim_weight: float,
+        gradient: bool,
+    ) -> tuple[Tensor, Tensor | None]:
+        """See `Backend`."""
+        from .loss import loss_and_gradient
+
+        return loss_and_gradient(image, target, mean, variance, taps, dssim_weight, gradient)

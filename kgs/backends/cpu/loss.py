@@ -1,0 +1,41 @@
+"""The photometric loss by the kernels: the value and its gradient are made in one go."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
+from .threads import over
+
+PIECES, LEAST = 16, 8192  # for the threads; pixels of one
+
+
+def loss_and_gradient(
+    image: Tensor,
+    target: Tensor,
+    mean: Tensor,
+    variance: Tensor,
+    taps: list[float],
+    dssim_weight: float,
+    gradient: bool,
+) -> tuple[Tensor, Tensor | None]:
+    """See `kgs.backends.Backend`."""
+    x, y, mean_y, variance_y = (x.detach().contiguous().flatten(0, 1).numpy() for x in (image, target, mean, variance))
+    half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
+    threads = torch.get_num_threads()
+    channels, height, width = x.shape
+    bands, pieces = channels * -(-height // BAND), min(PIECES, -(-x.size // LEAST))
+    maps, sums = np.empty((3, *x.shape), np.float32), np.zeros((bands, 2))
+    over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
+    absolute, ssim = sums.sum(0) / x.size
+    loss = image.new_tensor(absolute + dssim_weight * (1.0 - ssim))
+    if not gradient:
+        return loss, None
+    found = torch.empty_like(image, memory_format=torch.contiguous_format)
+    padded = np.empty((channels, height + 2 * RADIUS, width), np.float32)
+    bands = channels * -(-padded.shape[1] // BAND)
+    over(threads, bands, ssim_gradient, half, x, y, maps, padded, pieces=pieces)
+    factors = np.float32(-dssim_weight / x.size), np.float32(1 / x.size)
+    rows, out = channels * height, found.flatten(0, 1).numpy()
+    over(threads, rows, total_gradient, x, y, padded, *factors, out, pieces=pieces)
+    return loss, found

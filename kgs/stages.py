@@ -1,0 +1,171 @@
+"""The two stages of a render, `project` and `composite`: arguments are checked here, and a backend does the work."""
+
+from dataclasses import replace
+from typing import Any, Unpack
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .backends import choose
+from .backends.base import Compositor
+from .camera import Cameras, image_size, intrinsics
+from .types import (
+    Composited,
+    Gaussians,
+    ProjectedGaussians,
+    RasterFields,
+    RasterOptions,
+    check_kind,
+    check_tensor,
+    raster_options,
+)
+
+
+def project(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    options: RasterOptions | None = None,
+    colors: bool = True,
+    backend: str = "auto",
+    **fields: Unpack[RasterFields],
+) -> ProjectedGaussians:
+    """Project Gaussians into every camera of a batch.
+
+    Differentiable once, by `backward`, with respect to all Gaussian parameters, extrinsics and intrinsics.
+
+    Convention:
+        World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
+        options: None for the defaults. Of these matter near_plane, eps2d and alpha_threshold (with 0 all in front of
+            the camera are seen).
+        colors: whether colours are wanted.
+        backend: "auto", or the name of one, see `kgs.backends`.
+        fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
+
+    Returns:
+        The visible pairs (camera, Gaussian): those that would touch the image if their opacity were 2, or the largest
+        of all if that is more. (The opacity of each is left aside, so that a dropped Gaussian counts as seen.)
+
+    Raises:
+        TypeError: no Gaussians, cameras of another kind, dtype or device, or both `options` and fields of them.
+        ValueError: an option is out of range, cameras of different image sizes, or opacities `(C, N)` for another
+            number of cameras.
+    """
+    options = raster_options(options, fields)
+    check_kind("gaussians", gaussians, Gaussians)
+    size = image_size(cameras)
+    for matrix in (cameras.extrinsics, intrinsics(cameras)):
+        check_tensor("cameras", matrix, gaussians.means, " as the Gaussians")
+    shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
+    if shape[:-1] not in ((), (count,)):
+        raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
+    chosen = choose(backend, "projection", lambda candidate: candidate.covers(gaussians.means))
+    return chosen.project(gaussians, cameras, size, options, colors)
+
+
+def composite(
+    projected: ProjectedGaussians,
+    features: Tensor,
+    *,
+    options: RasterOptions | None = None,
+    median_depth: bool = False,
+    chunk_size: int | None = None,
+    backend: str = "auto",
+    **fields: Unpack[RasterFields],
+) -> Composited:
+    """Composite features of projected Gaussians over all pixels of all cameras.
+
+    Differentiable once, by `backward`, with respect to `features` and `projected.means2d`, `factors` and `opacities`.
+    `kgs.raster` has the equations.
+
+    Args:
+        projected: M visible pairs (camera, Gaussian).
+        features: what to accumulate, `(M, F)`: colours, depths, anything.
+        options: None for the defaults. Of these matter tile_size, alpha_threshold, transmittance_stop and max_bytes.
+        median_depth: also find the depth at which T falls below one half.
+        chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
+        backend: "auto", or the name of one, see `kgs.backends`.
+        fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
+
+    Returns:
+        Features `(C, F, H, W)` without background, transmittance and median depth (or None), each `(C, 1, H, W)`.
+
+    Raises:
+        TypeError: an argument has another type, dtype or device, or both `options` and fields of them are given.
+        ValueError: an option is out of range, shapes do not fit, or one row of tiles alone exceeds `max_bytes`.
+
+    Examples:
+        >>> import torch, kgs
+        >>> gaussians = kgs.Gaussians(
+        ...     means=torch.tensor([[0.0, 0.0, 2.0]]), quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        ...     scales=torch.full((1, 3), 0.2), opacities=torch.tensor([0.9]), colors=torch.zeros(1, 3))
+        >>> k = torch.tensor([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
+        >>> projected = kgs.project(gaussians, kgs.cameras(torch.eye(4), k, width=32, height=24))
+        >>> kgs.composite(projected, torch.rand(len(projected), 8)).features.shape
+        torch.Size([1, 8, 24, 32])
+    """
+    given = raster_options(options, fields)
+    if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
+        raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
+    if not isinstance(projected, ProjectedGaussians):
+        raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
+    check_tensor("features", features)
+    shape, like = tuple(features.shape), projected.means2d
+    if len(shape) != 2 or shape[0] != len(like):
+        raise ValueError(f"features: expected shape ({len(like)}, F), a row per projected Gaussian, got {shape}")
+    for name, value in (("factors", projected.factors), ("opacities", projected.opacities), ("features", features)):
+        if len(value) != len(like) or (value.dtype, value.device) != (like.dtype, like.device):
+            want, got = (f"{len(x)} rows of {x.dtype} on {x.device}" for x in (like, value))
+            raise TypeError(f"{name}: expected {want} as means2d, got {got}")
+    chosen = choose(
+        backend,
+        "compositing",
+        lambda candidate: candidate.covers(features) and candidate.covers_compositing(projected, given, chunk_size),
+    )
+    tile_size = given.tile_size or chosen.tile_size
+    given = replace(given, tile_size=tile_size)
+    compositor = chosen.compositor(projected, features, given, median_depth, chunk_size)
+    inputs = (projected.means2d, projected.factors, projected.opacities, features)
+    keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+    sums, transmittance, median = _Composite.apply(*inputs, compositor, keep)
+    return Composited(sums, transmittance, median if median_depth else None, tile_size)
+
+
+class _Composite(torch.autograd.Function):
+    """Compositing of any backend."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Tensor,
+        factors: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        compositor: Compositor,
+        keep: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        inputs = (means2d, factors, opacities, features)
+        images, ctx.kept = compositor.forward(inputs, keep)
+        ctx.compositor = compositor
+        ctx.save_for_backward(*inputs)
+        ctx.mark_non_differentiable(images[2])
+        return images
+
+    @staticmethod
+    def backward(ctx: Any, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
+        needs = ctx.needs_input_grad[:4]
+        # the memory of what was kept is free as soon as it was used; a second backward makes it again
+        found = ctx.compositor.backward(ctx.saved_tensors, _taken(ctx), grad_sums, grad_transmittance, needs)
+        return *found, None, None
+
+
+def _taken(ctx: Any) -> Any:
+    kept, ctx.kept = ctx.kept, None
+    return kept
