@@ -71,6 +71,12 @@ def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
         yield request.param
 
 
+@pytest.fixture(params=[b.name for b in backends.BACKENDS if b.name != "torch" and b.is_installed()])
+def kernel_backend(request: pytest.FixtureRequest) -> str:
+    """The name of each backend beside torch, for tests that compare it with torch in float64."""
+    return request.param
+
+
 @pytest.fixture
 def torch_alone() -> None:
     """For a test that comes to no kernel: of errors, of files."""

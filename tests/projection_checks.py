@@ -104,9 +104,9 @@ def list_and_gradients(gaussians, cameras, backend, dtype=torch.float32, **optio
     return got, dict(zip(FIELDS, (x.grad for x in inputs), strict=True))
 
 
-def assert_alike(gaussians, cameras, accuracy=3e-6, **options):
+def assert_alike(gaussians, cameras, backend, accuracy=3e-6, **options):
     """The list of torch in float32, and what torch says in float64."""
-    got, grads = list_and_gradients(gaussians, cameras, "numba", **options)
+    got, grads = list_and_gradients(gaussians, cameras, backend, **options)
     listed, same = list_and_gradients(gaussians, cameras, "torch", **options)
     exact, exact_grads = list_and_gradients(gaussians, cameras, "torch", torch.float64, **options)
     for name in ("camera_ids", "gaussian_ids", "num_nonfinite", "radii"):

@@ -1,4 +1,4 @@
-"""What tests of compiled stages have in common."""
+"""What tests of kernels have in common."""
 
 import pytest
 

@@ -4,7 +4,7 @@ import re
 
 import pytest
 import torch
-from compiled_checks import avx_assembly
+from kernel_checks import avx_assembly
 
 from kgs.init_points import matching
 

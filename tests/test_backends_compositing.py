@@ -1,13 +1,11 @@
-"""Compositing by numba kernels: what torch gives in float64, the same lists, the same bits on any number of threads."""
+"""Compositing of each backend: what torch gives in float64, the same bits on any number of threads."""
 
 import dataclasses
 import math
-import re
+from functools import partial
 
-import numpy as np
 import pytest
 import torch
-from compiled_checks import assembly
 from compositing_checks import STOP, TH, drawn, footprints, leaves, many_bands  # noqa: F401 - a fixture for all
 from factories import random_camera, random_gaussians
 from oracles import near_threshold
@@ -16,13 +14,6 @@ from tile_checks import scene
 import kgs
 import kgs.reference
 from kgs import GaussianRenderer, composite
-from kgs.raster.tiles import bin_to_tiles
-
-pytest.importorskip("numba")
-
-from kgs.backends.cpu import compositing_kernels as kernels
-from kgs.backends.cpu.binning import Reach
-from kgs.backends.cpu.compositing import _arrays
 
 THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
 
@@ -37,9 +28,9 @@ def random(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def outcome(projected, features, certain, dtype=torch.float32, wanted=(True,) * 4, **options):
+def outcome(projected, features, certain, dtype=torch.float64, wanted=(True,) * 4, backend="torch", **options):
     """Sums, light, median depth and the gradients of a loss over the pixels that are certain."""
-    options = {"backend": "numba" if dtype == torch.float32 else "torch", "median_depth": True} | options
+    options = {"backend": backend, "median_depth": True} | options
     values = {k: getattr(projected, k).to(dtype) for k in ("means2d", "factors", "opacities", "depths")}
     projected, inputs = leaves(dataclasses.replace(projected, **values), features.to(dtype))
     for x, needed in zip(inputs, wanted, strict=True):
@@ -49,6 +40,12 @@ def outcome(projected, features, certain, dtype=torch.float32, wanted=(True,) * 
     loss = (image * (random(*image.shape) * certain).to(dtype)).sum()
     gradients = torch.autograd.grad(loss, [x for x in inputs if x.requires_grad])
     return [x.detach() for x in (out.features, out.transmittance, out.median_depth)], gradients
+
+
+@pytest.fixture
+def run(kernel_backend):
+    """`outcome` by each backend beside torch."""
+    return partial(outcome, dtype=torch.float32, backend=kernel_backend)
 
 
 def assert_close(got, expected, certain, bound=1e-5, image_bound=2e-6):
@@ -63,33 +60,33 @@ def assert_close(got, expected, certain, bound=1e-5, image_bound=2e-6):
 
 @pytest.mark.parametrize("thresholds", THRESHOLDS)
 @pytest.mark.parametrize("width", [0, 1, 3, 4, 5, 8, 9, 11, 20])
-def test_any_number_of_features_is_torch_in_float64(width, thresholds):
+def test_any_number_of_features_is_torch_in_float64(run, width, thresholds):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     projected, certain = sample(thresholds=thresholds)
     features = random(len(projected), width)
-    expected = outcome(projected, features, certain, torch.float64, **options)
-    assert_close(outcome(projected, features, certain, **options), expected, certain)
+    expected = outcome(projected, features, certain, **options)
+    assert_close(run(projected, features, certain, **options), expected, certain)
 
 
 @pytest.mark.parametrize("size", [(8, 8), (11, 5), (1, 1), (3, 100)])
-def test_image_sizes(size):
+def test_image_sizes(run, size):
     projected, certain = sample(60, size=size)
-    expected = outcome(projected, projected.colors, certain, torch.float64)
-    assert_close(outcome(projected, projected.colors, certain), expected, certain)
+    expected = outcome(projected, projected.colors, certain)
+    assert_close(run(projected, projected.colors, certain), expected, certain)
 
 
-def test_several_cameras_do_not_mix():
+def test_several_cameras_do_not_mix(run):
     projected, certain = scene(0, cameras=3), torch.ones(())
     features = random(len(projected), 3)
-    expected = outcome(projected, features, certain, torch.float64, alpha_threshold=0.0, transmittance_stop=0.0)
-    got = outcome(projected, features, certain, alpha_threshold=0.0, transmittance_stop=0.0)
+    expected = outcome(projected, features, certain, alpha_threshold=0.0, transmittance_stop=0.0)
+    got = run(projected, features, certain, alpha_threshold=0.0, transmittance_stop=0.0)
     assert_close(got, expected, certain)
 
 
 @pytest.mark.parametrize("width", [0, 3])
-def test_no_gaussians(width):
+def test_no_gaussians(run, width):
     projected, certain = sample(0)
-    (sums, light, median), gradients = outcome(projected, torch.zeros(0, width), certain)
+    (sums, light, median), gradients = run(projected, torch.zeros(0, width), certain)
     assert sums.shape == (1, width, 40, 56)
     assert not sums.any()
     assert not median.any()
@@ -97,55 +94,12 @@ def test_no_gaussians(width):
     assert [len(x) for x in gradients] == [0] * 4
 
 
-def test_the_renderer_is_the_reference():
+def test_the_renderer_is_the_reference(kernel_backend):
     for seed in range(3):
         gaussians, camera = random_gaussians(120, seed, torch.float32, 2), random_camera(40, 56, seed, torch.float32)
         certain = ~near_threshold(gaussians, camera, TH, STOP)
-        image = GaussianRenderer(backend="numba")(gaussians, camera).image
+        image = GaussianRenderer(backend=kernel_backend)(gaussians, camera).image
         assert ((image - kgs.reference.render(gaussians, camera)).abs() * certain).max() <= 5e-6
-
-
-# -- lists ---------------------------------------------------------------------------------------------------------
-
-
-def reach_of(projected, threshold=TH, max_spans=2**40):
-    inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
-    arrays = _arrays(*inputs, projected.depths, projected.camera_ids)
-    rules = np.float32(projected.eps2d), np.float32(threshold)
-    return Reach(arrays, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
-
-
-@pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])
-@pytest.mark.parametrize(("cameras", "threshold"), [(1, TH), (3, TH), (2, 0.0)])
-def test_lists_are_those_of_torch(cameras, threshold, rows):
-    for seed in range(4):
-        projected = scene(seed, cameras=cameras)
-        off = torch.rand(len(projected), generator=torch.Generator().manual_seed(seed)) < 0.2
-        depths = projected.depths.round(decimals=1) - 4  # ties, and both signs
-        depths[::7] = -0.0
-        opacities = projected.opacities.masked_fill(off, 0.0)
-        projected = dataclasses.replace(projected, depths=depths, opacities=opacities)
-        bins, reach = bin_to_tiles(projected, 8, threshold), reach_of(projected, threshold)
-        begin, end = rows or (0, reach.total_rows)
-        expected = torch.tensor_split(bins.ids[bins.entries.long()], bins.offsets[1:-1])
-        part, tile = reach.row_slice(begin, end), begin * bins.grid[1]
-        for b in range(len(part.bounds) - 1):
-            band = reach.band(part, b)
-            assert band.first_tile == tile
-            ids = reach.ids[part.members[band.members][band.entries]]
-            assert not off[torch.from_numpy(ids)].any()
-            for got in np.split(ids, band.offsets[1:-1]):
-                assert got.tolist() == expected[tile].tolist()
-                tile += 1
-        assert tile == end * bins.grid[1]
-
-
-@pytest.mark.parametrize("max_spans", [2**40, 200, 1])
-def test_rows_hold_what_was_counted(max_spans):
-    projected = scene(0, cameras=2)
-    reach, bins = reach_of(projected, max_spans=max_spans), bin_to_tiles(projected)
-    assert torch.equal(torch.from_numpy(reach.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
-    assert reach.spans_per_row.tolist() == [len(reach.row_slice(row, row + 1).spans) for row in range(12)]
 
 
 # -- bits ----------------------------------------------------------------------------------------------------------
@@ -159,63 +113,63 @@ def threads():
     torch.set_num_threads(before)
 
 
-def bits(projected, features, **options):
-    images, gradients = outcome(projected, features, torch.ones(()), **options)
+def bits(run, projected, features, **options):
+    images, gradients = run(projected, features, torch.ones(()), **options)
     return [*images, *gradients]
 
 
 @pytest.mark.parametrize("max_bytes", [2**30, 2**18])
-def test_the_same_bits_on_any_number_of_threads(threads, max_bytes):
+def test_the_same_bits_on_any_number_of_threads(run, threads, max_bytes):
     projected, *_ = drawn(3000, size=(80, 112))
     threads(1)
-    first = bits(projected, projected.colors, max_bytes=max_bytes)
+    first = bits(run, projected, projected.colors, max_bytes=max_bytes)
     for count in (1, 2, 3, 4):
         threads(count)
-        got = bits(projected, projected.colors, max_bytes=max_bytes)
+        got = bits(run, projected, projected.colors, max_bytes=max_bytes)
         assert all(torch.equal(a, b) for a, b in zip(got, first, strict=True))
 
 
-def test_what_is_asked_for_beside_the_image_does_not_change_its_bits():
+def test_what_is_asked_for_beside_the_image_does_not_change_its_bits(kernel_backend):
     projected, *_ = drawn()
     features = random(len(projected), 20)
-    first = composite(projected, features[:, :3], backend="numba")
+    first = composite(projected, features[:, :3], backend=kernel_backend)
     for width in (3, 4, 6, 8, 9, 12, 20):
         for median in (False, True):
-            out = composite(projected, features[:, :width], median_depth=median, backend="numba")
+            out = composite(projected, features[:, :width], median_depth=median, backend=kernel_backend)
             assert torch.equal(out.features[:, :3], first.features)
             assert torch.equal(out.transmittance, first.transmittance)
 
 
 @pytest.mark.parametrize("width", [3, 11])
-def test_row_slices_change_nothing(width):
+def test_row_slices_change_nothing(kernel_backend, run, width):
     projected, certain = sample(800, size=(80, 112))
     features = random(len(projected), width)
-    whole = outcome(projected, features, certain)
+    whole = run(projected, features, certain)
     for max_bytes in (2**20, 2**18):
-        sliced = outcome(projected, features, certain, max_bytes=max_bytes)
+        sliced = run(projected, features, certain, max_bytes=max_bytes)
         assert all(torch.equal(a, b) for a, b in zip(sliced[0], whole[0], strict=True))
         assert_close(sliced, whole, certain, 2e-6)
     with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 3000 for it"):
-        composite(projected, features, max_bytes=3000, backend="numba")
+        composite(projected, features, max_bytes=3000, backend=kernel_backend)
 
 
 # -- differentiation -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wanted", [(0, 0, 0, 1), (0, 0, 1, 0), (1, 1, 0, 0), (1, 1, 1, 0)])
-def test_only_what_is_wanted_is_differentiated(wanted):
+def test_only_what_is_wanted_is_differentiated(run, wanted):
     projected, certain = sample()
     features = random(len(projected), 11)
-    _, all_of_them = outcome(projected, features, certain)
-    _, some = outcome(projected, features, certain, wanted=tuple(map(bool, wanted)))
+    _, all_of_them = run(projected, features, certain)
+    _, some = run(projected, features, certain, wanted=tuple(map(bool, wanted)))
     expected = [x for x, needed in zip(all_of_them, wanted, strict=True) if needed]
     assert all(torch.equal(a, b) for a, b in zip(some, expected, strict=True))
 
 
-def test_backward_again_without_graph_and_in_inference_mode():
+def test_backward_again_without_graph_and_in_inference_mode(kernel_backend):
     sampled, *_ = drawn()
     projected, inputs = leaves(sampled, random(100000, 3)[: len(sampled)])
-    out = composite(projected, inputs[-1], backend="numba")
+    out = composite(projected, inputs[-1], backend=kernel_backend)
     loss = out.features.square().sum() + out.transmittance.sum()
     first = torch.autograd.grad(loss, inputs, retain_graph=True)
     assert all(
@@ -224,17 +178,17 @@ def test_backward_again_without_graph_and_in_inference_mode():
     with pytest.raises(RuntimeError, match="expected backward without create_graph, there is no second derivative"):
         torch.autograd.grad(loss, inputs, create_graph=True)
     with torch.inference_mode():
-        assert torch.equal(composite(projected, inputs[-1], backend="numba").features, out.features)
+        assert torch.equal(composite(projected, inputs[-1], backend=kernel_backend).features, out.features)
 
 
-def test_gradients_that_are_views_and_inputs_that_are_not_contiguous():
+def test_gradients_that_are_views_and_inputs_that_are_not_contiguous(kernel_backend):
     projected, *_ = drawn()
     features = random(6, len(projected)).t()[:, ::2]
     factors = projected.factors.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     strided, inputs = leaves(dataclasses.replace(projected, factors=factors), features)
     plain, plain_inputs = leaves(projected, features.contiguous())
     for p, x in ((strided, inputs), (plain, plain_inputs)):
-        out = composite(p, x[-1], backend="numba")
+        out = composite(p, x[-1], backend=kernel_backend)
         (out.features.mean() + out.transmittance.sum()).backward()
     assert all(torch.equal(a.grad, b.grad) for a, b in zip(inputs, plain_inputs, strict=True))
 
@@ -244,17 +198,17 @@ def test_gradients_that_are_views_and_inputs_that_are_not_contiguous():
 
 @pytest.mark.parametrize("opacity", [1e-30, 0.5, 0.99, 1.0, 2.0, 1e6, 1e38, torch.inf])
 @pytest.mark.parametrize("threshold", [0.0, TH])
-def test_opacities_from_nothing_to_everything(opacity, threshold):
+def test_opacities_from_nothing_to_everything(run, opacity, threshold):
     layers = footprints([opacity, 0.5], [[5.2, 4.1], [7.0, 3.0]], 2 * random(2, 2, 3), size=(24, 40), eps2d=0.3)
     certain, features = torch.ones(()), random(2, 3)
-    expected = outcome(layers, features, certain, torch.float64, alpha_threshold=threshold)
-    got = outcome(layers, features, certain, alpha_threshold=threshold)
+    expected = outcome(layers, features, certain, alpha_threshold=threshold)
+    got = run(layers, features, certain, alpha_threshold=threshold)
     assert_close(got, expected, certain, 2e-5, 2e-6 + 1e-6 * max(0, math.log2(min(opacity, 1e38))))
 
 
 @pytest.mark.parametrize("field", ["means2d", "factors", "opacities"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e9, 1e12])
-def test_what_is_not_finite_or_overflows_is_as_in_torch(field, value):
+def test_what_is_not_finite_or_overflows_is_as_in_torch(run, field, value):
     layers = footprints([0.7, 0.5, 0.6], 20 * torch.rand(3, 2), 2 * random(3, 2, 3), size=(24, 40), eps2d=0.3)
     changed = getattr(layers, field).clone()
     changed[1] = value if field != "factors" else value * torch.eye(2, 3)
@@ -262,37 +216,6 @@ def test_what_is_not_finite_or_overflows_is_as_in_torch(field, value):
     features, single = random(3, 3), {"backend": "torch"}
     expected = outcome(layers, features, torch.ones(()), torch.float32, **single)
     assert all(x.isfinite().all() for x in expected[0])
-    got = outcome(layers, features, torch.ones(()))
+    got = run(layers, features, torch.ones(()))
     assert_close((got[0], ()), (expected[0], ()), torch.ones(()), image_bound=5e-5)
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(got[1], expected[1], strict=True) if b.isfinite().all())
-
-
-# -- speed ---------------------------------------------------------------------------------------------------------
-
-FLOATS = r"(?:fn?m(?:add|sub)\d*|mul|add|sub)"
-PACKED = rf"\tv?{FLOATS}ps\b.*[yz]mm|\tf(?:mla|mls|mul|add|sub)(?:\.4s|\tv\d+\.4s)"  # x86, arm
-SCALAR = rf"\tv?{FLOATS}ss\b|\tf(?:n?m(?:add|sub)|mul|add|sub)\ts\d"
-
-
-@pytest.mark.parametrize("kernel", [kernels.composite_forward, kernels.composite_backward], ids=["forward", "backward"])
-def test_pixels_are_the_lanes(kernel):
-    """LLVM leaves a loop scalar without a word: see the rules in `kgs.backends.cpu`."""
-    import numba as nb
-
-    f, i8 = nb.float32, nb.int64
-    types = {"grid": nb.types.UniTuple(i8, 2), "offsets": i8[::1], "entries": nb.int32[::1], "table": f[:, ::1]}
-    types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
-    types |= {
-        "starts": f[:, ::1],
-        "done": i8[::1],
-        "light": f[:, :, ::1],
-        "depths": f[:, :, ::1],
-        "grad_light": f[:, :, ::1],
-    }
-    types |= {"grads": f[:, :, :, ::1], "moments": nb.boolean, "colors": nb.boolean}
-    types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
-    names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
-    text = assembly(kernel, *(types.get(name, i8) for name in names))
-    packed, scalar = (len(re.findall(pattern, text)) for pattern in (PACKED, SCALAR))
-    # Forward has 44 where LLVM makes AVX2 (haswell to znver3), 92 with AVX-512 (unrolled twice), 0 of a scalar loop.
-    assert packed > max(40, 1.5 * scalar)

@@ -5,7 +5,7 @@ from itertools import product
 
 import pytest
 import torch
-from compiled_checks import avx_assembly
+from kernel_checks import avx_assembly
 
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.init_points import plane_sweep

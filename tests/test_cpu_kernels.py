@@ -1,0 +1,120 @@
+"""What only the numba kernels have: lists in bands, vector code, one cache on the disk."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+import torch
+from compositing_checks import TH, many_bands  # noqa: F401 - a fixture for all
+from kernel_checks import assembly, avx_assembly
+from tile_checks import scene
+
+from kgs.raster.tiles import bin_to_tiles
+
+nb = pytest.importorskip("numba")
+
+from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
+from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
+from kgs.backends.cpu.binning import Reach  # noqa: E402  # needs numba
+from kgs.backends.cpu.compositing import _arrays  # noqa: E402  # needs numba
+
+# -- lists ---------------------------------------------------------------------------------------------------------
+
+
+def reach_of(projected, threshold=TH, max_spans=2**40):
+    inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
+    arrays = _arrays(*inputs, projected.depths, projected.camera_ids)
+    rules = np.float32(projected.eps2d), np.float32(threshold)
+    return Reach(arrays, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
+
+
+@pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])
+@pytest.mark.parametrize(("cameras", "threshold"), [(1, TH), (3, TH), (2, 0.0)])
+def test_lists_are_those_of_torch(cameras, threshold, rows):
+    for seed in range(4):
+        projected = scene(seed, cameras=cameras)
+        off = torch.rand(len(projected), generator=torch.Generator().manual_seed(seed)) < 0.2
+        depths = projected.depths.round(decimals=1) - 4  # ties, and both signs
+        depths[::7] = -0.0
+        opacities = projected.opacities.masked_fill(off, 0.0)
+        projected = dataclasses.replace(projected, depths=depths, opacities=opacities)
+        bins, reach = bin_to_tiles(projected, 8, threshold), reach_of(projected, threshold)
+        begin, end = rows or (0, reach.total_rows)
+        expected = torch.tensor_split(bins.ids[bins.entries.long()], bins.offsets[1:-1])
+        part, tile = reach.row_slice(begin, end), begin * bins.grid[1]
+        for b in range(len(part.bounds) - 1):
+            band = reach.band(part, b)
+            assert band.first_tile == tile
+            ids = reach.ids[part.members[band.members][band.entries]]
+            assert not off[torch.from_numpy(ids)].any()
+            for got in np.split(ids, band.offsets[1:-1]):
+                assert got.tolist() == expected[tile].tolist()
+                tile += 1
+        assert tile == end * bins.grid[1]
+
+
+@pytest.mark.parametrize("max_spans", [2**40, 200, 1])
+def test_rows_hold_what_was_counted(max_spans):
+    projected = scene(0, cameras=2)
+    reach, bins = reach_of(projected, max_spans=max_spans), bin_to_tiles(projected)
+    assert torch.equal(torch.from_numpy(reach.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
+    assert reach.spans_per_row.tolist() == [len(reach.row_slice(row, row + 1).spans) for row in range(12)]
+
+
+# -- vector code ---------------------------------------------------------------------------------------------------
+
+FLOATS = r"(?:fn?m(?:add|sub)\d*|mul|add|sub)"
+PACKED = rf"\tv?{FLOATS}ps\b.*[yz]mm|\tf(?:mla|mls|mul|add|sub)(?:\.4s|\tv\d+\.4s)"  # x86, arm
+SCALAR = rf"\tv?{FLOATS}ss\b|\tf(?:n?m(?:add|sub)|mul|add|sub)\ts\d"
+
+
+@pytest.mark.parametrize("kernel", [kernels.composite_forward, kernels.composite_backward], ids=["forward", "backward"])
+def test_pixels_are_the_lanes(kernel):
+    """LLVM leaves a loop scalar without a word: see the rules in `kgs.backends.cpu`."""
+    f, i8 = nb.float32, nb.int64
+    types = {"grid": nb.types.UniTuple(i8, 2), "offsets": i8[::1], "entries": nb.int32[::1], "table": f[:, ::1]}
+    types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
+    types |= {
+        "starts": f[:, ::1],
+        "done": i8[::1],
+        "light": f[:, :, ::1],
+        "depths": f[:, :, ::1],
+        "grad_light": f[:, :, ::1],
+    }
+    types |= {"grads": f[:, :, :, ::1], "moments": nb.boolean, "colors": nb.boolean}
+    types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
+    names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
+    text = assembly(kernel, *(types.get(name, i8) for name in names))
+    packed, scalar = (len(re.findall(pattern, text)) for pattern in (PACKED, SCALAR))
+    # Forward has 44 where LLVM makes AVX2 (haswell to znver3), 92 with AVX-512 (unrolled twice), 0 of a scalar loop.
+    assert packed > max(40, 1.5 * scalar)
+
+
+IMAGE, MAPS = nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]
+TAPS, SUMS = nb.types.UniTuple(nb.float32, 6), nb.float64[:, ::1]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "operations"),  # of the loops over columns, in the source
+    [
+        ("ssim_maps", (TAPS, IMAGE, IMAGE, IMAGE, IMAGE, MAPS, SUMS), 90),
+        ("ssim_gradient", (TAPS, IMAGE, IMAGE, MAPS, IMAGE), 26),
+        ("total_gradient", (IMAGE, IMAGE, IMAGE, nb.float32, nb.float32, IMAGE), 6),
+    ],
+)
+def test_loops_over_columns_are_vector_code(name, arguments, operations):
+    """All that they compute stands in the assembly for whole AVX registers; single numbers are what is left over."""
+    assembly = avx_assembly(getattr(loss_kernels, name), nb.int64, nb.int64, *arguments)
+    assert len(re.findall(r"\bv\w*(?:add|sub|mul)\w*ps\b.*[yz]mm", assembly)) >= operations
+
+
+# -- cache ---------------------------------------------------------------------------------------------------------
+
+
+def test_kernels_are_compiled_anew_when_any_file_of_theirs_changes():
+    stamps = {
+        k._cache._cache_file._source_stamp[-1] for k in (projection_kernels.footprints, binning_kernels.sort_by_depth)
+    }
+    assert len(stamps) == 1
+    assert len(stamps.pop()) == 64
