@@ -102,7 +102,8 @@ def _project_one(
 
 def seen_within(opacities: Tensor, alpha_threshold: float) -> Tensor:
     """How many standard deviations wide a footprint counts as seen: one number for all, 0-d."""
-    largest = torch.cat([opacities.flatten(), opacities.new_tensor([2.0])]).amax()
+    two = torch.full((1,), 2.0, dtype=opacities.dtype, device=opacities.device)
+    largest = torch.cat([opacities.flatten(), two]).amax()
     return cut_squared(largest, alpha_threshold).clamp_min(9.0).sqrt()
 
 
@@ -125,6 +126,7 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
         return inverse[:, 2].expand_as(means)
     camera = in_full_precision(torch.mv, inverse, lens.extrinsics[:3, 3])
     offsets = inverse[:, 2].expand_as(means) if lens.parallel else means + camera
+    offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # the squares of 1e20 would overflow
     unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return unit
 

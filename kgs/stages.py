@@ -114,14 +114,7 @@ def composite(
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
-    check_tensor("features", features)
-    shape, like = tuple(features.shape), projected.means2d
-    if len(shape) != 2 or shape[0] != len(like):
-        raise ValueError(f"features: expected shape ({len(like)}, F), a row per projected Gaussian, got {shape}")
-    for name, value in (("factors", projected.factors), ("opacities", projected.opacities), ("features", features)):
-        if len(value) != len(like) or (value.dtype, value.device) != (like.dtype, like.device):
-            want, got = (f"{len(x)} rows of {x.dtype} on {x.device}" for x in (like, value))
-            raise TypeError(f"{name}: expected {want} as means2d, got {got}")
+    _check_projected(projected, features)
     chosen = choose(
         backend,
         "compositing",
@@ -134,6 +127,29 @@ def composite(
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
     sums, transmittance, median = _Composite.apply(*inputs, compositor, keep)
     return Composited(sums, transmittance, median if median_depth else None, tile_size)
+
+
+def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
+    """Raise a TypeError or ValueError unless all that compositing reads fits together."""
+    check_tensor("features", features)
+    m, like = len(projected), projected.means2d
+    if features.ndim != 2 or len(features) != m:
+        got = tuple(features.shape)
+        raise ValueError(f"features: expected shape ({m}, F), a row per projected Gaussian, got {got}")
+    values = {name: getattr(projected, name) for name in ("means2d", "factors", "opacities", "depths")}
+    shapes = {"means2d": (m, 2), "factors": (m, 2, 3), "opacities": (m,), "depths": (m,), "features": features.shape}
+    for name, value in (values | {"features": features}).items():
+        check_tensor(name, value, like, " as means2d")
+        if tuple(value.shape) != tuple(shapes[name]):
+            raise ValueError(f"{name}: expected shape {shapes[name]}, got {tuple(value.shape)}")
+    ids = projected.camera_ids
+    if ids.dtype != torch.int64 or ids.device != like.device or tuple(ids.shape) != (m,):
+        raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
+    if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # of a GPU this would wait for it
+        first, last = (int(find(ids.numpy())) for find in (np.min, np.max))
+        if first < 0 or last >= projected.num_cameras:
+            wrong = first if first < 0 else last
+            raise ValueError(f"camera_ids: expected 0 to {projected.num_cameras - 1}, got {wrong}")
 
 
 class _Composite(torch.autograd.Function):

@@ -92,8 +92,7 @@ def photometric_loss(
     moments = target if isinstance(target, TargetMoments) else moments
     if moments is not None and not isinstance(moments, TargetMoments):
         raise TypeError(f"moments: expected TargetMoments, got {type(moments).__name__}")
-    known = None if moments is None else (tuple(moments.mean.shape), moments.mean.dtype, moments.mean.device)
-    if known not in (None, (shape, image.dtype, image.device)):
+    if moments is not None and not _belong_to(moments, image):
         raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
     if isinstance(target, TargetMoments):
         target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
@@ -126,6 +125,16 @@ def target_moments(target: Tensor) -> TargetMoments:
     padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
     mean = _blur(padded)
     return TargetMoments(padded, mean, _blur(padded * padded).sub_(mean * mean))
+
+
+def _belong_to(moments: TargetMoments, image: Tensor) -> bool:
+    """Whether all tensors of the moments have the size, dtype and device that those of such an image have."""
+    batch, channels, height, width = image.shape
+    shape = (1, batch * channels, height, width)
+    padded = (1, batch * channels, height + 2 * RADIUS, width + 2 * RADIUS)
+    shapes = (tuple(moments.padded.shape), tuple(moments.mean.shape), tuple(moments.variance.shape))
+    kinds = {(x.dtype, x.device) for x in vars(moments).values()}
+    return shapes == (padded, shape, shape) and kinds == {(image.dtype, image.device)}
 
 
 def _torch_loss(

@@ -191,9 +191,9 @@ def test_other_types_and_dtypes_are_named(name):
             composite(**given | {name: [1.0]})
     else:
         given["projected"] = dataclasses.replace(layers, **{name: getattr(layers, name).float()})
-        with pytest.raises(TypeError, match=f"^{name}: expected 2 rows of torch.float64"):
+        with pytest.raises(TypeError, match=f"^{name}: expected torch.float64"):
             composite(**given)
-    with pytest.raises(TypeError, match="^features: expected 2 rows of torch.float64"):
+    with pytest.raises(TypeError, match="^features: expected torch.float64"):
         composite(layers, layers.colors.float())
 
 
@@ -205,3 +205,18 @@ def test_projection_checks_its_options():
             project(gaussians, camera, **{name: value})
     with pytest.raises(TypeError, match="^gaussians: expected Gaussians, got list"):
         project([gaussians], camera)
+
+
+@pytest.mark.parametrize("ids", [[0, 1], [-1, 0], [0, 2**40]])
+def test_cameras_that_are_not_there_are_refused(ids, each_backend):
+    layers = dataclasses.replace(footprints([0.5, 0.5], dtype=torch.float32), camera_ids=torch.tensor(ids))
+    with pytest.raises(ValueError, match=r"^camera_ids: expected 0 to 0, got"):
+        composite(layers, layers.colors)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("means2d", (2, 3)), ("factors", (2, 3, 2)), ("depths", (1,))])
+def test_shapes_that_do_not_fit_are_refused(name, shape, each_backend):
+    layers = footprints([0.5, 0.5], dtype=torch.float32)
+    layers = dataclasses.replace(layers, **{name: torch.zeros(shape)})
+    with pytest.raises(ValueError, match=rf"^{name}: expected shape"):
+        composite(layers, torch.zeros(2, 3))

@@ -152,7 +152,7 @@ def test_byte_budget_changes_nothing(dtype, made):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_alphas_made_again_are_those_that_were_kept(dtype, made, monkeypatch):
-    monkeypatch.setattr("kgs.raster.torch_passes.buffer_bytes", lambda *_: 2**20)  # so that groups stay the same
+    monkeypatch.setattr("kgs.raster.tasks.buffer_bytes", lambda *_: 2**20)  # so that groups stay the same
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
 
     def steps():
@@ -208,7 +208,7 @@ def as_on_a_gpu(monkeypatch, torch_alone):
     monkeypatch.setattr(Slice, "__init__", init)
     monkeypatch.setattr("kgs.raster.tasks._STEP_PAIRS", {"cpu": 2**24})
     monkeypatch.setattr("kgs.raster.tasks._PAIRS_TO_SHARE", 2**60)
-    monkeypatch.setattr("kgs.raster.torch_passes.choose_chunk_size", lambda _: 32)
+    monkeypatch.setattr("kgs.raster.tasks.choose_chunk_size", lambda _: 32)
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])

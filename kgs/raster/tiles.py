@@ -86,8 +86,8 @@ class Reach:
         height, self._width = projected.image_size
         self.tile_size, self.grid = tile_size, (-(-height // tile_size), -(-self._width // tile_size))
         self.total_rows = projected.num_cameras * self.grid[0]
-        cut = cut_squared(projected.opacities, alpha_threshold)
         xx, xy, yy, det = variances(projected.factors, projected.eps2d)
+        cut = torch.where(det < torch.inf, cut_squared(projected.opacities, alpha_threshold), -torch.inf)
         reach = (cut.clamp_min(0.0) * yy).sqrt()
         x, y = projected.means2d.unbind(1)
         top, bottom = torch.ceil(y - reach).clamp(0, height), torch.floor(y + reach).clamp(-1, height - 1)

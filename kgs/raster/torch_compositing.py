@@ -9,7 +9,7 @@ from kgs.covariance import moment_gradients
 from kgs.full_precision import full_precision
 from kgs.types import ProjectedGaussians, RasterOptions
 
-from . import torch_passes
+from . import tasks, torch_passes
 from .tasks import Rules
 from .tiles import Reach, to_images, to_tiles
 
@@ -26,13 +26,13 @@ class TorchCompositing:
         chunk_size: int | None,
     ) -> None:
         tile_size = options.tile_size or 8
-        buffers, number = torch_passes.buffer_bytes(options.max_bytes, features), features.element_size()  # type: ignore[attr-defined]
+        buffers, number = tasks.buffer_bytes(options.max_bytes, features), features.element_size()
         budget = options.max_bytes - buffers * (4 if features.device.type == "cpu" else 1)  # some threads, one GPU
         # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved light
         per_span, per_entry = 32 + 16 * number, 80 + (8 + 2 * features.shape[1] + tile_size**2 // 8) * number
         reach = Reach(projected, tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span)))
         slices = reach.row_slices(budget, per_span, per_entry)
-        size = chunk_size or torch_passes.choose_chunk_size(reach)  # type: ignore[attr-defined]
+        size = chunk_size or tasks.choose_chunk_size(reach)
         threads = max(4, options.max_bytes // 4 // max(1, buffers))
         rules = Rules(options.alpha_threshold, options.transmittance_stop, median_depth, size, buffers, threads)
         spare = budget - per_entry * reach.num_entries - per_span * reach.num_spans // 4

@@ -97,9 +97,11 @@ class Forward(_Worker):
             if self.keep:
                 group.steps.append(Step(j, rows, n, light[:, 0].clone(), alpha if self.keep_alphas else None, ended))
             if part.depths is not None:
-                crossing = ((layers[:-1] >= 0.5) & (layers[1:] < 0.5)).to(light.dtype)
-                depths = part.depths.index_select(0, ids).view(size, n, 1).permute(1, 2, 0)
-                median.baddbmm_(depths, crossing.transpose(0, 1))
+                crossing = (layers[:-1] >= 0.5) & (layers[1:] < 0.5)
+                depths = part.depths.index_select(0, ids).view(size, n, 1)
+                median[:, 0] += torch.where(crossing, depths, 0.0).sum(
+                    0
+                )  # a depth that is not finite stays in its pixels
             weights = torch.mul(alpha, layers[:-1], out=buffer).transpose(0, 1)
             for block, total in zip(self.blocks, sums, strict=True):
                 total.baddbmm_(block.index_select(0, ids).view(size, n, -1).permute(1, 2, 0), weights)

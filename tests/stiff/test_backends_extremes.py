@@ -6,7 +6,7 @@ import torch
 from factories import FIELDS, replace, select
 from projection_checks import assert_alike, list_and_gradients, wide_scene
 
-from kgs import Gaussians
+from kgs import GaussianRenderer, Gaussians, composite, project
 from kgs.harmonics import SH_C0
 
 
@@ -96,3 +96,47 @@ def test_nothing_to_see(kernel_backend, degree):
         got, grads = assert_alike(none, cameras, kernel_backend)
         assert len(got) == 0
         assert all(x is not None and not x.any() for x in grads.values())
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("value", [0.0, 1e-45, 1e-30, 1e10, 1.8e19, 1e20, 1e30])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_extreme_values_spoil_no_other_gaussian(field, value, degree):
+    """Some Gaussians are far, huge or tiny in one field: images and gradients of all others are those of torch."""
+    gaussians, cameras = wide_scene(degree, cameras=2)
+    values = getattr(gaussians, field).clone()
+    some = slice(5, 15)
+    values[some] = values[some] * value if field in ("means", "scales") else value
+    changed = replace(gaussians, **{field: values})
+    (image, grads), (expected, same) = (image_and_gradients(changed, cameras, name) for name in ("numba", "torch"))
+    torch.testing.assert_close(image, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+    for name in FIELDS:
+        got, wanted = (torch.cat([x[name][:5], x[name][15:]]) for x in (grads, same))
+        assert got.isfinite().all()
+        torch.testing.assert_close(got, wanted, rtol=1e-3, atol=1e-5 * float(wanted.abs().max()))
+
+
+def image_and_gradients(gaussians, cameras, backend):
+    inputs = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in FIELDS}
+    image = GaussianRenderer(backend=backend)(Gaussians(**inputs), cameras).image
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    (image * weights).sum().backward()
+    return image.detach(), {name: value.grad for name, value in inputs.items()}
+
+
+def test_tensors_with_the_negative_bit(kernel_backend):
+    """What `conj().imag` gives: a view whose numbers stand in memory with the other sign."""
+    gaussians, cameras = wide_scene(1, n=60)
+    lazy = {name: torch.complex(torch.zeros_like(x), -x).conj().imag for name, x in vars(gaussians).items()}
+    assert all(x.is_neg() for x in lazy.values())
+    for first, second in zip(
+        projected_and_composited(Gaussians(**lazy), cameras, kernel_backend),
+        projected_and_composited(gaussians, cameras, kernel_backend),
+        strict=True,
+    ):
+        assert torch.equal(first, second)
+
+
+def projected_and_composited(gaussians, cameras, backend):
+    projected = project(gaussians, cameras, backend=backend)
+    return projected.means2d, projected.colors, composite(projected, projected.colors, backend=backend).features

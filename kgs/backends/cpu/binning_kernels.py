@@ -38,8 +38,10 @@ def find_rows(begin, end, means2d, factors, opacities, eps2d, threshold, height,
         cut = TWO * math.log(opacities[g] / threshold) + _WIDER  # infinite for a threshold of 0
         if not cut > ZERO:
             continue
-        yy = factors[g, 1, 0] * factors[g, 1, 0] + factors[g, 1, 1] * factors[g, 1, 1]
-        yy += factors[g, 1, 2] * factors[g, 1, 2] + eps2d
+        f = factors[g]
+        _, _, yy, det = variances(f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], eps2d)
+        if not is_finite(det):
+            continue
         reach = math.sqrt(cut * yy)
         top, bottom = np.ceil(means2d[g, 1] - reach), np.floor(means2d[g, 1] + reach)
         if bottom >= ZERO and top <= f32(height - 1) and bottom >= top:  # nothing that is not a number

@@ -13,6 +13,7 @@ from kgs.raster.tiles import row_slices
 from kgs.types import ProjectedGaussians, RasterOptions
 
 from . import compositing_kernels as kernels
+from .arrays import arrays
 from .binning import Band, Reach, RowSlice
 from .threads import over
 
@@ -42,13 +43,13 @@ class CpuCompositing:
         per_span = _NUMBER * (1 + 1 + 7 + channels + median_depth + 6 + channels)
         per_entry = _NUMBER * (1 + kernels.P // kernels.K)
         inputs = (projected.means2d, projected.factors, projected.opacities, features)
-        arrays = _arrays(*inputs, projected.depths, projected.camera_ids)
+        fields = arrays(*inputs, projected.depths, projected.camera_ids)
         self._size, self._cameras, self._median_depth = projected.image_size, projected.num_cameras, median_depth
         self._eps2d = np.float32(projected.eps2d)
         rules = self._eps2d, np.float32(options.alpha_threshold)
         most = max(2**12, options.max_bytes // (2 * per_span))
         threads = torch.get_num_threads()
-        self._reach = Reach(arrays, self._size, self._cameras, rules, channels, median_depth, most, threads)
+        self._reach = Reach(fields, self._size, self._cameras, rules, channels, median_depth, most, threads)
         needs = self._reach.spans_per_row * per_span + self._reach.entries_per_row * per_entry
         self._row_slices = row_slices(needs.tolist(), options.max_bytes)
         self._threshold, self._stop = (
@@ -70,7 +71,7 @@ class CpuCompositing:
     ) -> tuple[Tensor | None, ...]:
         """See `Compositor`."""
         moments, colors = any(needs[:3]), needs[3]
-        grads, behind = _arrays(grad_features, grad_transmittance[:, 0])
+        grads, behind = arrays(grad_features, grad_transmittance[:, 0])
         columns = self._reach.table.shape[1] - 1 - self._median_depth
         totals = np.zeros((len(self._reach.ids), columns), np.float32)
         blank = (np.empty_like(behind), _nothing(3), _nothing(4))
@@ -81,8 +82,8 @@ class CpuCompositing:
             del part, done  # before the next is made
         wanted = (*[moments] * 3, colors)
         found = [x.new_empty(x.shape if need else (0, *x.shape[1:])) for x, need in zip(inputs, wanted, strict=True)]
-        own = _arrays(*inputs[1:3])
-        rest = (self._reach.ranks, totals, *own, self._eps2d, *_arrays(*found))
+        own = arrays(*inputs[1:3])
+        rest = (self._reach.ranks, totals, *own, self._eps2d, *arrays(*found))
         over(torch.get_num_threads(), len(inputs[0]), kernels.fill_gradients, *rest)
         return tuple(x if need else None for x, need in zip(found, needs, strict=True))
 
@@ -133,11 +134,6 @@ def _blocks(features: int) -> list[tuple[int, int]]:
     most = kernels.WIDTHS[-1]
     begins = range(0, max(features, 1), most)
     return [(begin, next(w for w in kernels.WIDTHS if w >= min(features - begin, most))) for begin in begins]
-
-
-def _arrays(*tensors: Tensor) -> list[NDArray[Any]]:
-    """The memory of tensors, contiguous."""
-    return [x.detach().contiguous().numpy() for x in tensors]
 
 
 def _nothing(dimensions: int) -> Floats:

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .arrays import arrays
 from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
 from .threads import over
 
@@ -20,7 +21,7 @@ def loss_and_gradient(
     gradient: bool,
 ) -> tuple[Tensor, Tensor | None]:
     """See `kgs.backends.Backend`."""
-    x, y, mean_y, variance_y = (x.detach().contiguous().flatten(0, 1).numpy() for x in (image, target, mean, variance))
+    x, y, mean_y, variance_y = arrays(*(x.flatten(0, 1) for x in (image, target, mean, variance)))
     half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
     threads = torch.get_num_threads()
     channels, height, width = x.shape

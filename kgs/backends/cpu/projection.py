@@ -14,11 +14,10 @@ from kgs.memory import empty
 from kgs.projection import finite_gaussians, project_torch, seen_within
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
+from .arrays import Array, arrays
 from .camera_kernels import camera_gradients
 from .projection_kernels import BLOCK, footprint_gradients, footprints
 from .threads import over
-
-Array = np.ndarray[Any, np.dtype[Any]]
 
 
 def project(
@@ -84,7 +83,7 @@ class _Projection(torch.autograd.Function):
         outs, colored = _fields(found), ctx.needs_input_grad[4] and gradients[4].shape[1] > 0
         if not colored:  # the largest by far
             outs = *outs[:4], outs[4][:, :0]
-        gradients = _arrays(gradients[0], gradients[1].flatten(1), *gradients[2:5])
+        gradients = arrays(gradients[0], gradients[1].flatten(1), *gradients[2:5])
         matrices = np.zeros((2, len(ctx.views), 4, 4), np.float32)  # poses, intrinsics
         for c, (view, ids) in enumerate(zip(ctx.views, ctx.ids, strict=True)):
             part = tuple(x[begin : begin + len(ids)] for x in gradients)
@@ -109,7 +108,7 @@ def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
         return False
     matrices = cameras.intrinsics, cameras.extrinsics
     wanted = torch.is_grad_enabled() and cameras.extrinsics.requires_grad
-    (k, pose), unit = (x.detach().numpy() for x in matrices), np.eye(4)
+    (k, pose), unit = arrays(*matrices), np.eye(4)
     last = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
     rigid = not wanted or all(_is_turn(each[:3, :3]) for each in pose)
     return bool(
@@ -125,7 +124,7 @@ def _is_turn(matrix: Array) -> bool:
 def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, ...]]:
     """What the kernels know of each camera; in NumPy, which is faster for numbers as few."""
     views = list[tuple[Array, ...]]()
-    for matrix, pose in zip(*_arrays(cameras.intrinsics, cameras.extrinsics), strict=True):
+    for matrix, pose in zip(*arrays(cameras.intrinsics, cameras.extrinsics), strict=True):
         focal, centre, extent = matrix.diagonal()[:2], matrix[:2, 2], np.array(size[::-1], matrix.dtype)
         first, last = -(centre + 0.5 + MARGIN * extent) / focal, (extent - 0.5 - centre + MARGIN * extent) / focal
         limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
@@ -136,13 +135,9 @@ def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, .
     return views
 
 
-def _arrays(*tensors: Tensor) -> tuple[Array, ...]:
-    return tuple(x.detach().contiguous().numpy() for x in tensors)
-
-
 def _fields(tensors: Sequence[Tensor]) -> tuple[Array, ...]:
     """The memory of the fields of Gaussians, opacities as `(1, N)` or `(C, N)`, colours as `(N, F)`."""
-    *first, opacities, colors = _arrays(*tensors)
+    *first, opacities, colors = arrays(*tensors)
     return *first, np.atleast_2d(opacities), colors.reshape(len(colors), math.prod(colors.shape[1:]))
 
 

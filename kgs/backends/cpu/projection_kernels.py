@@ -12,6 +12,7 @@ import numpy as np
 from .harmonics_kernels import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
 from .kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
 
+SMALLEST_SQUARE, LARGEST_SQUARE = f32(1e-30), f32(1e36)
 BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
 
 
@@ -95,8 +96,14 @@ def turned_back(t, r):
 def _direction(means, g, centre):
     """Unit vector from the camera's centre, and 1 / distance."""
     x, y, z = means[g, 0] - centre[0], means[g, 1] - centre[1], means[g, 2] - centre[2]
-    inverse = ONE / math.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse, inverse
+    square = x * x + y * y + z * z
+    scale = ONE
+    if not SMALLEST_SQUARE <= square <= LARGEST_SQUARE:  # beyond 1e18, or nearer than 1e-15: the squares are not right
+        scale = ONE / max(abs(x), abs(y), abs(z))
+        x, y, z = x * scale, y * scale, z * scale
+        square = x * x + y * y + z * z
+    inverse = ONE / math.sqrt(square)
+    return x * inverse, y * inverse, z * inverse, inverse * scale
 
 
 @inline
