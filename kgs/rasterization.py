@@ -10,14 +10,38 @@ from torch import Tensor
 from .camera import cameras
 from .renderer import blend
 from .stages import composite, project
-from .types import SH_SIZES, Gaussians, RasterOptions, check_tensor
+from .types import SH_SIZES, Gaussians, ProjectedGaussians, RasterOptions, check_tensor
 
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-# what gsplat takes and kgs does not: the value with which it does nothing
-_HARMLESS = {"radius_clip": 0, "rasterize_mode": "classic", "camera_model": "pinhole"}
-_HARMLESS |= dict.fromkeys(("sparse_grad", "absgrad", "distributed", "with_ut", "with_eval3d"), False)
-_HARMLESS |= dict.fromkeys(("covars", "viewmats_rs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"))
-_HARMLESS |= dict.fromkeys(("ftheta_coeffs", "rolling_shutter"))
+# Arguments of gsplat 1.5 and 1.6 that ask for what kgs does not do: the value at which each does nothing.
+_NO_OPS: dict[str, Any] = {
+    "radius_clip": 0,
+    "sparse_grad": False,
+    "absgrad": False,
+    "rasterize_mode": "classic",
+    "distributed": False,
+    "camera_model": "pinhole",
+    "covars": None,
+    "with_ut": False,
+    "with_eval3d": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+}
+_WITHOUT_EFFECT = ("macro_tile",)  # how gsplat works, not what comes of it
+_LARGEST_RADIUS = 2e9  # pixels, as an int32
 
 
 def rasterization(  # noqa: D417 - what does nothing is described together
@@ -25,7 +49,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -58,8 +82,9 @@ def rasterization(  # noqa: D417 - what does nothing is described together
 
     Differentiable in all tensors, `viewmats` and `Ks` included. For other lenses and outputs see `GaussianRenderer`.
     For near_plane, eps2d, tile_size, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
-    Without effect are packed, channel_chunk and segmented; only at the values with which they do nothing are accepted
-    far_plane (1e10 or more), radius_clip, sparse_grad, absgrad, rasterize_mode, distributed, camera_model, and others.
+    packed, channel_chunk, segmented and macro_tile have no effect. These arguments are accepted only at their no-op
+    values: far_plane (1e10 or more), radius_clip, sparse_grad, absgrad, rasterize_mode, distributed, camera_model, and
+    `others`, the further arguments of gsplat 1.5 and 1.6 by name.
 
     Convention:
         World-to-camera matrices, OpenCV axes; quaternions w, x, y, z; the first pixel's centre at (0.5, 0.5).
@@ -69,7 +94,8 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         quats: of any norm from 1e-38 on, `(N, 4)`.
         scales: standard deviations in world units, > 0, `(N, 3)`.
         opacities: in [0, 1], `(N,)` or `(C, N)`.
-        colors: without `sh_degree` any features, `(N, D)` or `(C, N, D)`; with it harmonics `(N, K, 3)`.
+        colors: without `sh_degree` any features, `(N, D)` or `(C, N, D)`; with it harmonics `(N, K, 3)`. May be None
+            where `render_mode` is "D" or "ED".
         viewmats: `(C, 4, 4)`.
         Ks: intrinsics in pixels, `(C, 3, 3)`.
         width: of the images in pixels.
@@ -82,8 +108,9 @@ def rasterization(  # noqa: D417 - what does nothing is described together
 
     Returns:
         Renders `(C, H, W, D)`, where a depth is the last channel; alphas `(C, H, W, 1)`; and a dict `meta` of the M
-        pairs (camera, Gaussian) that were seen: camera_ids, gaussian_ids, radii, depths, opacities, all `(M,)`,
-        means2d `(M, 2)` in the pixels of `Ks`, which keeps its `.grad`, conics `(M, 3)`; width, height, tile_size,
+        pairs (camera, Gaussian) that were seen: camera_ids, gaussian_ids, depths, opacities, all `(M,)`; means2d
+        `(M, 2)` in the pixels of `Ks`, which keeps its `.grad`; radii `(M, 2)`, int32, 3.33 standard deviations along
+        x and y in pixels, rounded up, as gsplat's strategies expect; conics `(M, 3)`; width, height, tile_size,
         n_cameras.
 
     Raises:
@@ -103,12 +130,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     """
     others |= {"radius_clip": radius_clip, "rasterize_mode": rasterize_mode, "camera_model": camera_model}
     others |= {"sparse_grad": sparse_grad, "absgrad": absgrad, "distributed": distributed}
-    for name, value in others.items():
-        if name not in _HARMLESS:
-            raise TypeError(f"rasterization: got an unexpected argument {name!r}")
-        if hasattr(value, "shape") or value != _HARMLESS[name]:
-            shown = f"an array {tuple(value.shape)}" if hasattr(value, "shape") else repr(value)
-            raise ValueError(f"{name}: expected {_HARMLESS[name]!r}, all that kgs supports, got {shown}")
+    _check_no_ops(others)
     if not far_plane >= 1e10:
         raise ValueError(f"far_plane: expected 1e10 or more, kgs cuts nothing far away, got {far_plane}")
     if render_mode not in _MODES:
@@ -118,8 +140,11 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         check_tensor("backgrounds", backgrounds)
     posed = cameras(viewmats, Ks, width, height, pixel_centers)
     count, n = posed.batch_size, means.shape[0] if means.ndim else 0
+    image = "RGB" in render_mode
+    if colors is None and not image:
+        colors, sh_degree = means.new_zeros(n, 0), None
     colors = _check_colors(colors, sh_degree, count, n)
-    image, own = "RGB" in render_mode, sh_degree is None and colors.ndim == 3
+    own = sh_degree is None and colors.ndim == 3
     every = colors.transpose(0, 1).flatten(1) if own else colors  # one that is not finite in some camera is in none
     gaussians = Gaussians(means, quats, scales, opacities, every)
     options = RasterOptions(tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes)
@@ -144,15 +169,39 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         renders = blend(renders, result.transmittance, backgrounds, "backgrounds")
     if render_mode.endswith("ED"):
         depths = depths / alphas.clamp_min(1e-10)
-    names = ("camera_ids", "gaussian_ids", "radii", "depths", "conics", "opacities")
-    meta = {name: getattr(projected, name) for name in names} | {"means2d": means2d, "width": width, "height": height}
-    meta |= {"tile_size": result.tile_size, "n_cameras": count}
+    names = ("camera_ids", "gaussian_ids", "depths", "conics", "opacities")
+    meta = {name: getattr(projected, name) for name in names} | {"radii": _radii(projected), "means2d": means2d}
+    meta |= {"width": width, "height": height, "tile_size": result.tile_size, "n_cameras": count}
     return torch.cat([renders, depths], 1).permute(0, 2, 3, 1), alphas.permute(0, 2, 3, 1), meta
 
 
-def _check_colors(colors: Tensor, sh_degree: int | None, count: int, n: int) -> Tensor:
+def _check_no_ops(given: dict[str, Any]) -> None:
+    """Raise a TypeError for an argument that gsplat does not have, a ValueError for one that is not at its no-op."""
+    for name, value in given.items():
+        if name in _WITHOUT_EFFECT:
+            continue
+        if name not in _NO_OPS:
+            raise TypeError(f"rasterization: got an unexpected argument {name!r}")
+        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
+            continue
+        if hasattr(value, "shape"):
+            got = f"an array {tuple(value.shape)}"
+            raise ValueError(f"{name}: expected {_NO_OPS[name]!r}, all that kgs supports, got {got}")
+        if value != _NO_OPS[name]:
+            raise ValueError(f"{name}: expected {_NO_OPS[name]!r}, all that kgs supports, got {value!r}")
+
+
+@torch.no_grad()
+def _radii(projected: ProjectedGaussians) -> Tensor:
+    """Gsplat's radii, `(M, 2)` int32: 3.33 standard deviations along x and y, rounded up."""
+    variances = projected.factors.square().sum(2) + projected.eps2d
+    return (3.33 * variances.sqrt()).ceil().clamp_max(_LARGEST_RADIUS).int()
+
+
+def _check_colors(colors: Tensor | None, sh_degree: int | None, count: int, n: int) -> Tensor:
     """The colours, of harmonics those that are used."""
-    check_tensor("colors", colors)
+    if not isinstance(colors, Tensor):
+        raise TypeError(f"colors: expected a torch.Tensor, got {type(colors).__name__}")
     shape = tuple(colors.shape)
     if sh_degree is None:
         if shape[:-1] not in ((n,), (count, n)):

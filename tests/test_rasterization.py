@@ -1,5 +1,6 @@
 """gsplat's call: against the renderer and the dense reference, and what it refuses."""
 
+import enum
 import inspect
 
 import pytest
@@ -19,6 +20,25 @@ POSITIONAL = [  # gsplat's, in its order
     *("packed", "tile_size", "backgrounds", "render_mode", "sparse_grad", "absgrad"),
     *("rasterize_mode", "channel_chunk", "distributed", "camera_model"),
 ]
+
+
+class RollingShutter(enum.Enum):
+    """As gsplat's."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    GLOBAL = 4
+
+
+GSPLAT_DEFAULTS = {  # of 1.6
+    **{"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3, "sh_degree": None, "packed": True},
+    **{"tile_size": None, "backgrounds": None, "render_mode": "RGB", "sparse_grad": False, "absgrad": False},
+    **{"rasterize_mode": "classic", "distributed": False, "camera_model": "pinhole", "segmented": False},
+    **{"covars": None, "with_ut": False, "with_eval3d": False, "macro_tile": False, "return_normals": False},
+    **{"global_z_order": True, "rays": None, "radial_coeffs": None, "tangential_coeffs": None},
+    **{"thin_prism_coeffs": None, "ftheta_coeffs": None, "lidar_coeffs": None, "external_distortion_coeffs": None},
+    **{"rolling_shutter": RollingShutter.GLOBAL, "viewmats_rs": None, "ut_params": None, "extra_signals": None},
+    **{"extra_signals_sh_degree": None, "renderer_config": None},
+}
 
 
 def scene(sh_degree=None, dtype=torch.float64, cameras=2):
@@ -53,7 +73,7 @@ def test_renders_are_those_of_the_renderer(half, dtype, bound):
     covered = out.alpha.permute(0, 2, 3, 1) > 1e-3
     assert ((renders[..., 3:] - out.depth.permute(0, 2, 3, 1)) * covered).abs().max() <= 100 * bound
     seen = out.projected
-    for name in ("camera_ids", "gaussian_ids", "radii"):
+    for name in ("camera_ids", "gaussian_ids"):
         assert torch.equal(meta[name], getattr(seen, name))
     for name in ("depths", "opacities", "conics"):
         assert torch.allclose(meta[name], getattr(seen, name))
@@ -167,6 +187,11 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
         ("far_plane", 100.0),
         ("covars", torch.eye(3).expand(60, 3, 3)),
         ("with_ut", True),
+        ("global_z_order", False),
+        ("return_normals", True),
+        ("rays", torch.zeros(2, 24, 32, 6)),
+        ("extra_signals", torch.zeros(60, 2)),
+        ("rolling_shutter", RollingShutter.ROLLING_TOP_TO_BOTTOM),
         ("radial_coeffs", torch.zeros(2, 4)),
         ("render_mode", "RGBD"),
         ("pixel_centers", "corner"),
@@ -194,3 +219,93 @@ def test_what_does_nothing_is_accepted_and_unknown_names_are_not():
     assert torch.equal(call(gaussians, cameras, **harmless)[0], call(gaussians, cameras)[0])
     with pytest.raises(TypeError, match="unexpected argument 'near'"):
         call(gaussians, cameras, near=0.1)
+
+
+def test_every_default_of_gsplat_may_be_given_by_name():
+    gaussians, cameras = scene(dtype=torch.float32)
+    given, alone = call(gaussians, cameras, **GSPLAT_DEFAULTS), call(gaussians, cameras)
+    assert torch.equal(given[0], alone[0])
+
+
+@pytest.mark.parametrize("mode", ["D", "ED"])
+def test_depths_need_no_colours(mode):
+    gaussians, cameras = scene(dtype=torch.float32)
+    without = call(gaussians, cameras, colors=None, render_mode=mode)
+    assert without[0].shape == (2, 24, 32, 1)
+    assert torch.equal(without[0], call(gaussians, cameras, render_mode=mode)[0])
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGB+D"])
+def test_images_need_colours(mode):
+    gaussians, cameras = scene(dtype=torch.float32)
+    with pytest.raises(TypeError, match=r"^colors: expected a torch.Tensor, got NoneType"):
+        call(gaussians, cameras, colors=None, render_mode=mode)
+
+
+def test_radii_are_those_of_each_axis():
+    gaussians, cameras = scene(dtype=torch.float32)
+    radii, seen = call(gaussians, cameras)[2]["radii"], GaussianRenderer()(gaussians, cameras).projected
+    covariances = seen.factors @ seen.factors.mT + seen.eps2d * torch.eye(2)
+    assert radii.dtype == torch.int32
+    assert torch.equal(radii, (3.33 * covariances.diagonal(dim1=1, dim2=2).sqrt()).ceil().int())
+
+
+def small_gaussians_inside(n=200):
+    """Parameters as gsplat's trainers have them, of Gaussians well inside the image, some large on the screen."""
+    generator = torch.Generator().manual_seed(0)
+    depths = 3 + torch.rand(n, generator=generator)
+    places = (torch.rand(n, 2, generator=generator) - 0.5) * torch.tensor([0.4, 0.3]) * depths[:, None]
+    values = {
+        "means": torch.cat([places, depths[:, None]], 1),
+        "scales": torch.log(0.02 + 0.1 * torch.rand(n, 3, generator=generator)),
+        "quats": torch.randn(n, 4, generator=generator),
+        "opacities": torch.randn(n, generator=generator),
+        "colors": torch.rand(n, 3, generator=generator),
+    }
+    return {name: torch.nn.Parameter(value) for name, value in values.items()}
+
+
+def test_gsplats_strategy_sees_what_it_sees_with_gsplats_projection(monkeypatch):
+    """The state of DefaultStrategy and the number of Gaussians are those that gsplat's own torch projection gives."""
+    pytest.importorskip("gsplat")
+    from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+    from gsplat.strategy import DefaultStrategy
+
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
+    size = (64, 48)
+    k = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])
+    pose = torch.eye(4)[None]
+    target = torch.rand(1, 48, 64, 3, generator=torch.Generator().manual_seed(1))
+
+    def fit(own_projection):
+        torch.manual_seed(0)
+        params = small_gaussians_inside()
+        optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
+        strategy = DefaultStrategy(
+            refine_start_iter=10, refine_every=10, refine_scale2d_stop_iter=60, grow_grad2d=1e-5, grow_scale2d=0.12
+        )
+        state = strategy.initialize_state(scene_scale=1.0)
+        counts = []
+        for step in range(45):
+            quats = torch.nn.functional.normalize(params["quats"], dim=1)
+            shown = (params["means"], quats, params["scales"].exp(), params["opacities"].sigmoid(), params["colors"])
+            renders, _, info = rasterization(*shown, pose, k, *size)
+            if own_projection:
+                covariances, _ = _quat_scale_to_covar_preci(quats, params["scales"].exp(), True, False, triu=False)
+                radii = _fully_fused_projection(params["means"], covariances, pose, k, *size)[0]
+                assert (radii > 0).all()
+                info["radii"] = radii[0].index_select(0, info["gaussian_ids"])
+            strategy.step_pre_backward(params, optimizers, state, step, info)
+            (renders - target).square().mean().backward()
+            strategy.step_post_backward(params, optimizers, state, step, info, packed=True)
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            counts.append(len(params["means"]))
+        return counts, state
+
+    (counts, state), (expected, wanted) = fit(False), fit(True)
+    assert len(set(expected)) > 1  # it did split and duplicate
+    assert counts == expected
+    for name in ("grad2d", "count", "radii"):
+        assert torch.equal(state[name], wanted[name])
