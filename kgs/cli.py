@@ -17,7 +17,7 @@ from importlib import import_module
 from itertools import pairwise
 from typing import Annotated, Any, get_type_hints
 
-from .errors import DataError, TrainingDiverged
+from .errors import DataError, TrainingDiverged, printable
 from .fit.commands import demo, evaluate, fit
 from .fit.config import FAST, PRESETS, FitConfig, Recipe
 from .fit.splat_commands import page, render
@@ -84,11 +84,14 @@ def _exit_code(words: list[str]) -> int:
     except ValueError as error:
         message = re.sub(r"^(\w+)( \(--[\w-]+\))?(?=:)", lambda name: names.get(name[1], name[0]), str(error))
     except TrainingDiverged as error:
-        message, code = f"training diverged: {error}", 1
+        message, code = printable(f"training diverged: {error}"), 1
     except BrokenPipeError:
         code = 0  # head has read what it wanted
     except OSError as error:
-        message, code = f"{error.filename or ''}: {error.strerror}".lstrip(": "), 2 if error.errno in _USERS else 1
+        message, code = (
+            f"{printable(error.filename or '')}: {error.strerror}".lstrip(": "),
+            2 if error.errno in _USERS else 1,
+        )
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not re.search("allocate|out of memory", str(error)):
             raise

@@ -3,6 +3,11 @@
 from os import PathLike
 
 
+def printable(text: object) -> str:
+    """Text for one line of a message: control characters, which names of files may have, become escapes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+
+
 class DataError(Exception):
     """A file or folder does not hold what it should.
 
@@ -18,7 +23,7 @@ class DataError(Exception):
 
     def __str__(self) -> str:
         where = f"{self.path}: {self.field}" if self.field else f"{self.path}"
-        return f"{where}: {self.reason}"
+        return f"{printable(where)}: {self.reason}"
 
 
 class TrainingDiverged(RuntimeError):

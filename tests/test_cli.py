@@ -169,6 +169,11 @@ def test_mistakes_are_one_line_and_exit_code_2(folder, tmp_path, capsys, argumen
     assert os.listdir(tmp_path) == []  # nothing was begun
 
 
+def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
+    assert run("eval", tmp_path / "a\nb") == 2
+    assert r"a\nb" in one_line(capsys)
+
+
 def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40) == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())

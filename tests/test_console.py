@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from kgs.io.console import progress, say
+from kgs.errors import DataError
+from kgs.io.console import as_line, progress, say
 
 
 class Terminal(io.StringIO):
@@ -59,3 +60,10 @@ def test_a_reader_that_has_gone_ends_nothing(monkeypatch, kind):
     with progress(2, "fit") as advance:
         advance()
         advance()
+
+
+def test_control_characters_in_names_become_escapes(capsys):
+    say("one\x1b[31m\ntwo\r")
+    assert capsys.readouterr().out == "one\\x1b[31m\ntwo\\r\n"
+    assert str(DataError("a\nb", "c\nd", "is missing")) == "a\\nb: c\\nd: is missing"
+    assert as_line("kgs", "a b", "it's\na \\") == r"kgs 'a b' $'it\'s\na \\'"

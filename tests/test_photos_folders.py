@@ -105,7 +105,7 @@ def test_one_photo_twice(folder, refused):
 
 def test_one_photo_twice_saved_anew(folder, refused):
     save(folder, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"])
-    refused(folder, "1.png and 2.jpg show the same from the same place: remove one of them")
+    refused(folder, "1.png and 2.jpg match at the same pixels", "remove one of them")
 
 
 def test_upright_and_lying_photos(folder, refused):

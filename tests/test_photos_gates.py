@@ -98,5 +98,8 @@ def test_photos_that_can_give_no_cameras():
     deep, flat, same = Look(30.0, 0.5), Look(30.0, 0.99), Look(0.1, 1.0)
     assert unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, flat) | {("a", "c"): deep}) == ""
     assert "only turned on the spot" in unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, flat))
-    assert "a and b show the same" in unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, deep) | {("a", "b"): same})
+    said = unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, deep) | {("a", "b"): same})
+    assert "a and b" in said
+    assert "remove one of them" in said
+    assert "watermark" in said  # matches at the same pixels can be those of what is printed on the photos
     assert "no two of the 3" in unfit(NAMES, dict.fromkeys(PAIRS, 0), {})

@@ -18,7 +18,7 @@ import torch
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError, TrainingDiverged
 from kgs.fit import run
-from kgs.fit.checkpoint import load_checkpoint
+from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.run import fit_scene
 from kgs.fit.saved import load_fit
@@ -135,6 +135,45 @@ def test_results_that_cannot_be_written_leave_the_old_ones(
     monkeypatch.undo()
     assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 3"  # the training is not lost
     assert seed_of(done) == 1
+
+
+def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
+    scene: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """The disk fills up during the training: splat and curve still fit on it, the first test picture does not."""
+
+    def full(path: Any, *_: Any) -> Any:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Trainer, "save", full)
+    monkeypatch.setattr(run, "write_png", full)
+    lines: list[str] = []
+    with pytest.raises(OSError, match="space") as error:
+        fit_scene(scene, CONFIG, tmp_path, say=lines.append)
+    unfinished = tmp_path / "unfinished"
+    assert error.value.filename == str(unfinished / "test" / "test_00.png")
+    assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(unfinished))
+    assert any(line.startswith(f"{unfinished}: holds the results") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"near_plane": -1.0}, "near_plane"),
+        ({"near_plane": "near"}, "near_plane"),
+        ({"step": -5}, "step"),
+        ({"backend": "foo"}, "backend"),
+        ({"poses": {"extrinsics": [1.0]}}, "poses"),
+        ({"poses": "none"}, "model"),
+    ],
+)
+def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], field: str) -> None:
+    path = done / CHECKPOINT
+    save_checkpoint(path, load_checkpoint(path) | changes)
+    previous(path).unlink(missing_ok=True)
+    with pytest.raises(DataError) as error:
+        load_fit(done)
+    assert (error.value.path, error.value.field) == (path, field)
 
 
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])

@@ -124,13 +124,6 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
     return {"training": of(scene.train), "test": of(scene.test), "background": _digest(scene.background)}
 
 
-def check_plain_values(state: dict[str, Any]) -> None:
-    """A KeyError, TypeError or ValueError unless a state has all of its plain values, each in its range."""
-    for name, (expected, is_right) in PLAIN.items():
-        if not is_right(state[name]):
-            raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
-
-
 def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
     """A KeyError, TypeError or ValueError unless a state is of this fingerprint and configuration.
 
@@ -164,6 +157,14 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
     if max(state["stack"], default=0) >= len(scene["training"]["names"]):
         raise ValueError(f"stack: expected views of the scene, got {state['stack']!s:.80}")
     return notes
+
+
+def check_plain(state: dict[str, Any], *names: str) -> None:
+    """A KeyError or ValueError where one of these plain values of a state is missing or wrong."""
+    for name in names:
+        expected, is_right = PLAIN[name]
+        if not is_right(state[name]):
+            raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
 
 
 def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], flag: str = "--") -> None:

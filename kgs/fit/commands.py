@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from kgs.errors import DataError
+from kgs.errors import DataError, printable
 from kgs.io.console import VIEWER, as_line, say, say_next
 
 from .config import DEMO, Backend, Background, FitConfig
@@ -55,7 +55,7 @@ def demo(
         say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
     gain = level["with"][0] - level["without"][0]
     say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
-    say(f"pictures: {out / 'demo.png'}, {out / 'curve.png'}")
+    say(f"pictures: {printable(out / 'demo.png')}, {printable(out / 'curve.png')}")
     say_next(
         f"open {as_line(out / 'index.html')} in a browser",
         "kgs fit PHOTOS -o OUT  # three or more photos of your own",
@@ -135,7 +135,7 @@ def fit(
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder with -o")
     loaded = _load(request, place)
     height, width = loaded.train.images.shape[-2:]
-    say(f"{scene}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     minutes = expected_minutes(width * height, config)
     if minutes > 2 and config.device == "cpu" and config.minutes is None:
         say(f"expect about {minutes:.0f} minutes on a CPU; see --fast, --minutes, --downscale")
@@ -150,7 +150,7 @@ def fit(
     posed = out if bare else scene
     splat, renders, by = (out / UNFINISHED if kept else out) / "splat.ply", out / "renders", request["downscale"]
     shrunk = ("--downscale", f"{by:g}") if by else ()
-    say(f"{splat}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
+    say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if what := left_out(metrics["needs"]):
         say(f"left out: {what}")
     if stopped_by:
@@ -197,7 +197,7 @@ def evaluate(
     write_json(path, metrics)
     refresh_page(out, saved, scene, metrics)
     say(in_words(metrics))
-    say(f"{path} and {out / PAGE} are up to date")
+    say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")
 
 

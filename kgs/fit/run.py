@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError
+from kgs.errors import DataError, printable
 from kgs.init_points import FirstPoints, first_points
 from kgs.io.console import Stage, each, progress, say, silent
 from kgs.io.figures import write_curve
@@ -117,7 +117,7 @@ def fit_scene(
             say(f"resumed at step {trainer.step}")
         else:
             if is_own(out / "splat.ply"):
-                say(f"{out}: the fit there will be replaced when this one is done (--resume would go on with it)")
+                say(f"{printable(out)}: the fit there is replaced when this one is done (--resume would go on with it)")
             begun = time.perf_counter()
             config, needs = decide(scene, config, choose_points, each)
             points = choose_points(scene, config, each)
@@ -129,7 +129,7 @@ def fit_scene(
             say(f"memory: at most {most_bytes(trainer) / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
-        told = len(trainer.notes)
+        told, is_trained = len(trainer.notes), False
         try:
             if source != new:
                 start_folder(new)
@@ -138,6 +138,7 @@ def fit_scene(
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
             write_json(new / "config.json", settings)
             stopped_by = train(trainer, new / CHECKPOINT)
+            is_trained = True
             save_ply(new / "splat.ply", trainer.shown, offset=scene.offset)
             write_curve(new / "curve.png", {"": trainer.curve})
             write_exports(trainer, new)
@@ -150,11 +151,16 @@ def fit_scene(
             if before_publish is not None:
                 before_publish(Finished(new, out, trainer, metrics, settings))
         except BaseException:
-            if not trainer.saved:  # nothing was trained
+            if is_trained:
+                for note in trainer.notes[told:]:
+                    say(note)
+                say(f"{printable(new)}: holds the results that could be written")
+            elif not trainer.saved:
                 shutil.rmtree(new, ignore_errors=True)
             raise
         if stopped_by and is_finished(out):
-            trainer.note(f"{out} keeps its finished fit; this one is in {new}, and --resume goes on with it")
+            kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
+            trainer.note(f"{kept}, and --resume goes on with it")
         else:
             publish(out)
         for note in trainer.notes[told:]:

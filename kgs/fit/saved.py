@@ -15,7 +15,7 @@ from kgs.io.results_folder import CHECKPOINT, end_stopped_move
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .checkpoint import newest_checkpoint
+from .checkpoint import check_plain, newest_checkpoint
 from .config import FitConfig
 from .poses import place_cameras
 
@@ -79,10 +79,19 @@ def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
     path = out / CHECKPOINT
     state, _ = newest_checkpoint(path)
     try:
+        check_plain(state, "backend", "near_plane", "step")
+    except KeyError as error:
+        raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint, got none") from error
+    except ValueError as error:
+        field, _, reason = str(error).partition(": ")
+        raise DataError(path, field, reason) from error
+    try:
         model = GaussianModel(**state["model"])
         model = (model.select(**part) if (part := state.get("shown")) else model).to(device)
-        backend = str(state.get("backend", "torch")) if model.means.device.type == "cpu" else "auto"
+        backend = state["backend"] if model.means.device.type == "cpu" else "auto"
         poses = (state.get("poses") or {}).get("extrinsics")
-        return SavedFit(request, config, model, float(state["near_plane"]), int(state["step"]), backend, poses)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error
+    if poses is not None and not (isinstance(poses, Tensor) and poses.shape[1:] == (4, 4)):
+        raise DataError(path, "poses", "expected extrinsics (V, 4, 4), got others")
+    return SavedFit(request, config, model, float(state["near_plane"]), state["step"], backend, poses)

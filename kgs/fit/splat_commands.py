@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from kgs.errors import printable
 from kgs.io.console import VIEWER, as_line, each, say, say_next
 
 from .config import Backend, Background, Recipe
@@ -55,7 +56,7 @@ def render(
             seen = renderer(model(), move_camera(camera, place), behind, outputs)
         image = torch.cat([seen.image / seen.alpha.clamp_min(1e-6), seen.alpha], 1) if clear else seen.image
         write_png(out / names[name], image[0])
-    say(f"{len(names)} pictures in {out}")
+    say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))
 
 
@@ -122,9 +123,12 @@ def page(
     near_plane = renderer.options.near_plane
     cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
     level = runs[""]["views"]["psnr"]
-    say(f"{out}: {len(model)} Gaussians, {len(scene.train)} photos" + (f", PSNR {level:.4g}" if level else ""))
+    say(
+        f"{printable(out)}: {len(model)} Gaussians, {len(scene.train)} photos"
+        + (f", PSNR {level:.4g}" if level else "")
+    )
     if cost:
-        say(f"to keep the page small it shows {cost}; {ply} has everything")
+        say(f"to keep the page small it shows {cost}; {printable(ply)} has everything")
     say_next(f"open {as_line(out)} in a browser")
 
 

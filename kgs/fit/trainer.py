@@ -33,7 +33,7 @@ from kgs.types import check_kind
 
 from .checkpoint import (
     PLAIN,
-    check_plain_values,
+    check_plain,
     check_state,
     fingerprint,
     load_moments,
@@ -88,7 +88,7 @@ class Start:
     def from_state(cls, state: dict[str, Any], config: FitConfig) -> Self:
         """The Gaussians of :meth:`Trainer.state_dict`; a ValueError where the state is not whole."""
         with _state_errors():
-            check_plain_values(state)
+            check_plain(state, *PLAIN)
             model = GaussianModel(**copy.deepcopy(state["model"]))
             if model.max_sh_degree != (config.sh_degree or 0) or model.means.dtype != torch.float32:
                 raise ValueError(f"model: expected float32 and harmonics of degree {config.sh_degree}, got others")

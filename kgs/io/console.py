@@ -6,16 +6,20 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
+from kgs.errors import printable
+
 VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a next step
 Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
 
 def say(line: str, file: TextIO | None = None) -> None:
-    """Print a line, on stdout unless told otherwise, and flush it.
+    """Print one or more lines, on stdout unless told otherwise, and flush them.
 
-    Letters that the terminal does not have become escapes. Where the reader has gone (a closed pipe) nothing happens.
+    Control characters, and letters that the terminal does not have, become escapes. Writing to a closed pipe does
+    nothing.
     """
     stream = sys.stdout if file is None else file
+    line = "\n".join(map(printable, line.split("\n")))
     with suppress(OSError, ValueError, AttributeError):  # closed by the reader, closed by the program, none at all
         encoding = stream.encoding or "utf-8"
         print(line.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
@@ -27,8 +31,15 @@ def say_next(*steps: str) -> None:
 
 
 def as_line(*words: object) -> str:
-    """Words as one types them in a shell."""
-    return shlex.join(map(str, words))
+    """Words as one types them in a shell, on one line."""
+    return " ".join(_quoted(str(word)) for word in words)
+
+
+def _quoted(word: str) -> str:
+    if word.isprintable():
+        return shlex.quote(word)
+    escaped = word.replace("\\", "\\\\").replace("'", "\\'")
+    return f"$'{printable(escaped)}'"
 
 
 @contextmanager

@@ -76,6 +76,8 @@ def write_film(
         with open(part, "ab") as file:  # an element of EBML that players skip
             file.write(b"\xec" + bytes([0x80 | len(MARK)]) + MARK)
         os.replace(part, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         part.unlink(missing_ok=True)
     return ""

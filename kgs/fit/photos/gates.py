@@ -112,7 +112,11 @@ def unfit(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Lo
         looks: how they lie, of the pairs that overlap.
     """
     if twins := [pair for pair, look in looks.items() if look.shift < _SAME_PLACE]:
-        return f"{' and '.join(twins[0])} show the same from the same place: remove one of them"
+        one, other = twins[0]
+        return (
+            f"{one} and {other} match at the same pixels: either they show the same from the same place, so remove one "
+            "of them; or they carry the same watermark, caption or frame, so crop it from all photos"
+        )
     groups = groups_of(names, pairs)
     if len(groups) == 1 and min(look.flat for look in looks.values()) < _FLAT:
         return ""
