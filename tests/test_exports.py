@@ -66,6 +66,9 @@ def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> 
         scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
         shown, notes = random_model(), list[str]()
 
+        def note(self, text: str) -> None:
+            self.notes.append(text)
+
         def render(self, camera: PinholeCamera) -> torch.Tensor:
             return torch.zeros(1, 3, int(camera.height), int(camera.width))
 

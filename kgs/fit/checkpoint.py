@@ -22,15 +22,11 @@ from torch import Tensor
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
 from kgs.io.json_files import is_number, parse_json
+from kgs.io.results_folder import previous
 
 from .config import FitConfig
 
 _FORMAT, _OLD = "kgs-checkpoint 3", b"kgs-checkpoint "
-
-
-def previous(path: Path) -> Path:
-    """Where the checkpoint before the one at `path` is."""
-    return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:

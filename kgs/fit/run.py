@@ -19,13 +19,13 @@ from kgs.io.figures import write_curve
 from kgs.io.json_files import write_json
 from kgs.io.outputs import check_folder, is_own, png_names, start_folder, write_png
 from kgs.io.ply import save_ply
-from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
+from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, previous, publish, taken
 from kgs.machine import bytes_of, check_tools, peak_rss_mb, versions
 from kgs.metrics.coverage import measure_coverage
 from kgs.metrics.evaluate import evaluate
 from kgs.metrics.lpips import Lpips
 
-from .checkpoint import previous, save_checkpoint
+from .checkpoint import save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
 from .minutes import steps_within

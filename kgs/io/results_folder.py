@@ -12,16 +12,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from kgs.errors import DataError
-from kgs.fit.checkpoint import previous
 
 from .json_files import read_json, write_json
 from .outputs import EXPORTS, is_own, remove_others
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
 UNFINISHED, _FINISHED = "unfinished", "finished"
 _LIST = "files.json"  # all files of the new result
-_OPTIONAL = (previous(Path(CHECKPOINT)).name, "turntable.webm", "checkpoint.pt", "checkpoint.previous.pt")  # old
+_OPTIONAL = (PREVIOUS, "turntable.webm", "checkpoint.pt", "checkpoint.previous.pt")  # old
 
 
 @contextmanager
@@ -44,6 +43,11 @@ def held(path: Path) -> Iterator[bool]:
         except OSError:
             pass  # a file system without locks
         yield ours
+
+
+def previous(path: Path) -> Path:
+    """Where the checkpoint before the one at `path` is."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 @contextmanager
