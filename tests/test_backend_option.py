@@ -74,7 +74,9 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
 
 
-@pytest.mark.parametrize("words", [["fit", "{scene}"], ["demo"], ["render", "x.ply", "--cameras", "{scene}"]])
+@pytest.mark.parametrize(
+    "words", [["fit", "{scene}"], ["demo"], ["render", "{scene}/transforms_train.json", "--cameras", "{scene}"]]
+)
 def test_numba_that_is_not_installed_is_one_line_before_any_work(installed, folder, tmp_path, capsys, words):
     installed(False)
     words = [word.format(scene=folder) for word in words]

@@ -15,8 +15,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
+from kgs.cli.render import render
 from kgs.fit import exports
-from kgs.fit.splat_commands import render
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
 from kgs.io.json_files import write_json

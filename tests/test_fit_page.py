@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import torch
 
+from kgs.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
-from kgs.fit.commands import evaluate
 from kgs.fit.config import FitConfig
 from kgs.fit.saved import load_fit
 from kgs.init_points import FirstPoints

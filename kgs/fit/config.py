@@ -12,8 +12,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
-from kgs.types import RasterOptions
-
 
 class _Range(NamedTuple):
     """What a number may be; `ends` says which of the two limits belong to it, "[" and "]" that they do."""
@@ -165,7 +163,7 @@ class FitConfig:
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
     growth: _Share = 0.0
     keep_all: bool = False
-    max_bytes: Annotated[int, _Range(1, 2**62)] = RasterOptions.max_bytes
+    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # as of RasterOptions, which would import torch
     evaluations: _Steps = 8
     device: str = "cpu"
     backend: Backend = "auto"
