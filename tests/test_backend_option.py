@@ -70,7 +70,7 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
     for asked in ("auto", begun):
         resumed = Trainer.resume(scene, replace(CONFIG, backend=asked), tmp_path / CHECKPOINT)
         assert (resumed.backend, resumed.renderer.backend) == (begun, begun)
-    with pytest.raises(DataError, match=f"--backend: expected '{begun}', as the fit was begun with, got '{other}'"):
+    with pytest.raises(DataError, match=f"backend: expected '{begun}', as the fit was begun with, got '{other}'"):
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
 
 

@@ -61,7 +61,7 @@ def folder(tmp_path):
 
 
 def test_no_folder(tmp_path, refused):
-    refused(tmp_path / "none", "expected a folder, there is none")
+    refused(tmp_path / "none", "expected a file or folder that is there, found none")
 
 
 def test_an_empty_folder(folder, refused):
@@ -182,7 +182,7 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
         (folder, "the photos themselves"),
         *((tmp_path / n, "kgs did not write") for n in ("scene", "other")),
     ):
-        refused(folder, "choose another folder with -o", out=out)
+        refused(folder, "choose another folder", out=out)
         with pytest.raises(DataError, match=f"{said}.*: choose another folder"):
             pose_photos(folder, out)
 
@@ -193,13 +193,13 @@ def test_a_users_own_folders_stay(folder, tmp_path, refused, name):
     mine = tmp_path / "project" / name / "deeper" / "IMG_1.HEIC"
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b"mine")
-    refused(write_planes(folder), "choose another folder with -o", out=tmp_path / "project", kept=True)
+    refused(write_planes(folder), "choose another folder", out=tmp_path / "project", kept=True)
     assert mine.read_bytes() == b"mine"
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     images = write_planes(tmp_path / "images")
-    refused(images, "choose another folder with -o", out=tmp_path)
+    refused(images, "choose another folder", out=tmp_path)
     for path in images.iterdir():  # as renders of kgs are
         write_png(path, torch.rand(3, 8, 8))
     with pytest.raises(DataError, match="holds the photos themselves"):
@@ -210,7 +210,7 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
 def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
     out = tmp_path / "project"
     out.mkdir()
-    for name in ("checkpoint.safetensors", "checkpoint.pt"):
+    for name in ("checkpoint.safetensors", "checkpoint.previous.safetensors"):
         (out / name).write_bytes(b"mine")
         refused(write_planes(folder), f"{name}: was not written by kgs", out=out)
         assert (out / name).read_bytes() == b"mine"

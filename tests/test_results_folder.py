@@ -81,7 +81,7 @@ def seed_of(out: Path) -> int:
 
 
 def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> None:
-    with locked(tmp_path), pytest.raises(DataError, match="another fit is at work in this folder.*--out"):
+    with locked(tmp_path), pytest.raises(DataError, match="another fit is at work in this folder"):
         fit(scene, CONFIG, tmp_path)
     fit(scene, CONFIG, tmp_path)
 
@@ -198,19 +198,11 @@ def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, 
 
 
 def test_no_pictures_or_checkpoints_of_the_former_fit_stay(scene: Any, done: Path) -> None:
-    (done / "checkpoint.pt").write_bytes(b"kgs-checkpoint 2 ")
     (done / "test" / "notes.txt").write_text("mine")
     fit(replace(scene, test=scene.test.select([1])), OTHER, done)
     assert len(list((done / "test").glob("*.png"))) == 1
     assert (done / "test" / "notes.txt").exists()
-    assert not (done / "checkpoint.pt").exists()
     assert seed_of(done) == 1
-
-
-def test_an_old_checkpoint_is_refused_in_one_line(scene: Any, tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.pt").write_bytes(b"kgs-checkpoint 2 ")
-    with pytest.raises(DataError, match=r"checkpoint\.pt: is a checkpoint of an older version.*without --resume"):
-        fit(scene, CONFIG, tmp_path, resume=True)
 
 
 def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:
@@ -242,7 +234,7 @@ def test_the_finished_fit_is_resumed_where_another_was_left_unfinished(scene: An
     assert json.loads((done / "metrics.json").read_text())["steps"] == 5
 
 
-@pytest.mark.parametrize("name", ["finished", "unfinished", CHECKPOINT, "checkpoint.previous.pt"])
+@pytest.mark.parametrize("name", ["finished", "unfinished", CHECKPOINT, previous(Path(CHECKPOINT)).name])
 def test_what_another_program_or_person_made_stays(scene: Any, tmp_path: Path, name: str) -> None:
     mine = tmp_path / name / "thesis.txt" if "." not in name else tmp_path / name
     mine.parent.mkdir(exist_ok=True)

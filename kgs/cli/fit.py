@@ -85,7 +85,7 @@ def fit(
     if bare := is_bare(scene):
         request, place = find_scene(scene, out, request, config)
     elif is_own(out / CAMERAS_REPORT):
-        raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder with -o")
+        raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     loaded = load(request, place)
     height, width = loaded.train.images.shape[-2:]
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")

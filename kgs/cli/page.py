@@ -56,7 +56,7 @@ def page(
     if out.suffix != ".html":
         raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
     if out.exists() and not is_own(out):
-        raise DataError(out, "", "was not written by kgs and would be overwritten: choose another file with -o")
+        raise DataError(out, "", "was not written by kgs and would be overwritten: choose another file")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
     scene = load_cameras(cameras, downscale, background=background, hold_out=0)

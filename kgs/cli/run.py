@@ -155,6 +155,7 @@ def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
     parameters = inspect.signature(command).parameters
     if "config" in parameters:
         paths |= {entry.name: f"recipe.{entry.name}" for entry in fields(Recipe)}
+        paths |= {f"recipe.{entry.name}": f"recipe.{entry.name}" for entry in fields(Recipe)}
         paths |= {entry.name: entry.name for entry in fields(FitConfig)}
     paths |= {name: name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY}
     paths |= _OTHER_NAMES

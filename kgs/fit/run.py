@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from kgs.io.json_files import write_json
 from kgs.io.outputs import check_folder, is_own, png_names, start_folder, write_png
 from kgs.io.ply import save_ply
 from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, previous, publish, taken
-from kgs.machine import bytes_of, check_tools, peak_rss_mb, versions
+from kgs.machine import check_tools, peak_rss_mb, versions
 from kgs.metrics.coverage import measure_coverage
 from kgs.metrics.evaluate import evaluate
 from kgs.metrics.lpips import Lpips
@@ -28,7 +27,7 @@ from kgs.metrics.lpips import Lpips
 from .checkpoint import save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
-from .minutes import steps_within
+from .forecast import forecast
 from .probes import decide
 from .prune import prune
 from .trainer import Trainer
@@ -117,16 +116,12 @@ def fit_scene(
             say(f"resumed at step {trainer.step}")
         else:
             if is_own(out / "splat.ply"):
-                say(f"{printable(out)}: the fit there is replaced when this one is done (--resume would go on with it)")
-            begun = time.perf_counter()
-            config, needs = decide(scene, config, choose_points, each)
+                say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
             points = choose_points(scene, config, each)
             say(f"first points: {len(points.points)} ({points.kind})")
-            if config.minutes is not None:
-                config = replace(config, steps=steps_within(scene, config, points, begun))
-                say(f"{config.minutes:g} minutes: {config.steps} steps")
+            say(forecast(scene.train.images, len(points.points), config))
+            config, needs = decide(scene, config, choose_points, each)
             trainer = Trainer(scene, config, points, needs)
-            say(f"memory: at most {most_bytes(trainer) / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
         told, is_trained = len(trainer.notes), False
@@ -160,7 +155,7 @@ def fit_scene(
             raise
         if stopped_by and is_finished(out):
             kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
-            trainer.note(f"{kept}, and --resume goes on with it")
+            trainer.note(f"{kept}, where a resumed fit goes on")
         else:
             publish(out)
         for note in trainer.notes[told:]:
@@ -173,7 +168,7 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
     errors = []
     for folder in (out / UNFINISHED, out):
         path = folder / CHECKPOINT
-        if any(file.exists() for file in (path, previous(path), path.with_suffix(".pt"))):
+        if any(file.exists() for file in (path, previous(path))):
             try:
                 return Trainer.resume(scene, config, path), folder
             except DataError as error:
@@ -181,11 +176,6 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
     if errors:
         raise errors[0]
     return None, out
-
-
-def most_bytes(trainer: Trainer) -> int:
-    """A bound for the bytes that a fit takes beyond what there is now, known before it begins."""
-    return trainer.config.max_bytes + bytes_of(trainer.max_gaussians, trainer.scene.train.images)
 
 
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
@@ -227,7 +217,8 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
-            raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
+            reason = f"expected points of the layout itself for the init {kind!r}, got none"
+            raise DataError(scene.root, "points", reason)
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     rules: dict[str, Any] = {"seed": config.seed, "count": config.init_points, "draw": config.draw}

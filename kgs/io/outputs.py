@@ -26,8 +26,8 @@ FOLDER_MARK = ".kgs"  # an empty file in a folder that kgs made for a while
 EXPORTS = ("cameras.json", "splat.glb", "turntable.webm")  # for other programs
 _MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
 _MARKS |= {".html": (b'<meta name="generator" content="kgs ',)}
+_MARKS |= {".safetensors": (b"kgs-checkpoint ",)}
 _MARKS |= {".glb": (b'"generator":"kgs ',), ".webm": (FILM_MARK,)}
-_MARKS |= {suffix: (b"kgs-checkpoint ",) for suffix in (".safetensors", ".pt")}
 _DEEP = (".json", ".webm", ".safetensors")  # the mark may stand far behind
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
@@ -40,7 +40,7 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
     `files`, relative to `out`, are what it is going to write; `scene` is a folder whose own photos it must not write
     beside. With `make` False it only looks. A folder that will not do is a DataError.
     """
-    advice = "choose another folder with -o"
+    advice = "choose another folder"
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
         raise DataError(out, "", f"expected a folder for results, but {there} is none")

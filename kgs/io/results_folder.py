@@ -20,7 +20,7 @@ CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensor
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
 UNFINISHED, _FINISHED = "unfinished", "finished"
 _LIST = "files.json"  # all files of the new result
-_OPTIONAL = (PREVIOUS, "turntable.webm", "checkpoint.pt", "checkpoint.previous.pt")  # old
+_OPTIONAL = (PREVIOUS, "turntable.webm")
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def locked(out: Path) -> Iterator[None]:
     """Keep other fits out of a folder until the block or the process ends; DataError where one is at work there."""
     with held(out / ".lock") as ours:
         if not ours:
-            raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another --out")
+            raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another folder")
         yield
 
 

@@ -94,7 +94,6 @@ def write_page(
         "size": scene["cameras"][0]["size"][::-1],
         "scene": scene,
         "levels": levels(runs),
-        "estimate": found if (found := first.get("estimate")) and found["psnr"] is not None else None,
         "nothing_held_out": bool(first.get("train")) and not first.get("test"),
         "notes": [shareable(note) for note in notes],
         "measures_head": head,

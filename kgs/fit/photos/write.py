@@ -28,7 +28,7 @@ UNFINISHED, WAITING = "unfinished-photos", "finished-photos"
 
 def check_place(out: Path, folder: Path) -> None:
     """A DataError where the results would lie among the user's photos or in place of files of another program."""
-    advice, photos = "choose another folder with -o", folder.resolve()
+    advice, photos = "choose another folder", folder.resolve()
     replaced = [out / name for name in (IMAGES, "sparse", UNFINISHED, WAITING)]
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
         raise DataError(out, "", f"holds the photos themselves: {advice}")
