@@ -55,18 +55,6 @@ def within(name, *modules):
 def floor(name):
     if within(name, "kgs.losses", "kgs.datasets"):
         return name.split(".")[1]
-    if within(
-        name,
-        "kgs.fit.commands",
-        "kgs.fit.demo",
-        "kgs.fit.splat_commands",
-        "kgs.fit.photos.entry",
-        "kgs.fit.photos.estimate",
-        "kgs.fit.photos.locate",
-    ):
-        return "cli"  # of which they are parts
-    if within(name, "kgs.fit.photos", "kgs.fit.keypoints"):
-        return "sfm"
     above = [floor for floor in FLOORS[1:] if within(name, f"kgs.{floor}")]
     return above[0] if above else "core"
 

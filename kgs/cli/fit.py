@@ -65,7 +65,7 @@ def fit(
     """
     del preset, fast  # `defaults` has read them
     from kgs.datasets.layouts import CAMERAS_REPORT
-    from kgs.fit.photos.entry import find_scene, is_bare, settle
+    from .unposed import find_scene, is_bare, settle
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
     from kgs.io.outputs import check_folder, is_own

@@ -11,14 +11,13 @@ from photo_folders import close, exif, planes, with_exif, write_photos, write_pl
 
 from kgs.cli import main
 from kgs.errors import DataError
-from kgs.fit import photos
-from kgs.fit.photos import pose_photos
-from kgs.fit.photos.entry import settle
-from kgs.fit.photos.read import blurred, read_photos
-from kgs.fit.photos.write import end_move
+from kgs.cli.unposed import settle
 from kgs.io.console import silent
 from kgs.io.json_files import write_json
 from kgs.io.outputs import PNG_MARK, start_folder, write_png
+from kgs.sfm import pose, pose_photos
+from kgs.sfm.read import blurred, read_photos
+from kgs.sfm.write import end_move
 
 pytest.importorskip("pycolmap")
 
@@ -254,7 +253,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         """How many photos the cameras in their place are of."""
         return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
 
-    monkeypatch.setattr(photos, "find_cameras", find)
+    monkeypatch.setattr(pose, "find_cameras", find)
     assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
     assert placed() == (3, 3)
     (out / "splat.ply").write_bytes(b"ply")
@@ -287,6 +286,6 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
     def fail(*arguments):
         raise error
 
-    monkeypatch.setattr(f"kgs.fit.photos.{stage}", fail)
+    monkeypatch.setattr(f"kgs.sfm.{stage}", fail)
     refused(write_planes(folder), said, code=code)
     assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]

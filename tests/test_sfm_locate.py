@@ -8,10 +8,10 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
-from kgs.fit.photos.locate import locate
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
 from kgs.geometry import camera_centers
+from kgs.sfm.locate import locate
 
 
 @pytest.fixture(scope="module")

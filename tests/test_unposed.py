@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
-from kgs import cli
+from kgs import cli, sfm
 from kgs.datasets import synthetic_scene
 from kgs.datasets.layouts import nearest_scene
-from kgs.fit import photos
-from kgs.fit.photos.entry import is_bare
+from kgs.cli.unposed import is_bare
 from kgs.io.json_files import write_json
+from kgs.sfm import estimate as estimate_module
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
@@ -106,7 +106,7 @@ def test_photos_are_told_from_scenes(folder, tmp_path, asked):
     bare = folder(4)
     assert is_bare(bare)
     assert not is_bare(tmp_path / "nothing")
-    photos.pose_photos(bare, bare / "out")
+    sfm.pose_photos(bare, bare / "out")
     assert is_bare(bare)  # what kgs made of them does not count
     assert not is_bare(bare / "out")
     (bare / "scene" / "sparse" / "0").mkdir(parents=True)

@@ -19,7 +19,7 @@ from kgs.errors import DataError
 from kgs.io.json_files import read_json, write_json
 from kgs.io.outputs import is_own, write_png
 
-from .mapping import Cameras, quiet_pycolmap
+from .map import Cameras, quiet_pycolmap
 from .read import Photo
 
 REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"

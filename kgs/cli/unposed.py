@@ -34,7 +34,7 @@ def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConf
     Raises:
         DataError: as of `pose_photos`.
     """
-    from . import pose_photos
+    from kgs.sfm import pose_photos
 
     report = pose_photos(photos, out, seed=config.seed, wait=True, stage=each, say=say)
     count, longest = len(report["photos"]), max(report["size"])
@@ -47,7 +47,7 @@ def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConf
 
 def settle(out: Path) -> None:
     """Put cameras that waited for a fit in their place, beside its results."""
-    from .write import end_move
+    from kgs.sfm.write import end_move
 
     with locked(out):
         end_move(out)
