@@ -13,7 +13,6 @@ from kgs.datasets import synthetic_scene
 from kgs.datasets.layouts import nearest_scene
 from kgs.cli.unposed import is_bare
 from kgs.io.json_files import write_json
-from kgs.sfm import estimate as estimate_module
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
@@ -71,7 +70,7 @@ def asked(truth, monkeypatch):
         write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
         return report | {"folder": str(out)}
 
-    monkeypatch.setattr(photos, "pose_photos", true_cameras)
+    monkeypatch.setattr(sfm, "pose_photos", true_cameras)
     return calls
 
 

@@ -111,5 +111,5 @@ def in_words(metrics: dict[str, Any]) -> str:
         share, level, rest = (seen[name] for name in ("share", "psnr", "psnr_rest"))
         lines.append(f" test: {100 * share:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
     if not metrics["test"]:
-        lines.append("no photo was held out: how good other views are was not measured (--hold-out N)")
+        lines.append("no photo was held out: the quality of other views was not measured (see --hold-out)")
     return "\n".join(lines)
