@@ -10,8 +10,8 @@ from init_point_scenes import texture
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
 from kgs.cli import main
-from kgs.errors import DataError
 from kgs.cli.unposed import settle
+from kgs.errors import DataError
 from kgs.io.console import silent
 from kgs.io.json_files import write_json
 from kgs.io.outputs import PNG_MARK, start_folder, write_png

@@ -9,9 +9,9 @@ import pytest
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from kgs import cli, sfm
+from kgs.cli.unposed import is_bare
 from kgs.datasets import synthetic_scene
 from kgs.datasets.layouts import nearest_scene
-from kgs.cli.unposed import is_bare
 from kgs.io.json_files import write_json
 
 SIZE = (72, 96)

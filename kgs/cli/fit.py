@@ -65,7 +65,6 @@ def fit(
     """
     del preset, fast  # `defaults` has read them
     from kgs.datasets.layouts import CAMERAS_REPORT
-    from .unposed import find_scene, is_bare, settle
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
     from kgs.io.outputs import check_folder, is_own
@@ -74,6 +73,8 @@ def fit(
     from kgs.metrics.evaluate import in_words
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import write_own_page
+
+    from .unposed import find_scene, is_bare, settle
 
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
