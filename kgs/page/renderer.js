@@ -25,7 +25,7 @@ async function decodeSplat(layout, base64) {
     const largest = columns.largest[i];
     let rest = 1;
     for (let axis = 0; axis < 3; axis++) {
-      const value = columns["turn" + axis][i];
+      const value = columns["quat" + axis][i];
       turn[axis + (axis >= largest)] = value;
       rest -= value * value;
     }
@@ -80,7 +80,8 @@ class DepthOrder {
 }
 
 class SplatRenderer {
-  // `shaders` holds the sources by name; `settings` nearPlane, lowPass (in pixels of a photo) and background.
+  // `shaders` holds the sources by name.
+  // `settings` has nearPlane, lowPass (in square pixels of a photo), margin (a share of the photo's size) and background.
   constructor(canvas, splat, shaders, settings) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
     if (!gl) throw new Error("this browser has no WebGL2");
@@ -147,8 +148,19 @@ class SplatRenderer {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
   }
 
-  // `eye` has rotation (rows), position, focal and centre in pixels of the canvas, and scale: its pixels per photo's.
-  draw(eye) {
+  // The tangents x/z and y/z, at the first and at the last border of the photo and a margin outside it: kgs holds the
+  // footprint's slope between them. They depend on the photo's frame, not on the shape of the canvas.
+  tangentLimits({ size, focal, centre }) {
+    const { margin } = this.settings;
+    return [
+      size.map((side, axis) => (-0.5 - margin * side - centre[axis]) / focal[axis]),
+      size.map((side, axis) => (side - 0.5 + margin * side - centre[axis]) / focal[axis]),
+    ];
+  }
+
+  // Draws what `eye` sees: it has rotation (rows), position, and size, focal and centre in pixels of the photo.
+  // `view` has focal and centre in pixels of the canvas, and scale: how many of these a pixel of the photo takes.
+  draw(eye, view) {
     const { gl, canvas, settings, program } = this, { width, height } = canvas;
     const uniform = (kind, name, ...value) => gl["uniform" + kind](gl.getUniformLocation(program, name), ...value);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
@@ -162,12 +174,15 @@ class SplatRenderer {
     uniform("1i", "coefficients", this.splat.coefficients);
     uniform("Matrix3fv", "rotation", true, eye.rotation.flat());
     uniform("3f", "position", ...eye.position);
-    uniform("2f", "focal", ...eye.focal);
-    uniform("2f", "centre", ...eye.centre);
+    uniform("2f", "focal", ...view.focal);
+    uniform("2f", "centre", ...view.centre);
     uniform("2f", "size", width, height);
+    const [leastTangent, largestTangent] = this.tangentLimits(eye);
+    uniform("2f", "leastTangent", ...leastTangent);
+    uniform("2f", "largestTangent", ...largestTangent);
     uniform("1f", "nearPlane", settings.nearPlane);
     // The low-pass filter grows with the picture: a larger one shows the splat as it was fitted, only larger.
-    uniform("1f", "lowPass", settings.lowPass * Math.max(1, eye.scale ** 2));
+    uniform("1f", "lowPass", settings.lowPass * Math.max(1, view.scale ** 2));
     const sorted = this.order.sort(this.splat.geometry, eye.rotation, eye.position, settings.nearPlane);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
     gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.DYNAMIC_DRAW);

@@ -11,6 +11,7 @@ uniform int coefficients;     // 1, 4, 9 or 16
 uniform mat3 rotation;        // world to camera
 uniform vec3 position;        // of the camera
 uniform vec2 focal, centre, size;  // pixels of the canvas, the first pixel's centre at 0
+uniform vec2 leastTangent, largestTangent;  // x/z and y/z at which footprints stop growing, from the photo's frame
 uniform float nearPlane, lowPass;
 in vec2 corner;               // -1 or 1
 in uint gaussian;
@@ -18,7 +19,6 @@ out vec2 offset;              // from the centre, in standard deviations
 flat out vec4 colour;         // with the opacity
 
 const float ALPHA_THRESHOLD = 1.0 / 255.0;
-const float MARGIN = 0.15;    // of the image beyond its borders, where the footprint's slope stops growing
 
 vec4 texel(sampler2D source, int place) {
   return texelFetch(source, ivec2(place % texelsPerRow, place / texelsPerRow), 0);
@@ -56,9 +56,8 @@ void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // nothing is drawn
   if (point.z <= nearPlane || reach == 0.0) return;
 
-  // The first-order footprint, its slope taken at a point that is not far outside the image.
-  vec2 low = -(centre + 0.5 + MARGIN * size) / focal, high = (size - 0.5 - centre + MARGIN * size) / focal;
-  vec2 tangent = clamp(point.xy / point.z, low, high);
+  // The first-order footprint, linearised at a point that is not far outside the photo's frame.
+  vec2 tangent = clamp(point.xy / point.z, leastTangent, largestTangent);
   mat3 slope = mat3(focal.x, 0, 0, 0, focal.y, 0, -focal * tangent, 0) * (1.0 / point.z);
   mat3 covariance = mat3(second.x, second.y, second.z, second.y, second.w, third.x, second.z, third.x, third.y);
   mat3 turned = slope * rotation, footprint = turned * covariance * transpose(turned);

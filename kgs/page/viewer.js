@@ -17,14 +17,15 @@ function turned(vector, axis, angle) {
 }
 
 class Viewer {
-  // `scene` has cameras (name, part, size, focal, centre, rotation, position, distance), up, and pyramid: their size.
+  // `scene` has cameras (name, part, size, focal, centre, rotation, position, distance), first (the index of the one
+  // that the viewer opens at), up (a unit vector) and pyramid (the depth of the pyramids that stand for cameras).
   constructor(frame, renderer, scene) {
     this.canvas = frame.querySelector("canvas");
     this.overlay = frame.querySelector("svg");
     this.choice = frame.querySelector("select");  // of a camera, for the keyboard too
     Object.assign(this, { renderer, scene, waiting: false, flight: 0, dragged: 0 });
     this.pyramids = scene.cameras.map((camera, index) => this.pyramid(camera, index));
-    this.place(0);
+    this.place(scene.first);
     this.listen(frame);
     new ResizeObserver(() => this.ask()).observe(this.canvas);
     this.draw();
@@ -35,12 +36,12 @@ class Viewer {
   place(index) {
     const { rotation, position, distance, size, focal, centre } = this.scene.cameras[index];
     this.eye = { rotation, position, distance, size, focal, centre };
+    this.choice.value = index;
   }
 
   flyTo(index) {
     const from = this.eye, begin = performance.now(), flight = ++this.flight;
     this.place(index);
-    this.choice.value = index;
     const to = this.eye, still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const step = (now) => {
       if (flight !== this.flight) return;  // something else has moved the eye
@@ -111,12 +112,12 @@ class Viewer {
     this.renderer.resize(...sides);
     const scale = ratio * this.scale();
     const borders = sides.map((side, axis) => (side - scale * eye.size[axis]) / 2);
-    this.shown = {
-      ...eye, scale, sides, ratio,
+    this.view = {
+      scale, sides, ratio,
       focal: eye.focal.map((value) => scale * value),
       centre: eye.centre.map((value, axis) => borders[axis] + scale * (value + 0.5) - 0.5),
     };
-    this.renderer.draw(this.shown);
+    this.renderer.draw(eye, this.view);
     this.drawPyramids();
   }
 
@@ -133,7 +134,7 @@ class Viewer {
   }
 
   drawPyramids() {
-    const { rotation, position, focal, centre, ratio, sides } = this.shown;
+    const { rotation, position } = this.eye, { focal, centre, ratio, sides } = this.view;
     this.overlay.setAttribute("viewBox", `0 0 ${sides[0] / ratio} ${sides[1] / ratio}`);
     this.scene.cameras.forEach((camera, index) => {
       const deep = this.scene.pyramid, [width, height] = camera.size;
@@ -194,13 +195,13 @@ class Viewer {
       if (arrow && event.shiftKey) this.move(-20 * arrow[0], -20 * arrow[1]);
       else if (arrow) this.turn(0.06 * arrow[0], 0.06 * arrow[1]);
       else if (nearer) this.zoom(nearer);
-      else if (event.key === "0" || event.key === "Home") this.flyTo(0);
+      else if (event.key === "0" || event.key === "Home") this.flyTo(this.scene.first);
       else return;
       event.preventDefault();
     });
     const pyramids = frame.querySelector(".pyramids");
     this.choice.addEventListener("change", () => this.flyTo(Number(this.choice.value)));
-    frame.querySelector(".start").addEventListener("click", () => this.flyTo(0));
+    frame.querySelector(".start").addEventListener("click", () => this.flyTo(this.scene.first));
     pyramids.addEventListener("click", () => {
       const hidden = this.overlay.toggleAttribute("hidden");
       pyramids.setAttribute("aria-pressed", String(!hidden));
