@@ -3,14 +3,16 @@
 import os
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 if "torch" not in sys.modules and "GOMP_SPINCOUNT" not in os.environ:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is loaded: threads that wait yield their core
 
 from .errors import DataError, TrainingDiverged
 
+TYPE_CHECKING = False  # as type checkers know it: typing would be most of what is imported here
 if TYPE_CHECKING:
+    from typing import Any
+
     from .camera import PosedCamera, cameras
     from .densify import Densifier, DensifyReport
     from .drop import DropGaussian, drop_gaussian
@@ -51,7 +53,7 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     """Load a public name, and torch with it, when it is first asked for: the command `kgs` answers before that."""
     if name in _HOMES:
         value = getattr(import_module(f".{_HOMES[name]}", __name__), name)

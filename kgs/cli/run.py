@@ -6,6 +6,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields
 from functools import partial, wraps
 from importlib import import_module
@@ -29,7 +30,7 @@ _COMMANDS = {
     "bench extremes": ("bench", "extremes"),
     "study": ("study", "study"),
 }
-_HEAVY = ("torch", "kornia", "cv2")
+_HEAVY = ("torch", "kornia", "cv2", "numba")
 _EXTRAS = {
     "numba": "fast",
     "pi_heif": "heic",
@@ -61,7 +62,8 @@ def exit_code(words: list[str]) -> int:
         flags |= _flags_of(command)
         call = _parse(command, f"kgs {name}", words, defaults(words))
         for module in _HEAVY:
-            import_module(module)
+            with suppress(ImportError):  # numba may be missing; the command says what it needs
+                import_module(module)
         interrupt_as_usual()
         return int(call() or 0)
     except SystemExit as stop:
