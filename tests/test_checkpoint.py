@@ -11,6 +11,7 @@ import safetensors.torch
 import torch
 
 from kgs import DataError
+from kgs.fit import checkpoint
 from kgs.fit.checkpoint import _digest_all, load_checkpoint, newest_checkpoint, previous, save_checkpoint
 
 
@@ -74,7 +75,7 @@ def test_other_files_are_refused(path, content):
 
 def test_safetensors_of_other_programs_are_refused(path):
     safetensors.torch.save_file({"x": torch.ones(3)}, path, {"format": "pt"})
-    with pytest.raises(DataError, match="expected the format 'kgs-checkpoint 3', got 'pt'"):
+    with pytest.raises(DataError, match="expected the format '.*', got 'pt'"):
         load_checkpoint(path)
 
 
@@ -85,7 +86,7 @@ def test_missing_file_is_named(path):
 
 def sealed(text, tensors):
     """A file with the right checksum."""
-    metadata = {"format": "kgs-checkpoint 3", "state": text, "sha256": _digest_all(text, tensors)}
+    metadata = {"format": checkpoint._FORMAT, "state": text, "sha256": _digest_all(text, tensors)}
     return safetensors.torch.save(tensors, metadata)
 
 

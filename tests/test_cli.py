@@ -49,7 +49,7 @@ def test_metrics_have_the_agreed_keys(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
         "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "needs", "steps", "seed", "drop", "init",
-        "backend", "protocol", "versions", "seen", "poses",
+        "backend", "protocol", "versions", "seen", "poses", "generator",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None
@@ -182,7 +182,7 @@ def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
 def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40) == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(runs) == {"without", "with"}
+    assert set(runs) == {"generator", "without", "with"}
     assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, 0.2)
     assert runs["without"]["init"] == runs["with"]["init"]
     gain = runs["with"]["test"]["psnr"] - runs["without"]["test"]["psnr"]

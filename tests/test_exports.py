@@ -20,7 +20,8 @@ from kgs.fit import exports
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
 from kgs.io.json_files import write_json
-from kgs.io.outputs import EXPORTS, is_own
+from kgs.io.outputs import EXPORTS
+from kgs.io.ownership import is_own
 
 
 def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ from kgs.cli.unposed import settle
 from kgs.errors import DataError
 from kgs.io.console import silent
 from kgs.io.json_files import write_json
-from kgs.io.outputs import PNG_MARK, start_folder, write_png
+from kgs.io.outputs import write_png
+from kgs.io.ownership import MARK
 from kgs.sfm import pose, pose_photos
 from kgs.sfm.read import blurred, read_photos
-from kgs.sfm.write import end_move
+from kgs.sfm.write import photo_staging
 
 pytest.importorskip("pycolmap")
 
@@ -224,15 +225,17 @@ def test_pycolmap_that_is_not_there(folder, monkeypatch):
 
 def test_a_move_that_was_stopped_is_ended(tmp_path):
     """A kill between the renaming of the new folder and the last of its parts."""
-    new = tmp_path / "finished-photos"
-    start_folder(new)
-    (new / "sparse" / "0").mkdir(parents=True)
+    staging = photo_staging(tmp_path)
+    staging.start()
+    (staging.unfinished / "sparse" / "0").mkdir(parents=True)
+    (staging.unfinished / "sparse" / "0" / "cameras.bin").touch()
     save(tmp_path / "images", planes()[:1], ["old.png"])
-    save(new / "images", planes()[:1], ["new.png"])
-    write_json(new / "photos.json", {"versions": {"kgs": "0"}})
-    end_move(tmp_path)
+    save(staging.unfinished / "images", planes()[:1], ["new.png"])
+    write_json(staging.unfinished / "photos.json", {})
+    staging.seal()
+    staging.complete()
     left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
-    assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0"]
+    assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0", "sparse/0/cameras.bin"]
 
 
 def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch):
@@ -244,7 +247,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         (new / "images").mkdir()
         (new / "sparse" / "0").mkdir(parents=True)
         for path in paths:
-            (new / "images" / path.name).write_bytes(PNG_MARK)
+            (new / "images" / path.name).write_bytes(MARK)
         for name in ("cameras", "images", "points3D"):
             (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
         return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}

@@ -67,8 +67,9 @@ def fit(
     from kgs.datasets.layouts import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
-    from kgs.io.outputs import check_folder, is_own
-    from kgs.io.results_folder import UNFINISHED, is_finished, taken
+    from kgs.io.outputs import check_folder
+    from kgs.io.ownership import is_own
+    from kgs.io.results_folder import fit_staging, is_finished, replaced_files
     from kgs.machine import check_tools
     from kgs.metrics.evaluate import in_words
     from kgs.metrics.lpips import Lpips
@@ -78,7 +79,7 @@ def fit(
 
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
-    check_folder(out, taken(out), scene, make=False)
+    check_folder(out, replaced_files(out), scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["hold_out"] = hold_out
     request["points"] = config.init if config.init == "model-points" else "none"
@@ -97,7 +98,8 @@ def fit(
         settle(out)
     say(in_words(metrics))
     posed = out if bare else scene
-    splat, renders, by = (out / UNFINISHED if kept else out) / "splat.ply", out / "renders", request["downscale"]
+    splat = (fit_staging(out).unfinished if kept else out) / "splat.ply"
+    renders, by = out / "renders", request["downscale"]
     shrunk = ("--downscale", f"{by:g}") if by else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if what := left_out(metrics["needs"]):

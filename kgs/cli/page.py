@@ -47,7 +47,7 @@ def page(
     from kgs.camera import move_camera
     from kgs.datasets import load_scene
     from kgs.errors import DataError
-    from kgs.io.outputs import is_own
+    from kgs.io.ownership import is_own
     from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page

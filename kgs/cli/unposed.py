@@ -47,10 +47,10 @@ def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConf
 
 def settle(out: Path) -> None:
     """Put cameras that waited for a fit in their place, beside its results."""
-    from kgs.sfm.write import end_move
+    from kgs.sfm.write import photo_staging
 
     with locked(out):
-        end_move(out)
+        photo_staging(out).complete()
 
 
 def _downscale(asked: float | None, longest: float, config: FitConfig) -> float | None:

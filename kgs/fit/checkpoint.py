@@ -22,11 +22,12 @@ from torch import Tensor
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
 from kgs.io.json_files import is_number, parse_json
+from kgs.io.ownership import MADE_BY
 from kgs.io.results_folder import previous
 
 from .config import FitConfig
 
-_FORMAT = "kgs-checkpoint 3"
+_FORMAT = f"checkpoint 4, {MADE_BY}"
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
@@ -37,7 +38,8 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
-    content = safetensors.torch.save(tensors, {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)})
+    metadata = {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)}
+    content = safetensors.torch.save(tensors, metadata)
     temporary = path.with_name(path.name + ".partial")
     try:
         with open(temporary, "wb") as file:

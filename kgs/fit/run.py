@@ -16,9 +16,10 @@ from kgs.init_points import FirstPoints, first_points
 from kgs.io.console import Stage, each, progress, say, silent
 from kgs.io.figures import write_curve
 from kgs.io.json_files import write_json
-from kgs.io.outputs import check_folder, is_own, png_names, start_folder, write_png
+from kgs.io.outputs import check_folder, png_names, write_png
+from kgs.io.ownership import is_own
 from kgs.io.ply import save_ply
-from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, previous, publish, taken
+from kgs.io.results_folder import CHECKPOINT, fit_staging, is_finished, locked, previous, replaced_files
 from kgs.machine import check_tools, peak_rss_mb, versions
 from kgs.metrics.coverage import measure_coverage
 from kgs.metrics.evaluate import evaluate
@@ -105,12 +106,13 @@ def fit_scene(
             raise DataError(scene.root, "images", reason)
     names = png_names([*scene.train.names, *scene.test.names])
     try:
-        check_folder(out, [*taken(out), *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
+        check_folder(out, [*replaced_files(out), *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
     except OSError as error:
         raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
     with locked(out):
-        end_move(out)
-        new = out / UNFINISHED
+        staging = fit_staging(out)
+        staging.complete()
+        new = staging.unfinished
         trainer, source = _resumed(scene, config, out) if resume else (None, out)
         if trainer is not None:
             say(f"resumed at step {trainer.step}")
@@ -127,7 +129,7 @@ def fit_scene(
         told, is_trained = len(trainer.notes), False
         try:
             if source != new:
-                start_folder(new)
+                staging.start()
                 save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # first points may have taken a minute
             settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
@@ -157,7 +159,8 @@ def fit_scene(
             kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
             trainer.note(f"{kept}, where a resumed fit goes on")
         else:
-            publish(out)
+            staging.seal()
+            staging.complete()
         for note in trainer.notes[told:]:
             say(note)
     return metrics, stopped_by
@@ -166,7 +169,7 @@ def fit_scene(
 def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None, Path]:
     """The fit that was interrupted in the folder, else the one that was finished, else None; and where it lies."""
     errors = []
-    for folder in (out / UNFINISHED, out):
+    for folder in (fit_staging(out).unfinished, out):
         path = folder / CHECKPOINT
         if any(file.exists() for file in (path, previous(path))):
             try:

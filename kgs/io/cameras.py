@@ -10,6 +10,8 @@ import kgs
 from kgs.datasets.scene import Views
 from kgs.geometry import common_up
 
+from .ownership import MADE_BY
+
 
 def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
     """The content of the `cameras.json` that some viewers expect beside a 3DGS PLY file: one entry per view.
@@ -26,7 +28,7 @@ def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
 
     Returns:
         One dict per view: id (counted from 0), img_name, width, height, fx and fy (pixels), position (world units),
-        rotation, and kgs, the version that wrote it.
+        rotation, and generator, the version of kgs that wrote it.
     """
     entries = list[dict[str, Any]]()
     for part in views:
@@ -44,7 +46,7 @@ def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
                     "rotation": pose[:3, :3].tolist(),
                     "fx": float(k[0, 0]),
                     "fy": float(k[1, 1]),
-                    "kgs": kgs.__version__,
+                    "generator": f"{MADE_BY} {kgs.__version__}",
                 }
             )
     return entries

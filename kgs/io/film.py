@@ -21,11 +21,11 @@ from kgs.geometry import meeting_point
 
 from .cameras import upright
 from .images import eight_bits
+from .ownership import MARK
 
 FRAMES = 90
 RATE = 30.0  # frames per second
 LONGEST = 640  # pixels of the longer side
-MARK = b"kgs film"  # in every film of kgs, to recognise it
 _STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
 _SWAY = 0.03  # radius of the path around a single camera, as a share of the scene's depth
 _EBML_VOID = b"\xec"  # element ID of padding, which players skip

@@ -18,7 +18,7 @@ from kgs.fit.run import Finished
 from kgs.fit.saved import SavedFit
 from kgs.io.console import each, say
 from kgs.io.json_files import read_json
-from kgs.io.outputs import is_own
+from kgs.io.ownership import is_own
 from kgs.model import GaussianModel
 
 from . import Picture, write_page

@@ -15,8 +15,8 @@ import torch
 
 from kgs.errors import DataError
 from kgs.io.console import Stage, say, silent
-from kgs.io.json_files import read_json
-from kgs.io.outputs import png_names, start_folder
+from kgs.io.json_files import read_json, write_json
+from kgs.io.outputs import png_names
 from kgs.io.results_folder import locked
 from kgs.machine import versions
 
@@ -40,14 +40,10 @@ from .write import (
     IMAGES,
     MODEL,
     REPORT,
-    UNFINISHED,
-    WAITING,
     check_place,
-    end_move,
     is_kept,
-    is_whole,
     level_and_scale,
-    publish,
+    photo_staging,
     write_images,
     write_model,
 )
@@ -105,24 +101,28 @@ def pose_photos(
     hashes = hash_photos(paths)
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        waiting, same = out / WAITING, {"settings": SETTINGS, "seed": seed, "sha256": hashes}
-        if not (wait and is_whole(waiting)):
-            end_move(out)
+        staging = photo_staging(out)
+        waiting = staging.finished
+        same = {"settings": SETTINGS, "seed": seed, "sha256": hashes}
+        if not (wait and staging.is_waiting):
+            staging.complete()
         place = next((place for place in (waiting, out) if is_kept(place, same)), None)
         if place is not None:
             say(f"cameras: those in {place} are of the same {len(paths)} photos and are used again")
         if place == out:
-            shutil.rmtree(waiting, ignore_errors=True)
+            staging.discard()
         if place is None:
-            new = out / UNFINISHED
-            start_folder(new)
+            new = staging.unfinished
+            staging.start()
             try:
-                publish(out, same | find_cameras(paths, new, seed % 2**31, stage, say))
+                report = find_cameras(paths, new, seed % 2**31, stage, say)
+                write_json(new / REPORT, same | report)
+                staging.seal()
             finally:
                 shutil.rmtree(new, ignore_errors=True)
         if not (wait and (out / "splat.ply").exists()):
-            end_move(out)
-        found = waiting if is_whole(waiting) else out
+            staging.complete()
+        found = waiting if staging.is_waiting else out
         return read_json(found / REPORT) | {"reused": place is not None, "folder": str(found)}
 
 
