@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from kgs import backends, composite, project
 from kgs.raster.tasks import Slice
-from kgs.raster.tiles import bin_to_tiles
+from kgs.raster.binning import bin_to_tiles
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
