@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -36,8 +37,8 @@ class DeviceSettings:
     may_ask: bool  # whether a question for a number is cheap; a GPU would have to finish all work before
 
 
-SETTINGS = {"cpu": DeviceSettings(2**17, 96, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
-_LEAST_LAYERS = 16  # of a step with many tiles
+SETTINGS = {"cpu": DeviceSettings(2**19, 192, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
+_LEAST_LAYERS = 8  # of a step with many tiles
 _ARRAYS = 9  # numbers per pair that a step holds at the same time
 
 
@@ -198,8 +199,8 @@ class Cut:
                 while lengths[end - 1] <= first:
                     end -= 1
                 # as many layers as a quarter of the lists still has: the longest take another step, with few tiles
-                wanted = max(lengths[begin + (end - begin) // 4] - first, _LEAST_LAYERS)
                 fitting = max(self.pairs // (pixels * (end - begin)), 1)
+                wanted = max(lengths[begin + (end - begin) // 4] - first, fitting // 4)
                 layers = self.layers or min(wanted, fitting, lengths[begin] - first)
                 steps.append(Step(slice(begin, end), first, layers))
                 first += layers
@@ -296,7 +297,7 @@ class DepthSlice:
             behind.copy_(later[0])
             value.sub_(later[1:]).mul_(weights)
             if self._clamps:  # no derivative where alpha is held at its maximum
-                value.masked_fill_(alpha >= ALPHA_MAX, 0.0)
+                value.mul_((ALPHA_MAX - alpha).sign_())
             found += _moments(value, dx, dy)
         if features:
             found += [(weights * grad).sum(1) for grad in grads]
@@ -396,5 +397,4 @@ def to_tiles(images: Tensor, grid: tuple[int, int], side: int) -> Tensor:
 
 def _below(value: float, dtype: torch.dtype) -> float:
     """The largest number below `value`."""
-    bound = torch.tensor(value, dtype=dtype, device="cpu")
-    return float(torch.nextafter(bound, torch.zeros_like(bound)))
+    return float(np.nextafter(np.dtype(str(dtype).removeprefix("torch.")).type(value), 0))
