@@ -77,10 +77,10 @@ def load_scene(
         if value not in known:
             raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
     if downscale is not None and not (isinstance(downscale, int | float | np.number) and 1 <= downscale < math.inf):
-        raise ValueError(f"downscale (--downscale): expected None or a number of at least 1, got {downscale!r}")
+        raise ValueError(f"downscale: expected None or a number of at least 1, got {downscale!r}")
     whole = isinstance(hold_out, int | np.integer) and not isinstance(hold_out, bool)
     if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
-        raise ValueError(f"hold_out (--hold-out): expected None, 0 or a whole number of at least 2, got {hold_out!r}")
+        raise ValueError(f"hold_out: expected None, 0 or a whole number of at least 2, got {hold_out!r}")
     root = Path(path)
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):  # which costs time
         found = find_layout(root)

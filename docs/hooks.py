@@ -50,4 +50,4 @@ def on_page_markdown(markdown, page, config, files):
     """Gives the wide tables of results the whole width, and links to notebooks their place on the site."""
     if page.file.src_uri.startswith("results/"):
         page.meta["hide"] = ["toc"]
-    return markdown.replace("](../notebooks/", "](notebooks/")
+    return markdown.replace("](../notebooks/", "](notebooks/").replace("](../README.md", "](index.md")

@@ -155,4 +155,7 @@ def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: fl
     w = torch.linalg.cross(a, b, dim=0)
     turned = torch.stack([torch.linalg.cross(b, w, dim=0), torch.linalg.cross(w, a, dim=0)])
     x, y = turned.add_(m, alpha=eps2d).div_(det)  # Q M
-    return conic(sx, sy).t(), conic(sxx * x + sxy * y, sxy * x + syy * y).permute(2, 0, 1), s0 / opacities
+    flat = ~(det < torch.inf)  # wider than numbers reach: it does not change over the image
+    d_means = conic(sx, sy).masked_fill_(flat, 0.0)
+    d_factors = conic(sxx * x + sxy * y, sxy * x + syy * y).masked_fill_(flat, 0.0)
+    return d_means.t(), d_factors.permute(2, 0, 1), s0 / opacities

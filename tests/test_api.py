@@ -5,6 +5,8 @@ import dataclasses
 import importlib
 import inspect
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,27 @@ PUBLIC = [(module, name) for module, names in INVENTORY.items() for name in name
 @pytest.mark.parametrize("module", INVENTORY)
 def test_inventory(module):
     assert sorted(importlib.import_module(module).__all__) == sorted(INVENTORY[module])
+
+
+LAZY = """
+import sys
+import kgs
+assert "torch" not in sys.modules
+assert set(kgs.__all__) <= set(dir(kgs))
+assert not hasattr(kgs, "nonsense")
+assert kgs.renderer.GaussianRenderer is kgs.GaussianRenderer
+from kgs import Gaussians, rasterization
+import kgs.gsplat
+assert kgs.rasterization is rasterization is kgs.gsplat.rasterization
+import pickle, torch
+cloud = Gaussians(torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), torch.ones(1, 3))
+assert torch.equal(pickle.loads(pickle.dumps(cloud)).quats, cloud.quats)
+assert pickle.loads(pickle.dumps(kgs.GaussianRenderer)) is kgs.GaussianRenderer
+"""
+
+
+def test_names_are_loaded_when_they_are_asked_for():
+    subprocess.run([sys.executable, "-c", LAZY], cwd=ROOT, check=True)
 
 
 @pytest.mark.parametrize(("module", "name"), PUBLIC)

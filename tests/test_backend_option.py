@@ -70,11 +70,13 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
     for asked in ("auto", begun):
         resumed = Trainer.resume(scene, replace(CONFIG, backend=asked), tmp_path / CHECKPOINT)
         assert (resumed.backend, resumed.renderer.backend) == (begun, begun)
-    with pytest.raises(DataError, match=f"--backend: expected '{begun}', as the fit was begun with, got '{other}'"):
+    with pytest.raises(DataError, match=f"backend: expected '{begun}', as the fit was begun with, got '{other}'"):
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
 
 
-@pytest.mark.parametrize("words", [["fit", "{scene}"], ["demo"], ["render", "x.ply", "--cameras", "{scene}"]])
+@pytest.mark.parametrize(
+    "words", [["fit", "{scene}"], ["demo"], ["render", "{scene}/transforms_train.json", "--cameras", "{scene}"]]
+)
 def test_numba_that_is_not_installed_is_one_line_before_any_work(installed, folder, tmp_path, capsys, words):
     installed(False)
     words = [word.format(scene=folder) for word in words]

@@ -2,8 +2,10 @@
 
 import io
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -73,3 +75,74 @@ def test_a_name_that_the_terminal_cannot_show(folder, tmp_path, monkeypatch):
 def test_help_for_head():
     done = kgs_process("fit", "--help", shell="| head -1; exit ${PIPESTATUS[0]}")
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+WITHOUT_TORCH = """
+import sys
+
+class NoTorch:
+    def find_spec(name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "numpy", "cv2", "kornia"):
+            sys.exit(f"{name} is imported")
+
+sys.meta_path.insert(0, NoTorch)
+import kgs.cli
+kgs.cli.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["fti"], "did you mean fit?"),
+        (["fit", "missing", "-o", "out"], "kgs: missing: expected"),
+        (["fit", ".", "-o", "out", "--stpes", "3"], "--steps"),
+        (["fit", ".", "-o", "out", "--steps", "many"], "--steps"),
+        (["eval", "missing"], "kgs: missing: expected"),
+        (["render", "missing", "--cameras", ".", "-o", "out"], "kgs: missing: expected"),
+        (["study", "-o", "out", "--lpips-weights", "missing"], "kgs: missing: expected"),
+    ],
+)
+def test_mistakes_are_told_before_torch_is_loaded(tmp_path, words, said):
+    command = [sys.executable, "-c", WITHOUT_TORCH, *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert os.listdir(tmp_path) == []
+
+
+SLOW_TORCH = """
+import sys, time
+
+class SlowTorch:
+    def find_spec(name, path=None, target=None):
+        if name == "torch":
+            print("torch", flush=True)
+            try:
+                time.sleep(60)
+            except BaseException:
+                pass  # as code does that is called while modules are imported
+
+sys.meta_path.insert(0, SlowTorch)
+import kgs.cli
+kgs.cli.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_ctrl_c_while_torch_is_imported_is_quiet(tmp_path):
+    command = [sys.executable, "-c", SLOW_TORCH, "fit", ".", "-o", "out"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=tmp_path, **pipes) as process:
+        assert process.stdout.readline() == b"torch\n"
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr.read() == b""
+
+
+def test_ctrl_c_raises_as_usual_after_a_command():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(SystemExit):
+        main(["nonsense"])
+    assert signal.getsignal(signal.SIGINT) is before

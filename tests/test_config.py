@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kgs import RasterOptions
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, timetable
 
 
@@ -106,3 +107,7 @@ def test_the_coarse_share_is_counted_in_steps():
 def test_shares_are_from_0_to_1(name, value):
     with pytest.raises(ValueError, match=name):
         FitConfig(**{name: value})
+
+
+def test_the_memory_of_a_render_is_bounded_as_without_a_fit():
+    assert FitConfig().max_bytes == RasterOptions().max_bytes

@@ -16,17 +16,17 @@ nb = pytest.importorskip("numba")
 
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
+from kgs.backends.cpu.arrays import arrays  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import Reach  # noqa: E402  # needs numba
-from kgs.backends.cpu.compositing import _arrays  # noqa: E402  # needs numba
 
 # -- lists ---------------------------------------------------------------------------------------------------------
 
 
 def reach_of(projected, threshold=TH, max_spans=2**40):
     inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
-    arrays = _arrays(*inputs, projected.depths, projected.camera_ids)
+    fields = arrays(*inputs, projected.depths, projected.camera_ids)
     rules = np.float32(projected.eps2d), np.float32(threshold)
-    return Reach(arrays, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
+    return Reach(fields, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
 
 
 @pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])

@@ -15,12 +15,13 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
+from kgs.cli.render import render
 from kgs.fit import exports
-from kgs.fit.splat_commands import render
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
 from kgs.io.json_files import write_json
-from kgs.io.outputs import EXPORTS, is_own
+from kgs.io.outputs import EXPORTS
+from kgs.io.ownership import is_own
 
 
 def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:
@@ -65,6 +66,9 @@ def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> 
     class Fitted:
         scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
         shown, notes = random_model(), list[str]()
+
+        def note(self, text: str) -> None:
+            self.notes.append(text)
 
         def render(self, camera: PinholeCamera) -> torch.Tensor:
             return torch.zeros(1, 3, int(camera.height), int(camera.width))

@@ -16,7 +16,7 @@ from torch import Tensor
 from kgs.datasets.scene import Views, pinholes
 from kgs.io import film
 from kgs.io.film import tour, write_film
-from kgs.io.outputs import is_own
+from kgs.io.ownership import is_own
 
 
 def looking_at(target: Tensor, places: Tensor) -> Tensor:

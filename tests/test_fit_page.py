@@ -11,13 +11,12 @@ from typing import Any
 import pytest
 import torch
 
+from kgs.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
-from kgs.fit.commands import evaluate
 from kgs.fit.config import FitConfig
 from kgs.fit.saved import load_fit
 from kgs.init_points import FirstPoints
-from kgs.metrics.evaluate import in_words
 from kgs.metrics.lpips import Lpips
 from kgs.page.fit_page import refresh_page, spread, write_own_page
 
@@ -73,21 +72,6 @@ def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any) -> None:
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", (out / "index.html").read_text(encoding="utf-8")))
     assert "blurred" not in facts
     assert "time" not in facts
-    (out / "index.html").write_bytes(own)
-
-
-def test_the_estimate_says_how_many_photos_it_could_judge(fitted: Any) -> None:
-    out, scene = fitted
-    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-    rows = [{"name": "a.jpg", "psnr": 21.0}, {"name": "b.jpg", "psnr": 23.0}, {"name": "c.jpg", "why": "lost"}]
-    metrics["estimate"] = {"psnr": 22.0, "sd": 1.4, "n": 2, "photos": rows}
-    refresh_page(out, load_fit(out), scene, metrics)
-    text = " ".join((out / "index.html").read_text(encoding="utf-8").split())
-    assert "each of 3 photos was left out once" in text
-    assert "2 of them could be judged" in text
-    assert "2 of 3 photos" in in_words(metrics)
-    metrics["estimate"] = {"psnr": None, "sd": None, "n": 0, "photos": rows[2:]}
-    assert "c.jpg: lost" in in_words(metrics)
     (out / "index.html").write_bytes(own)
 
 

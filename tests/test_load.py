@@ -78,12 +78,12 @@ def test_photos_of_several_sizes_are_told_in_their_own_pixels(tmp_path: Path) ->
             load_scene(tmp_path, downscale=downscale)
 
 
-def test_messages_name_the_flags(tmp_path: Path) -> None:
+def test_messages_name_the_argument(tmp_path: Path) -> None:
     photos(tmp_path / "images")
     np.save(tmp_path / "poses_bounds.npy", np.tile(UPRIGHT, (3, 1)))
-    with pytest.raises(ValueError, match=r"--views.*expected None or a whole number from 1 to 2, got 3"):
+    with pytest.raises(ValueError, match=r"train_views: expected None or a whole number from 1 to 2, got 3"):
         load_scene(tmp_path, 3)
-    with pytest.raises(ValueError, match=r"--downscale.*at least 1, got 0\.5"):
+    with pytest.raises(ValueError, match=r"downscale: .*at least 1, got 0\.5"):
         load_scene(tmp_path, downscale=0.5)
 
 
@@ -241,5 +241,5 @@ def test_test_views_of_the_files_can_be_trained_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize("hold_out", [1, -1, 2.5, True, "3"])
 def test_what_cannot_be_held_out_is_refused(tmp_path: Path, hold_out: object) -> None:
     write_colmap(tmp_path)
-    with pytest.raises(ValueError, match=r"hold_out \(--hold-out\): expected None, 0 or a whole number of at least 2"):
+    with pytest.raises(ValueError, match=r"hold_out: expected None, 0 or a whole number of at least 2"):
         load_scene(tmp_path, hold_out=hold_out)  # type: ignore[arg-type]

@@ -106,11 +106,11 @@ CLAIMS["07_your_own_photos"] = (
     """
     assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
     assert len(scene.test) == 0 and len(scene.train) == COUNT
-    assert trainer.step == STEPS and [row["name"] for row in judged["photos"]][0] == "0.png"
+    assert trainer.step == judge.step == STEPS and half.test.names == ("0.png", "2.png")
     """,
     """
     assert max(errors) < 0.2 and trainer.psnr(scene.train) > 28
-    assert judged["n"] == COUNT and judged["psnr"] > 22
+    assert 15 < judge.psnr(half.test) < judge.psnr(half.train)
     """,
 )
 

@@ -12,7 +12,7 @@ import torch
 from factories import batch, random_camera, random_gaussians
 
 from kgs.page import Picture, write_page
-from kgs.page.figures import facts, levels, measures, plot, shareable
+from kgs.page.figures import facts, headline, measure_table, psnr_plot, without_folders
 
 SIZE = (24, 32)
 GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)
@@ -81,7 +81,7 @@ def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
     smaller = len(path.read_bytes()) - 10_000
     text = write(path, most_bytes=smaller)
     assert len(path.read_bytes()) <= smaller
-    assert "To keep this page small it shows numbers of 8 bits" in text
+    assert "To keep this page small it shows 8-bit numbers" in text
     with pytest.raises(ValueError, match="expected room for a Gaussian"):
         write(path, most_bytes=10_000)
 
@@ -95,16 +95,16 @@ def test_a_page_says_where_no_photo_was_held_out(tmp_path: Path) -> None:
 
 def test_measures_have_their_spread(tmp_path: Path) -> None:
     runs = {"off": {"test": views(20.0, 24.0), "train": views(30.0)}, "on": {"test": views(21.0, 24.5), "train": None}}
-    head, rows = measures(runs)
+    head, rows = measure_table(runs)
     assert head == ["", "held out (2), off", "training (1), off", "held out (2), on"]
     assert rows[0] == ["PSNR [dB]", "22.00 (20.00 to 24.00)", "30.00", "22.75 (21.00 to 24.50)"]
     assert [row[0] for row in rows] == ["PSNR [dB]", "SSIM"]  # none of what nobody measured
-    assert levels(runs)["PSNR [dB], held out (2 views), on"] == "22.75"
+    assert headline(runs)["PSNR [dB], held out (2 views), on"] == "22.75"
 
 
 def test_curves_stay_in_their_picture() -> None:
     curve = [{"seconds": 9.0 * i, "test_psnr": None if i == 1 else 20 - i, "train_psnr": 25.0 + i} for i in range(4)]
-    drawn = plot({"": {"curve": curve}})
+    drawn = psnr_plot({"": {"curve": curve}})
     assert drawn is not None
     points = [[tuple(map(float, p.split(","))) for p in line["points"].split()] for line in drawn["lines"]]
     assert [len(line) for line in points] == [3, 4]
@@ -112,7 +112,7 @@ def test_curves_stay_in_their_picture() -> None:
         assert drawn["left"] <= x <= drawn["right"]
         assert drawn["top"] <= y <= drawn["bottom"]
     assert points[0][0][1] < points[0][-1][1]  # it falls
-    assert plot({"": {"curve": curve[:1]}}) is None
+    assert psnr_plot({"": {"curve": curve[:1]}}) is None
 
 
 @pytest.mark.parametrize(
@@ -123,9 +123,9 @@ def test_any_two_moments_can_be_drawn(first: float, last: float) -> None:
     """Also where the quarter of a span is a last bit below a power of ten: 0.09 - 0.05 is."""
     for seconds, psnr in (((first, last), (20.0, 21.0)), ((0.0, 9.0), (first, last))):
         moments = zip(seconds, psnr, strict=True)
-        drawn = plot({"": {"curve": [{"seconds": s, "test_psnr": None, "train_psnr": p} for s, p in moments]}})
+        drawn = psnr_plot({"": {"curve": [{"seconds": s, "test_psnr": None, "train_psnr": p} for s, p in moments]}})
         assert drawn is not None
-        marks = [float(text) for _, text in drawn["across"]]
+        marks = [float(text) for _, text in drawn["x_ticks"]]
         assert marks[0] <= seconds[0]
         assert seconds[1] <= marks[-1] + 1e-6
         for x, y in (map(float, p.split(",")) for p in drawn["lines"][0]["points"].split()):
@@ -146,7 +146,7 @@ def test_any_two_moments_can_be_drawn(first: float, last: float) -> None:
     ],
 )
 def test_of_absolute_paths_the_last_name_is_shown(text: str, expected: str) -> None:
-    assert shareable(text) == expected
+    assert without_folders(text) == expected
 
 
 def test_facts_are_simple_values_in_words() -> None:

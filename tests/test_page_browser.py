@@ -7,17 +7,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from browser import Browser
-from factories import batch, random_camera, random_gaussians
+from factories import batch, random_camera, random_gaussians, with_camera
 
 import kgs
+from kgs import Gaussians
 from kgs.page import Picture, write_page
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
+PARTS = ["training", "training", "training", "test"]
+CENTRAL = 1  # the training camera nearest the mean pose
 READY = "document.querySelector('.viewer').dataset.state === 'ready'"
 SHOW = f"""(index) => {{
   const canvas = document.querySelector("canvas");
@@ -30,9 +34,17 @@ SHOW = f"""(index) => {{
 
 @pytest.fixture(scope="module")
 def scene() -> Any:
-    """Anisotropic Gaussians with harmonics of degree 3, some of them faint, and cameras off their centres."""
+    """Anisotropic Gaussians with harmonics of degree 3, some faint, some beside the frame; off-centre cameras."""
     gaussians = random_gaussians(400, 0, torch.float32, sh_degree=3, image_size=max(SIZE), opacities=(0.001, 0.999))
-    return gaussians, batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(3)))
+    beside = random_gaussians(20, 1, torch.float32, sh_degree=3)
+    beside.means[:, 0] = torch.linspace(0.7, 1.3, 20) * beside.means[:, 2]  # the frame ends at about 0.5
+    beside.scales[:] = torch.tensor([0.05, 0.05, 1.5])
+    beside.quats[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    gaussians = Gaussians(*map(torch.cat, zip(vars(gaussians).values(), vars(beside).values(), strict=True)))
+    first, last, test = (random_camera(*SIZE, seed, torch.float32) for seed in range(3))
+    between = first.extrinsics.clone()
+    between[:, :3, 3] = (first.extrinsics + last.extrinsics)[:, :3, 3] / 2
+    return gaussians, batch(first, with_camera(first, extrinsics=between), last, test)
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +64,15 @@ def browser(tmp_path_factory: Any) -> Iterator[Browser]:
 def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
     gaussians, cameras = scene
     path: Path = tmp_path_factory.mktemp("page") / "index.html"
-    names = [f"a photo with a rather long name that someone gave it {i}.jpg" for i in range(3)]
-    pictures = [Picture(names[2], 1 - renders[2], {"": renders[2]})]
-    views = [{"name": names[2], "psnr": 20.0, "ssim": 0.5, "ssim_zero_padded": 0.5, "lpips_vgg": 0.25}]
+    names = [f"a photo with a rather long name that someone gave it {i}.jpg" for i in range(4)]
+    pictures = [Picture(names[3], 1 - renders[3], {"": renders[3]})]
+    views = [{"name": names[3], "psnr": 20.0, "ssim": 0.5, "ssim_zero_padded": 0.5, "lpips_vgg": 0.25}]
     curve = [{"step": i, "seconds": 1.0 * i, "test_psnr": 20 + i / 9, "train_psnr": 25.0 + i} for i in range(4)]
     metrics = {"test": {**views[0], "views": views}, "train": None, "curve": curve, "seconds": 3.0, "steps": 3}
     rules: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "pictures": pictures}
     settings = {"init_file": "/photos/someone/points.ply", "a_setting_with_a_long_name": "x" * 60}
     write_page(
-        path, "A test", gaussians, cameras, names, ["training", "training", "test"], runs={"": metrics},
-        settings=settings, **rules,
+        path, "A test", gaussians, cameras, names, PARTS, runs={"": metrics}, settings=settings, **rules,
     )  # fmt: skip
     return path
 
@@ -73,17 +84,62 @@ def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, 
     assert browser.problems == []
 
 
-@pytest.mark.parametrize("index", range(3))
+def array(image: torch.Tensor) -> np.ndarray[Any, Any]:
+    """`(H, W, 3)` of `(3, H, W)`."""
+    return image.permute(1, 2, 0).double().numpy()
+
+
+def psnr(shown: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> float:
+    assert shown.shape == expected.shape
+    return -10 * math.log10(np.mean((shown - expected) ** 2))
+
+
+@pytest.mark.parametrize("index", range(len(PARTS)))
 def test_the_canvas_shows_what_kgs_renders(browser: Browser, page: Path, renders: Any, index: int) -> None:
     browser.size(1000, 800)
     browser.open(page, READY)
-    shown = browser.picture(browser.run(f"({SHOW})({index})"))
-    expected = renders[index].permute(1, 2, 0).double().numpy()
-    assert shown.shape == expected.shape
-    level = -10 * math.log10(np.mean((shown - expected) ** 2))
-    print(f"camera {index}: {level:.1f} dB")
-    assert level >= 38
+    shown, expected = browser.picture(browser.run(f"({SHOW})({index})")), array(renders[index])
+    assert psnr(shown, expected) >= 38
     assert np.abs(shown - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 844), (844, 390)])
+def test_the_first_view_is_a_whole_photo_on_every_screen(
+    browser: Browser, page: Path, renders: Any, width: int, height: int
+) -> None:
+    browser.size(width, height)
+    browser.open(page, READY)
+    canvas = browser.run(
+        "(() => { const box = viewer.canvas.getBoundingClientRect(); return [box.width, box.height]; })()"
+    )
+    stage = browser.run("[document.querySelector('.stage').clientWidth, document.querySelector('.stage').clientHeight]")
+    assert canvas == pytest.approx(stage, abs=1)
+    assert canvas[0] == pytest.approx(canvas[1] * SIZE[1] / SIZE[0], abs=1)
+    assert canvas[1] <= 0.8 * height
+    assert canvas[0] >= 0.9 * width or canvas[1] >= 0.75 * height  # as large as the screen allows
+    assert browser.run("document.querySelector('select').value") == str(CENTRAL)
+    shown = browser.picture(browser.run("(viewer.draw(), viewer.canvas.toDataURL())"))
+    shown = cv2.resize(shown, SIZE[::-1], interpolation=cv2.INTER_AREA)
+    assert psnr(shown, array(renders[CENTRAL])) >= 30
+
+
+def test_start_goes_back_to_the_first_view(browser: Browser, page: Path) -> None:
+    browser.size(1280, 900)
+    browser.open(page, READY)
+    for button in ("viewer.flyTo(3)", "document.querySelector('.start').click()"):
+        browser.run(button)
+    assert browser.run("document.querySelector('select').value") == str(CENTRAL)
+
+
+def test_footprints_do_not_depend_on_the_shape_of_the_canvas(browser: Browser, page: Path, renders: Any) -> None:
+    """A canvas that is wider than the photo shows the photo's frame in its middle as kgs renders it."""
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    wide = SHOW.replace(f"{SIZE[1]}px", f"{3 * SIZE[1]}px")
+    for index, render in enumerate(renders):
+        shown = browser.picture(browser.run(f"({wide})({index})"))
+        assert shown.shape == (SIZE[0], 3 * SIZE[1], 3)
+        assert psnr(shown[:, SIZE[1] : 2 * SIZE[1]], array(render)) >= 38
 
 
 def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:

@@ -38,7 +38,7 @@ def gaussians_of(packed: Packed) -> Gaussians:
     """What a viewer draws."""
     columns, degree = decode(packed), packed.layout["degree"]
     means = np.stack([columns[axis] for axis in "xyz"], 1)
-    three = np.stack([columns[f"turn{axis}"] for axis in range(3)], 1)
+    three = np.stack([columns[f"quat{axis}"] for axis in range(3)], 1)
     pairs = zip(three, columns["largest"].astype(int), strict=True)
     quats = np.array([np.insert(row, place, np.sqrt(max(0.0, 1 - row @ row))) for row, place in pairs]).reshape(-1, 4)
     scales = np.exp(np.stack([columns[f"scale{axis}"] for axis in range(3)], 1))
@@ -98,8 +98,8 @@ def test_a_limit_costs_bits_then_harmonics_then_the_least_gaussians(cameras: Any
         sizes.append(len(packed.content))
         words.append(packed.left_out)
         assert sizes[-1] <= most
-    assert words[0] == "numbers of 8 bits"
-    assert words[1].startswith("numbers of 8 bits, harmonics up to degree ")
+    assert words[0] == "8-bit numbers"
+    assert words[1].startswith("8-bit numbers, harmonics up to degree ")
     assert words[2].endswith("of 400 Gaussians")
     kept = nearest(gaussians_of(packed), exact)
     assert kept.min() == 400 - len(kept)  # those that contribute most

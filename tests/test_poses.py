@@ -9,9 +9,9 @@ import torch
 from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
+from kgs.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import FitConfig, Trainer, fit_scene
-from kgs.fit.commands import evaluate
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
 from kgs.fit.saved import load_fit

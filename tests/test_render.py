@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import kgs
+from kgs.cli.page import page
+from kgs.cli.render import render
 from kgs.datasets import load, synthetic_scene
 from kgs.errors import DataError
-from kgs.fit.splat_commands import page, render
 
 
 @pytest.fixture(scope="module")

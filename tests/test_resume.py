@@ -71,7 +71,7 @@ def test_other_views_masks_and_background_are_named(scene, saved):
     for other, said in (
         (replace(scene, train=views.select([0, 1])), "names of the training views"),
         (replace(scene, train=replace(views, masks=torch.ones(3, 1, 32, 40))), "masks of the training views"),
-        (replace(scene, background=torch.tensor([1.0, 1.0, 1.0])), "--background"),
+        (replace(scene, background=torch.tensor([1.0, 1.0, 1.0])), "background"),
     ):
         with pytest.raises(DataError, match=said):
             Trainer.resume(other, CONFIG, saved)
@@ -81,12 +81,12 @@ def test_other_views_masks_and_background_are_named(scene, saved):
 @pytest.mark.parametrize(
     ("change", "flag"),
     [
-        ({"seed": 6}, "--seed: expected 5, as the fit was begun with, got 6"),
-        ({"drop": 0.0}, "--drop"),
-        ({"max_gaussians": 99}, "--max-gaussians"),
-        ({"recipe": Recipe(grad_threshold=2e-5)}, "--recipe.grad-threshold: expected 1e-05"),
-        ({"steps": 7}, "--steps: expected 6, as the fit was begun with, got 7"),
-        ({"steps": 1}, "--steps: expected 6"),
+        ({"seed": 6}, "seed: expected 5, as the fit was begun with, got 6"),
+        ({"drop": 0.0}, "drop"),
+        ({"max_gaussians": 99}, "max_gaussians"),
+        ({"recipe": Recipe(grad_threshold=2e-5)}, "recipe.grad_threshold: expected 1e-05"),
+        ({"steps": 7}, "steps: expected 6, as the fit was begun with, got 7"),
+        ({"steps": 1}, "steps: expected 6"),
     ],
 )
 def test_another_setting_is_named_by_its_flag(scene, saved, change, flag):
@@ -107,7 +107,7 @@ def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points
     done.fit()
     done.save(path)
     longer = replace(CONFIG, steps=9)
-    with pytest.raises(DataError, match="--steps: expected at least the 6 that are done, got 5"):
+    with pytest.raises(DataError, match="steps: expected at least the 6 that are done, got 5"):
         Trainer.resume(scene, replace(CONFIG, steps=5), path)
     trainer = Trainer.resume(scene, longer, path)
     assert [note for note in trainer.notes if "from step 6" in note and "fit of 9 steps from the start" in note]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from dataclasses import replace
@@ -144,10 +145,12 @@ def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) ->
     assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
 
 
-def test_memory_is_foretold(scene: Any, tmp_path: Path) -> None:
+def test_time_and_memory_are_told_before_the_fit(scene: Any, tmp_path: Path) -> None:
     lines: list[str] = []
     fit_scene(scene, replace(CONFIG, steps=2), tmp_path, say=lines.append)
-    assert any(line.startswith("memory: at most ") and "300 Gaussians" in line for line in lines)
+    said = [line for line in lines if line.startswith("the fit takes about ")]
+    assert len(said) == 1
+    assert re.fullmatch(r"the fit takes about \d+ s, .* at most \d+ MiB of memory with 300 Gaussians", said[0])
 
 
 def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> None:

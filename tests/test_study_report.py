@@ -81,7 +81,7 @@ def reports(tmp_path_factory):
     """The report on each case: its folder, and what was returned."""
     folder = tmp_path_factory.mktemp("reports") / "new"
     return {
-        name: (folder / str(k), write_report(rows, folder / str(k), "kgs bench study --preset cpu", 99))
+        name: (folder / str(k), write_report(rows, folder / str(k), "kgs study --preset cpu", 99))
         for k, (name, rows) in enumerate(CASES.items())
     }
 
@@ -136,7 +136,7 @@ def test_plots_without_data_are_left_out(reports, tmp_path):
 
 
 def test_the_same_rows_give_the_same_bytes(reports, tmp_path):
-    write_report(CASES["one cell"], tmp_path, "kgs bench study --preset cpu", 99)
+    write_report(CASES["one cell"], tmp_path, "kgs study --preset cpu", 99)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (reports["one cell"][0] / path.name).read_bytes()
 

@@ -30,7 +30,7 @@ def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
     done = [json.loads(line)["cell"] for line in content.splitlines()]
     assert sorted(done, key=str) == sorted(cells, key=lambda cell: str(dict(sorted(cell.items()))))
     report = (tmp_path / "sparse.md").read_text(encoding="utf-8")
-    assert "kgs bench study --preset quick -o OUT" in report
+    assert "kgs study --preset quick -o OUT" in report
     assert "3 of 3 cells" in report
     assert (tmp_path / "index.html").exists()
 

@@ -13,7 +13,6 @@ from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
 from kgs.densify import Densifier
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.run import most_bytes
 from kgs.fit.trainer import Trainer
 from kgs.renderer import GaussianRenderer
 
@@ -146,7 +145,7 @@ def test_a_limit_that_leaves_no_room_holds_and_is_said_once(scene, points):
     trainer = fitted(scene, points, replace(CONFIG, max_gaussians=170))
     assert len(trainer.model) <= 170
     assert len(trainer.notes) == 1
-    assert "--max-gaussians 170 leaves little room beside the 150 first points" in trainer.notes[0]
+    assert "max_gaussians: 170 leaves little room beside the 150 first points" in trainer.notes[0]
 
 
 def test_the_usual_limit_is_reached_without_a_word(whole, points):
@@ -223,7 +222,6 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
 
 def test_the_memory_budget_reaches_the_renderer(scene, points):
     small = Trainer(scene, replace(CONFIG, max_bytes=1000), points)
-    assert most_bytes(small) < most_bytes(Trainer(scene, CONFIG, points))
     with pytest.raises(ValueError, match="max_bytes"):
         small.fit()
 

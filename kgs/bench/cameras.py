@@ -13,10 +13,10 @@ import torch
 from kgs.datasets import load_scene
 from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
-from kgs.fit.photos import pose_photos
-from kgs.fit.photos.mapping import quiet_pycolmap
 from kgs.geometry import camera_centers, degrees_between
 from kgs.io.outputs import write_png
+from kgs.sfm import pose_photos
+from kgs.sfm.map import quiet_pycolmap
 
 from .output import markdown_table
 from .study.grid import Cell, run_grid

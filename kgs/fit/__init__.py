@@ -1,6 +1,6 @@
 """Fits: turns a scene into a splat, with one call or in a loop of your own.
 
-`first_points` needs the packages of kgs alone; `Trainer`, `fit_scene` and `kgs.fit.photos` need the extra `app`.
+`first_points` needs the packages of kgs alone; `Trainer`, `fit_scene` and `kgs.sfm` need the extra `app`.
 
 Examples:
     >>> from kgs.fit import FitConfig, Trainer, first_points

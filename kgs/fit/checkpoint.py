@@ -22,15 +22,12 @@ from torch import Tensor
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
 from kgs.io.json_files import is_number, parse_json
+from kgs.io.ownership import MADE_BY
+from kgs.io.results_folder import previous
 
 from .config import FitConfig
 
-_FORMAT, _OLD = "kgs-checkpoint 3", b"kgs-checkpoint "
-
-
-def previous(path: Path) -> Path:
-    """Where the checkpoint before the one at `path` is."""
-    return path.with_name(f"{path.stem}.previous{path.suffix}")
+_FORMAT = f"checkpoint 4, {MADE_BY}"
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
@@ -41,7 +38,8 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
-    content = safetensors.torch.save(tensors, {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)})
+    metadata = {"format": _FORMAT, "state": text, "sha256": _digest_all(text, tensors)}
+    content = safetensors.torch.save(tensors, metadata)
     temporary = path.with_name(path.name + ".partial")
     try:
         with open(temporary, "wb") as file:
@@ -81,15 +79,12 @@ def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read what `save_checkpoint` wrote, with tensors on the CPU.
 
-    A DataError where the file is missing, no checkpoint, of an older version or damaged, or a number is not finite.
+    A DataError where the file is missing, no checkpoint or damaged, or a number is not finite.
     """
-    old = path.with_suffix(".pt")
     try:
-        content = path.read_bytes() if path.exists() or not old.exists() else _OLD
+        content = path.read_bytes()
     except OSError as error:
         raise DataError(path, "", f"expected a checkpoint, got {error.strerror}") from error
-    if content.startswith(_OLD):
-        raise DataError(old, "", "is a checkpoint of an older version of kgs and cannot be used: fit without --resume")
     try:
         tensors = safetensors.torch.load(content)
         metadata = parse_json(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
@@ -131,7 +126,6 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
     """
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
-    asked["minutes"] = config.minutes or state["config"].get("minutes")  # unless given, the steps say it
     asked |= {"backend": state["backend"]} if config.backend == "auto" else {}
     if steps == done < config.steps:
         asked["steps"] = steps
@@ -142,7 +136,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
         )
     elif steps != config.steps or done > steps:
         wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
-        raise ValueError(f"--steps: expected {wanted} got {config.steps}")
+        raise ValueError(f"steps: expected {wanted} got {config.steps}")
     _compare_settings(state["config"] | {"backend": state["backend"]}, asked)
     for part in ("training", "test"):
         for what, values in scene[part].items():
@@ -153,7 +147,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
                 which = f"{what} of the {part} views: expected those that the fit was begun with, got others"
                 raise ValueError(which + f" for {changed:.200}" * bool(changed))
     if state["scene"]["background"] != scene["background"]:
-        raise ValueError("--background: expected the one that the fit was begun with, got another")
+        raise ValueError("background: expected the one that the fit was begun with, got another")
     if max(state["stack"], default=0) >= len(scene["training"]["names"]):
         raise ValueError(f"stack: expected views of the scene, got {state['stack']!s:.80}")
     return notes
@@ -167,14 +161,13 @@ def check_plain(state: dict[str, Any], *names: str) -> None:
             raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
 
 
-def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], flag: str = "--") -> None:
+def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = "") -> None:
     for name, value in asked.items():
         before = saved.get(name)
         if isinstance(value, dict) and isinstance(before, dict):
-            _compare_settings(before, value, f"{flag}{name}.")
+            _compare_settings(before, value, f"{path}{name}.")
         elif before != value:
-            name = (flag + name).replace("_", "-")
-            raise ValueError(f"{name}: expected {before!r}, as the fit was begun with, got {value!r}")
+            raise ValueError(f"{path}{name}: expected {before!r}, as the fit was begun with, got {value!r}")
 
 
 def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Tensor]]:

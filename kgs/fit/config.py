@@ -12,8 +12,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
-from kgs.types import RasterOptions
-
 
 class _Range(NamedTuple):
     """What a number may be; `ends` says which of the two limits belong to it, "[" and "]" that they do."""
@@ -102,12 +100,10 @@ class FitConfig:
     """What one fit is asked to do. NumPy's numbers are taken as Python's.
 
     `fit_scene` and the command act on all entries. A `Trainer` takes its points as they are and does all steps: for it
-    minutes, init, init_file, init_points, draw and keep_all have no effect, and no `sh_degree` means 0.
+    init, init_file, init_points, draw and keep_all have no effect, and no `sh_degree` means 0.
 
     Args:
         steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
-        minutes: from first points to the last step, in the place of steps. Their number is fixed once, after a warm-up,
-            to within a tenth; a resumed fit keeps it.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         drop_until: share of the steps, the first ones, in which Gaussians are dropped; in [0, 1].
@@ -146,7 +142,6 @@ class FitConfig:
     """
 
     steps: _Steps = 2000
-    minutes: Annotated[float | None, _Range(0, 1e6, "(]")] = None
     drop: Annotated[float, _Range(0, 1, "[)")] = 0.2
     drop_schedule: Literal["linear", "constant"] = "linear"
     drop_until: _Share = 0.9
@@ -165,7 +160,7 @@ class FitConfig:
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
     growth: _Share = 0.0
     keep_all: bool = False
-    max_bytes: Annotated[int, _Range(1, 2**62)] = RasterOptions.max_bytes
+    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # as of RasterOptions, which would import torch
     evaluations: _Steps = 8
     device: str = "cpu"
     backend: Backend = "auto"

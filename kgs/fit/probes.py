@@ -4,8 +4,8 @@ A probe is a fit in small: a training view is left out, the pictures have half t
 without the view, and rates of learning are `HASTE` times higher, so that few steps go far. Probes of one left-out view
 differ in a single choice: the difference of their PSNR in that view is its gain. The dearer choice is taken where its
 mean gain is above `LEAST` decibels and `CERTAIN` standard errors over the left-out views; else the cheaper one. With
-fewer than `FEWEST` training views none can be spared, in small pictures little is to be seen, and with `minutes` there
-is no time: then the cheaper choice stands, and "by" says "rule".
+fewer than `FEWEST` training views none can be spared, and in small pictures little is to be seen: then the cheaper
+choice stands, and "by" says "rule".
 """
 
 import math
@@ -57,7 +57,6 @@ def decide(
     reasons = {
         "too few views to leave one out": len(views) < FEWEST,
         "too small pictures for probes": min(views.images.shape[-2:]) < 2 * SMALLEST,
-        "no time for probes": config.minutes is not None,
         "too few steps for probes": steps < FEWEST_STEPS,
     }
     if not still_open or any(reasons.values()):

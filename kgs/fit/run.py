@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,18 +16,19 @@ from kgs.init_points import FirstPoints, first_points
 from kgs.io.console import Stage, each, progress, say, silent
 from kgs.io.figures import write_curve
 from kgs.io.json_files import write_json
-from kgs.io.outputs import check_folder, is_own, png_names, start_folder, write_png
+from kgs.io.outputs import check_folder, png_names, write_png
+from kgs.io.ownership import is_own
 from kgs.io.ply import save_ply
-from kgs.io.results_folder import CHECKPOINT, UNFINISHED, end_move, is_finished, locked, publish, taken
-from kgs.machine import bytes_of, check_tools, peak_rss_mb, versions
+from kgs.io.results_folder import CHECKPOINT, fit_staging, is_finished, locked, previous, replaced_files
+from kgs.machine import check_tools, peak_rss_mb, versions
 from kgs.metrics.coverage import measure_coverage
 from kgs.metrics.evaluate import evaluate
 from kgs.metrics.lpips import Lpips
 
-from .checkpoint import previous, save_checkpoint
+from .checkpoint import save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
-from .minutes import steps_within
+from .forecast import forecast
 from .probes import decide
 from .prune import prune
 from .trainer import Trainer
@@ -106,33 +106,30 @@ def fit_scene(
             raise DataError(scene.root, "images", reason)
     names = png_names([*scene.train.names, *scene.test.names])
     try:
-        check_folder(out, [*taken(out), *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
+        check_folder(out, [*replaced_files(out), *(f"test/{names[view]}" for view in scene.test.names)], scene.root)
     except OSError as error:
         raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
     with locked(out):
-        end_move(out)
-        new = out / UNFINISHED
+        staging = fit_staging(out)
+        staging.complete()
+        new = staging.unfinished
         trainer, source = _resumed(scene, config, out) if resume else (None, out)
         if trainer is not None:
             say(f"resumed at step {trainer.step}")
         else:
             if is_own(out / "splat.ply"):
-                say(f"{printable(out)}: the fit there is replaced when this one is done (--resume would go on with it)")
-            begun = time.perf_counter()
-            config, needs = decide(scene, config, choose_points, each)
+                say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
             points = choose_points(scene, config, each)
             say(f"first points: {len(points.points)} ({points.kind})")
-            if config.minutes is not None:
-                config = replace(config, steps=steps_within(scene, config, points, begun))
-                say(f"{config.minutes:g} minutes: {config.steps} steps")
+            say(forecast(scene.train.images, len(points.points), config))
+            config, needs = decide(scene, config, choose_points, each)
             trainer = Trainer(scene, config, points, needs)
-            say(f"memory: at most {most_bytes(trainer) / 2**20:.0f} MiB with {trainer.max_gaussians} Gaussians")
         for note in trainer.notes:
             say(note)
         told, is_trained = len(trainer.notes), False
         try:
             if source != new:
-                start_folder(new)
+                staging.start()
                 save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # first points may have taken a minute
             settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
@@ -160,9 +157,10 @@ def fit_scene(
             raise
         if stopped_by and is_finished(out):
             kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
-            trainer.note(f"{kept}, and --resume goes on with it")
+            trainer.note(f"{kept}, where a resumed fit goes on")
         else:
-            publish(out)
+            staging.seal()
+            staging.complete()
         for note in trainer.notes[told:]:
             say(note)
     return metrics, stopped_by
@@ -171,9 +169,9 @@ def fit_scene(
 def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None, Path]:
     """The fit that was interrupted in the folder, else the one that was finished, else None; and where it lies."""
     errors = []
-    for folder in (out / UNFINISHED, out):
+    for folder in (fit_staging(out).unfinished, out):
         path = folder / CHECKPOINT
-        if any(file.exists() for file in (path, previous(path), path.with_suffix(".pt"))):
+        if any(file.exists() for file in (path, previous(path))):
             try:
                 return Trainer.resume(scene, config, path), folder
             except DataError as error:
@@ -181,11 +179,6 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
     if errors:
         raise errors[0]
     return None, out
-
-
-def most_bytes(trainer: Trainer) -> int:
-    """A bound for the bytes that a fit takes beyond what there is now, known before it begins."""
-    return trainer.config.max_bytes + bytes_of(trainer.max_gaussians, trainer.scene.train.images)
 
 
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
@@ -227,7 +220,8 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Fir
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
-            raise DataError(scene.root, "points", f"expected points of the layout itself for --init {kind}, got none")
+            reason = f"expected points of the layout itself for the init {kind!r}, got none"
+            raise DataError(scene.root, "points", reason)
         return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     rules: dict[str, Any] = {"seed": config.seed, "count": config.init_points, "draw": config.draw}

@@ -11,7 +11,7 @@ from kgs.camera import move_camera
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.io.json_files import is_number, read_json
-from kgs.io.results_folder import CHECKPOINT, end_stopped_move
+from kgs.io.results_folder import CHECKPOINT, complete_stopped_move
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -74,7 +74,7 @@ class SavedFit(NamedTuple):
 
 def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
     """Read what a fit left in its folder; a DataError where config.json or the checkpoint is missing or damaged."""
-    end_stopped_move(out)
+    complete_stopped_move(out)
     request, config = read_settings(out / "config.json")
     path = out / CHECKPOINT
     state, _ = newest_checkpoint(path)

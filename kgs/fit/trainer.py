@@ -217,7 +217,7 @@ class Trainer:
             self.densifier.max_gaussians = first + round(share * (most - first))
             capped = self.densifier.step().capped
             if capped and share == 1.0 and most < 1.25 * first:
-                self.note(f"--max-gaussians {most} leaves little room beside the {first} first points")
+                self.note(f"max_gaussians: {most} leaves little room beside the {first} first points")
         if step in self.times.reset:
             self.densifier.reset_opacity(self.config.recipe.reset_opacity)
         self.seconds += time.perf_counter() - start
@@ -313,8 +313,6 @@ class Trainer:
         state, damage = newest_checkpoint(Path(path))
         try:
             decided = {name: state["config"][name] for name in CHOICES if getattr(config, name) is None}
-            if config.minutes is not None:
-                decided["steps"] = state["config"]["steps"]
             config = replace(config, **decided)
             trainer = cls(scene, config, Start.from_state(state, config))
             trainer.load_state_dict(state)

@@ -10,6 +10,7 @@ from torch import Tensor
 from kgs.datasets.scene import Views
 
 from .json_files import write_whole
+from .ownership import MADE_BY
 
 
 def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:
@@ -51,5 +52,5 @@ def _figure(width: float, height: float) -> Any:
 
 def _write(path: Path, figure: Any) -> None:
     content = BytesIO()
-    figure.savefig(content, format="png", dpi=120, metadata={"Software": "kgs"})
+    figure.savefig(content, format="png", dpi=120, metadata={"Software": MADE_BY})
     write_whole(path, content.getvalue())

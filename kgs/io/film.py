@@ -1,8 +1,9 @@
-"""A film of a splat: a smooth path through the cameras, and its frames as a file that browsers play."""
+"""A film of a splat: a smooth path through the training cameras, written as a WebM file that browsers play."""
 
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,14 @@ from kgs.geometry import meeting_point
 
 from .cameras import upright
 from .images import eight_bits
+from .ownership import MARK
 
 FRAMES = 90
-RATE = 30.0  # frames a second
+RATE = 30.0  # frames per second
 LONGEST = 640  # pixels of the longer side
-MARK = b"kgs film"
-_STOPS = 12  # cameras that a path of three seconds can pass
-_SWAY = 0.03  # radius of the path of a single camera, in depths of the scene
+_STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
+_SWAY = 0.03  # radius of the path around a single camera, as a share of the scene's depth
+_EBML_VOID = b"\xec"  # element ID of padding, which players skip
 Array = NDArray[np.float64]
 
 
@@ -37,33 +39,28 @@ def write_film(
     depth: float,
     stage: Callable[[Sequence[Any], str, str], Iterable[Any]] = lambda items, *_: items,
 ) -> str:
-    """Write a film along the :func:`tour` through some views, a WebM file with VP8; it appears whole or not at all.
+    """Write a film along the :func:`tour` through some views, as WebM with VP8. The write is atomic.
 
-    It has `FRAMES` frames, `RATE` a second, and can be repeated without a jump. Its pictures are as large as the views,
-    up to even numbers and to `LONGEST` pixels. (OpenCV's VP9 takes six times as long for half a decibel.)
+    The film has `FRAMES` frames at `RATE` frames per second and loops without a jump. Frames have the size of the
+    views, reduced to at most `LONGEST` pixels and rounded to even numbers. (OpenCV's VP9 encoder takes six times as
+    long for 0.5 dB.)
 
     Args:
-        path: the file to write, in a folder that exists.
-        render: from one camera to a picture `(1, 3, H, W)`.
-        views: those whose cameras are passed.
-        depth: of the scene before the cameras, in world units.
-        stage: shows how far the work is; :func:`kgs.io.console.each`, or nothing.
+        path: the file to write, in an existing folder.
+        render: from a camera to an image `(1, 3, H, W)`.
+        views: the views whose cameras the path passes.
+        depth: distance from the cameras to the scene, in world units.
+        stage: wraps the poses to show progress, such as :func:`kgs.io.console.each`.
 
     Returns:
-        "", or why there is no film: OpenCV cannot write such files here.
+        "", or the reason why no film was written: OpenCV cannot write such files here.
     """
     path = Path(path)
-    height, width = views.images.shape[-2:]
-    shrink = min(1.0, LONGEST / max(height, width))
-    size = (max(2, 2 * round(height * shrink / 2)), max(2, 2 * round(width * shrink / 2)))
-    scale = views.cameras.intrinsics.new_tensor([size[1] / width, size[0] / height])
-    lens = views.cameras.intrinsics.mean(0)
-    lens[:2] *= scale[:, None]
-    lens[:2, 2] += (scale - 1) / 2  # (c + 1/2) s - 1/2: pixel centres are integers
+    size, lens = _frame_lens(views)
     poses = tour(views.cameras.extrinsics, FRAMES, depth).to(lens)
-    part = path.with_name(f".{path.name}")  # OpenCV goes by the ending
+    part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
     try:
-        with _silent():
+        with _stderr_discarded():
             writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP80"), RATE, size[::-1])
         if not writer.isOpened():
             return f"no {path.name}: this OpenCV writes no WebM files"
@@ -73,8 +70,8 @@ def write_film(
         writer.release()
         if round(cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT)) != len(poses):
             return f"no {path.name}: it could not be written whole"
-        with open(part, "ab") as file:  # an element of EBML that players skip
-            file.write(b"\xec" + bytes([0x80 | len(MARK)]) + MARK)
+        with open(part, "ab") as file:
+            file.write(_EBML_VOID + bytes([0x80 | len(MARK)]) + MARK)
         os.replace(part, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -83,114 +80,156 @@ def write_film(
     return ""
 
 
-def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
-    """A smooth closed path through some cameras: their poses, and those between them.
+def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:
+    """Height and width of the frames, and the mean intrinsics of the views for this size, `(4, 4)`."""
+    height, width = views.images.shape[-2:]
+    shrink = min(1.0, LONGEST / max(height, width))
+    size = (max(2, 2 * round(height * shrink / 2)), max(2, 2 * round(width * shrink / 2)))
+    scale = views.cameras.intrinsics.new_tensor([size[1] / width, size[0] / height])
+    lens = views.cameras.intrinsics.mean(0)
+    lens[:2] *= scale[:, None]
+    lens[:2, 2] += (scale - 1) / 2  # (c + 1/2) s - 1/2: pixel centres are integers
+    return size, lens
 
-    Positions and quaternions are cubic splines in the order of a short round trip, with slopes that never overshoot
-    (F. Fritsch and J. Butland, SIAM J. Sci. Stat. Comput. 5, 1984): each coordinate stays between those of neighbouring
-    cameras. Those that look at one point are passed on arcs around it, looking there, not on chords through it.
-    From two cameras the path goes there and back, around a single one it sways. Of more than twelve some are passed.
+
+def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
+    """A smooth closed path through some cameras, as poses.
+
+    The cameras are passed in the order of a short round trip. Between them, positions and quaternions are cubic splines
+    that do not overshoot (F. Fritsch and J. Butland, SIAM J. Sci. Stat. Comput. 5, 1984): each coordinate stays between
+    those of the neighbouring cameras. If the cameras look at a common point, the path follows arcs around this point
+    and keeps looking at it. With two cameras, the path goes there and back; with one, it is a small ellipse. With more
+    than twelve, some cameras are skipped.
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, in and out. The first pose is that of one of the cameras.
 
     Args:
         extrinsics: `(V, 4, 4)`, V >= 1.
-        frames: how many poses are wanted; after the last one the first follows.
-        depth: of the scene before the cameras, in world units; for a single camera.
+        frames: number of poses. The first one follows the last.
+        depth: distance from the cameras to the scene, in world units; used for a single camera.
 
     Returns:
         `(frames, 4, 4)`, float64.
     """
-    poses = torch.linalg.inv(extrinsics.double().cpu())
-    centers, ahead = poses[:, :3, 3].numpy(), poses[:, :3, 2].numpy()
+    poses = torch.linalg.inv(extrinsics.double().cpu())  # camera to world
     if len(poses) == 1:
         return _sway(poses[0], frames, depth)
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
-    apart = apart / (apart.max() or 1.0) + np.arccos((ahead @ ahead.T).clip(-1, 1)) / np.pi
-    order = _round_trip(apart)
+    distances = _distances(poses)
+    order = _round_trip(distances)
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
-    places, turns, focus = poses[order, :3, 3], poses[order, :3, :3], meeting_point(extrinsics[order])
-    stops = torch.empty(len(order), 8, dtype=torch.float64)  # place, distance from the focus, quaternion
-    stops[:, :3], stops[:, 3] = places, 1.0
-    if focus is not None:  # the direction from there, and the rotation from looking there
-        down = -upright(extrinsics)[1]
-        stops[:, 3] = (places - focus).norm(dim=1)
-        stops[:, :3] = (places - focus) / stops[:, 3:4]
-        turns = _looking(places, focus, down).mT @ turns
-    stops[:, 4:] = rotation_matrix_to_quaternion(turns.contiguous())
-    times = np.array([apart[a, b] for a, b in zip(order, order[1:] + order[:1], strict=True)])
-    found = torch.from_numpy(_closed_spline(stops.numpy(), times.clip(1e-6), frames))
-    places, turns = found[:, :3], quaternion_to_rotation_matrix(found[:, 4:])
-    if focus is not None:
-        places = focus + found[:, 3:4] * normalize(places, dim=1)
-        turns = _looking(places, focus, down) @ turns
-    return _extrinsics(places, turns)
+    times = np.array([distances[a, b] for a, b in zip(order, order[1:] + order[:1], strict=True)]).clip(1e-6)
+    places, rotations = poses[order, :3, 3], poses[order, :3, :3]
+    focus = meeting_point(extrinsics[order])
+    if focus is None:
+        places, rotations = _interpolated(places, rotations, times, frames)
+        return _extrinsics(places, rotations)
+
+    # Interpolate the direction and the distance from the focus, and the rotation relative to looking at it.
+    down = -upright(extrinsics)[1]
+    radii = (places - focus).norm(dim=1, keepdim=True)
+    rotations = _looking_at(focus, places, down).mT @ rotations
+    polar = torch.cat([(places - focus) / radii, radii], 1)
+    polar, rotations = _interpolated(polar, rotations, times, frames)
+    places = focus + polar[:, 3:] * normalize(polar[:, :3], dim=1)
+    return _extrinsics(places, _looking_at(focus, places, down) @ rotations)
+
+
+def _distances(poses: Tensor) -> Array:
+    """Distances between camera-to-world poses, `(V, V)`: those of positions plus those of directions, each up to 1."""
+    centers, forward = poses[:, :3, 3].numpy(), poses[:, :3, 2].numpy()
+    moved = np.linalg.norm(centers[:, None] - centers, axis=2)
+    turned = np.arccos((forward @ forward.T).clip(-1, 1))
+    distances: Array = moved / (moved.max() or 1.0) + turned / np.pi
+    return distances
 
 
 def _sway(pose: Tensor, frames: int, depth: float) -> Tensor:
-    """A small ellipse before one camera, which keeps looking at what lies at the depth."""
+    """Poses on a small ellipse beside one camera, looking at the point at `depth` on its optical axis."""
     angles = 2 * torch.pi * torch.arange(frames, dtype=torch.float64) / frames
-    right, down, ahead = pose[:3, :3].T
+    right, down, forward = pose[:3, :3].T
     places = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
-    return _extrinsics(pose[:3, 3] + places, _looking(places, depth * ahead, down))
+    return _extrinsics(pose[:3, 3] + places, _looking_at(depth * forward, places, down))
 
 
-def _looking(places: Tensor, target: Tensor, down: Tensor) -> Tensor:
-    """Rotations from the camera's axes to the world's, `(F, 3, 3)`: ahead is the target, `down` is below."""
-    ahead = normalize(target - places, dim=1)
-    right = normalize(torch.linalg.cross(down.expand_as(ahead), ahead), dim=1)
-    return torch.stack([right, torch.linalg.cross(ahead, right), ahead], 2)
+def _looking_at(target: Tensor, places: Tensor, down: Tensor) -> Tensor:
+    """Camera-to-world rotations `(F, 3, 3)` of cameras at `places` that look at the target, with `down` below."""
+    forward = normalize(target - places, dim=1)
+    right = normalize(torch.linalg.cross(down.expand_as(forward), forward), dim=1)
+    return torch.stack([right, torch.linalg.cross(forward, right), forward], 2)
 
 
-def _extrinsics(places: Tensor, turns: Tensor) -> Tensor:
+def _extrinsics(places: Tensor, rotations: Tensor) -> Tensor:
+    """World-to-camera matrices `(F, 4, 4)` from positions and camera-to-world rotations."""
     poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
-    poses[:, :3, :3], poses[:, :3, 3] = turns, places
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, places
     found: Tensor = torch.linalg.inv(poses)
     return found
 
 
-def _round_trip(apart: Array) -> list[int]:
-    """A short round trip through all: the nearest one next, then parts are turned around while that helps."""
-    order, left = [0], set(range(1, len(apart)))
+def _round_trip(distances: Array) -> list[int]:
+    """A short round trip through all points: always to the nearest one next, then improved by reversing sections."""
+    order, left = [0], set(range(1, len(distances)))
     while left:
-        order.append(min(left, key=lambda i: (apart[order[-1], i], i)))
+        order.append(min(left, key=lambda i: (distances[order[-1], i], i)))
         left.remove(order[-1])
-    better = True
-    while better:
-        better = False
+    improved = True
+    while improved:
+        improved = False
         for i in range(1, len(order) - 1):
             for j in range(i + 1, len(order)):
                 a, b, c, d = order[i - 1], order[i], order[j], order[(j + 1) % len(order)]
-                if apart[a, c] + apart[b, d] < apart[a, b] + apart[c, d] - 1e-9:
-                    order[i : j + 1], better = order[i : j + 1][::-1], True
+                if distances[a, c] + distances[b, d] < distances[a, b] + distances[c, d] - 1e-9:
+                    order[i : j + 1] = order[i : j + 1][::-1]
+                    improved = True
     return order
 
 
+def _interpolated(vectors: Tensor, rotations: Tensor, times: Array, frames: int) -> tuple[Tensor, Tensor]:
+    """Vectors `(V, D)` and rotations `(V, 3, 3)` along a closed path: `(frames, D)` and `(frames, 3, 3)`.
+
+    `times` has V durations, each from one stop to the next.
+    """
+    quaternions = rotation_matrix_to_quaternion(rotations.contiguous())
+    rows = torch.from_numpy(_closed_spline(torch.cat([vectors, quaternions], 1).numpy(), times, frames))
+    return rows[:, :-4], quaternion_to_rotation_matrix(rows[:, -4:])
+
+
 def _closed_spline(stops: Array, times: Array, frames: int) -> Array:
-    """Rows `(frames, 8)` of the spline through the stops, evenly in time; the last four columns are quaternions."""
+    """Rows of a cubic spline through the stops `(V, D)`, evenly spaced in time: `(frames, D)`.
+
+    The last four columns are quaternions, not normalised. `times` has V durations, each from one stop to the next.
+    """
     n = len(stops)
-    steps = times[np.arange(-1, n + 1) % n]
-    values = stops[np.arange(-1, n + 2) % n]
-    for i in range(1, n + 3):  # the nearer of the two quaternions of each rotation
-        values[i, 4:] *= -1.0 if values[i, 4:] @ values[i - 1, 4:] < 0 else 1.0
-    slopes = np.diff(values, axis=0) / steps[:, None]
-    before, after, h, g = slopes[:-1], slopes[1:], steps[:-1, None], steps[1:, None]
-    turns = before * after <= 0
-    safe = np.where(turns, 1.0, before), np.where(turns, 1.0, after)
-    tangents = np.where(turns, 0.0, 3 * (h + g) / ((2 * g + h) / safe[0] + (g + 2 * h) / safe[1]))
+    values = stops[np.arange(-1, n + 2) % n]  # the last stop, all stops, the first two again
+    for previous, value in pairwise(values):
+        if value[-4:] @ previous[-4:] < 0:  # q and -q are the same rotation: take the nearer one
+            value[-4:] *= -1.0
+    steps = times[np.arange(-1, n + 1) % n, None]
+    slopes = np.diff(values, axis=0) / steps
+    tangents = _tangents(slopes[:-1], slopes[1:], steps[:-1], steps[1:])
+
     ends = np.cumsum(times)
     moments = ends[-1] * np.arange(frames) / frames
-    i = np.searchsorted(ends, moments, side="right").clip(max=n - 1)
-    u = ((moments - ends[i]) / times[i] + 1)[:, None]
-    parts = (1 + 2 * u) * (1 - u) ** 2 * values[i + 1] + u * u * (3 - 2 * u) * values[i + 2]
-    rows: Array = parts + times[i, None] * (u * (1 - u) ** 2 * tangents[i] - u * u * (1 - u) * tangents[i + 1])
+    i = np.searchsorted(ends, moments, side="right").clip(max=n - 1)  # which stop comes before
+    u = ((moments - ends[i]) / times[i] + 1)[:, None]  # 0 at this stop, 1 at the next one
+    position = (1 + 2 * u) * (1 - u) ** 2 * values[i + 1] + u * u * (3 - 2 * u) * values[i + 2]
+    rows: Array = position + times[i, None] * (u * (1 - u) ** 2 * tangents[i] - u * u * (1 - u) * tangents[i + 1])
     return rows
 
 
+def _tangents(before: Array, after: Array, step_before: Array, step_after: Array) -> Array:
+    """Tangents by Fritsch and Butland: a weighted harmonic mean of both slopes, or 0 where their signs differ."""
+    extremum = before * after <= 0
+    before, after = np.where(extremum, 1.0, before), np.where(extremum, 1.0, after)
+    weights = (2 * step_after + step_before) / before + (step_after + 2 * step_before) / after
+    tangents: Array = np.where(extremum, 0.0, 3 * (step_before + step_after) / weights)
+    return tangents
+
+
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """What native code writes to stderr goes nowhere: OpenCV remarks on every WebM file."""
+def _stderr_discarded() -> Iterator[None]:
+    """Discards what native code writes to stderr: OpenCV prints a remark for each WebM file."""
     kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(null, 2)

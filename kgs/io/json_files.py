@@ -9,6 +9,8 @@ from typing import Any, TypeGuard
 
 from kgs.errors import DataError
 
+from .ownership import MADE_BY
+
 _MOST_BYTES = 64 * 2**20
 
 
@@ -33,7 +35,12 @@ def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGua
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all; a ValueError where a number is not finite."""
+    """Write JSON whole or not at all; a ValueError where a number is not finite.
+
+    An object says first who wrote it, under "generator".
+    """
+    if isinstance(value, dict):
+        value = {"generator": MADE_BY} | value
     write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 

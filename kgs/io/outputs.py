@@ -3,11 +3,10 @@
 import hashlib
 import os
 import re
-import shutil
 import unicodedata
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -17,18 +16,11 @@ from kgs.datasets.images import list_images
 from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.errors import DataError
 
-from .film import MARK as FILM_MARK
 from .images import eight_bits
 from .json_files import write_whole
+from .ownership import MARK, is_own
 
-PNG_MARK = b"Software\0kgs"
-FOLDER_MARK = ".kgs"  # an empty file in a folder that kgs made for a while
 EXPORTS = ("cameras.json", "splat.glb", "turntable.webm")  # for other programs
-_MARKS = {".png": (PNG_MARK,), ".ply": (b"\ncomment kgs ",), ".json": (b'"kgs": "', b'"timetable": {')}
-_MARKS |= {".html": (b'<meta name="generator" content="kgs ',)}
-_MARKS |= {".glb": (b'"generator":"kgs ',), ".webm": (FILM_MARK,)}
-_MARKS |= {suffix: (b"kgs-checkpoint ",) for suffix in (".safetensors", ".pt")}
-_DEEP = (".json", ".webm", ".safetensors")  # the mark may stand far behind
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
 _LONGEST = 120  # bytes of a picture's name
@@ -40,7 +32,7 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
     `files`, relative to `out`, are what it is going to write; `scene` is a folder whose own photos it must not write
     beside. With `make` False it only looks. A folder that will not do is a DataError.
     """
-    advice = "choose another folder with -o"
+    advice = "choose another folder"
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
         raise DataError(out, "", f"expected a folder for results, but {there} is none")
@@ -56,24 +48,6 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
             raise DataError(path, "", f"was not written by kgs and would be overwritten: {advice}")
     if make:
         out.mkdir(parents=True, exist_ok=True)
-
-
-def is_own(path: Path) -> bool:
-    """Whether kgs wrote this file (PNG, PLY, JSON, HTML, glTF, WebM, checkpoint), or made this folder."""
-    if path.is_dir():
-        return (path / FOLDER_MARK).is_file() or not any(path.iterdir())
-    if not path.is_file():
-        return False
-    with open(path, "rb") as file:
-        content = file.read(2**26 if path.suffix in _DEEP else 2**12)
-    return any(mark in content for mark in _MARKS.get(path.suffix, ()))
-
-
-def start_folder(path: Path) -> None:
-    """An empty folder by which `is_own` knows kgs again, in the place of a former one of kgs's own."""
-    shutil.rmtree(path, ignore_errors=True)
-    path.mkdir()
-    (path / FOLDER_MARK).touch()
 
 
 def png_names(views: Iterable[str]) -> dict[str, str]:
@@ -101,14 +75,8 @@ def write_png(path: Path, image: Tensor) -> None:
     ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")
-    chunk = b"tEXt" + PNG_MARK
-    mark = len(PNG_MARK).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    text = b"Software\0" + MARK
+    chunk = b"tEXt" + text
+    mark = len(text).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
     data, header = content.tobytes(), 33  # bytes of the signature and the first chunk
     write_whole(path, data[:header] + mark + data[header:])
-
-
-def remove_others(folder: Path, keep: Collection[str]) -> None:
-    """Remove the pictures of a former run: PNGs that kgs wrote, but for those named in `keep`."""
-    for path in folder.glob("*.png"):
-        if path.name not in keep and is_own(path):
-            path.unlink()

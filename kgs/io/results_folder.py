@@ -1,27 +1,25 @@
-"""The folder of a fit: one fit at a time, and an old result that stays whole until the new one is.
+"""The folder of a fit: which files it has, one fit at a time, and when it is finished."""
 
-A fit writes to `unfinished`, its checkpoints included. When all is there the folder is renamed to `finished`, and its
-files are moved to their places. Whoever opens the folder after a kill in between ends the move first.
-"""
-
-import os
-import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from kgs.errors import DataError
-from kgs.fit.checkpoint import previous
 
-from .json_files import read_json, write_json
-from .outputs import EXPORTS, is_own, remove_others
+from .json_files import read_json
+from .outputs import EXPORTS
+from .ownership import is_own
+from .staging import Staging
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
-UNFINISHED, _FINISHED = "unfinished", "finished"
-_LIST = "files.json"  # all files of the new result
-_OPTIONAL = (previous(Path(CHECKPOINT)).name, "turntable.webm", "checkpoint.pt", "checkpoint.previous.pt")  # old
+_OPTIONAL = (PREVIOUS, "turntable.webm")
+
+
+def fit_staging(out: Path) -> Staging:
+    """How the results of a fit get to their folder."""
+    return Staging(out, optional=_OPTIONAL, merged=("test",))
 
 
 @contextmanager
@@ -51,44 +49,20 @@ def locked(out: Path) -> Iterator[None]:
     """Keep other fits out of a folder until the block or the process ends; DataError where one is at work there."""
     with held(out / ".lock") as ours:
         if not ours:
-            raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another --out")
+            raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another folder")
         yield
 
 
-def taken(out: Path) -> list[str]:
+def replaced_files(out: Path) -> list[str]:
     """What a fit replaces or removes in its folder; checkpoints, which may be damaged, only where there is no fit."""
-    names = [*RESULTS, UNFINISHED, _FINISHED]
+    staging = fit_staging(out)
+    names = [*RESULTS, staging.unfinished.name, staging.finished.name]
     return names if is_own(out / "config.json") else [*names, CHECKPOINT, *_OPTIONAL]
 
 
-def publish(out: Path) -> None:
-    """Put the results in `unfinished` in the place of a former fit's; what fails to move, the next `end_move` moves."""
-    new = out / UNFINISHED
-    write_json(new / _LIST, {"files": _results(new)})
-    shutil.rmtree(out / _FINISHED, ignore_errors=True)
-    os.replace(new, out / _FINISHED)
-    end_move(out)
-
-
-def end_move(out: Path) -> None:
-    """Within `locked`: what is left of a move goes to its place, what belonged to the former result goes away."""
-    done = out / _FINISHED
-    if not (is_own(done) and (done / _LIST).exists()):
-        return
-    names = [str(name) for name in read_json(done / _LIST).get("files", [])]  # of the moved ones as well
-    (out / "test").mkdir(exist_ok=True)
-    remove_others(out / "test", {Path(name).name for name in names if name.startswith("test/")})
-    for name in set(_OPTIONAL) - set(names):
-        (out / name).unlink(missing_ok=True)
-    for name in _results(done):
-        os.replace(done / name, out / name)
-    shutil.rmtree(done)
-
-
-def _results(folder: Path) -> list[str]:
-    """The files of a result, without what a kill left half written."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != _LIST]
-    return [path.relative_to(folder).as_posix() for path in files if path.name[0] != "." and path.suffix != ".partial"]
+def previous(path: Path) -> Path:
+    """Where the checkpoint before the one at `path` is."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 def is_finished(out: Path) -> bool:
@@ -99,8 +73,9 @@ def is_finished(out: Path) -> bool:
         return False
 
 
-def end_stopped_move(out: Path) -> None:
-    """End the move of a fit that a kill stopped, if there is one."""
-    if (out / _FINISHED / _LIST).exists():
+def complete_stopped_move(out: Path) -> None:
+    """Complete the move of a fit's results that a kill stopped, if there is one."""
+    staging = fit_staging(out)
+    if staging.finished.exists():
         with locked(out):
-            end_move(out)
+            staging.complete()

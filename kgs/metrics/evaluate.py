@@ -110,13 +110,6 @@ def in_words(metrics: dict[str, Any]) -> str:
     if seen.get("psnr") is not None and seen.get("psnr_rest") is not None:
         share, level, rest = (seen[name] for name in ("share", "psnr", "psnr_rest"))
         lines.append(f" test: {100 * share:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
-    if (found := metrics.get("estimate")) and found["psnr"] is not None:
-        spread = "" if found["sd"] is None else f"sd {found['sd']:.2g}, "
-        count = f"{found['n']} of {len(found['photos'])} photos"
-        lines.append(f"estimate: PSNR {found['psnr']:.4g} ({spread}{count}, each left out once, with --fast)")
-    elif found:
-        lines.append("estimate: none of the photos that were left out could be judged")
-        lines += [f"  {photo['name']}: {photo['why']}" for photo in found["photos"]]
-    elif not metrics["test"]:
-        lines.append("no photo was held out: how good other views are was not measured (--hold-out N, --estimate)")
+    if not metrics["test"]:
+        lines.append("no photo was held out: the quality of other views was not measured (see --hold-out)")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""A page of a splat: one HTML file with a viewer, photos beside renders, and what is known of the fit."""
+"""The web page of a splat: one HTML file with a viewer, photos beside renders, and the measurements of the fit."""
 
 from .pictures import Picture
 from .write import write_page

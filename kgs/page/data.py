@@ -1,9 +1,12 @@
-"""A splat in few bytes, for the viewer: each number in fixed point, in planes of bytes that gzip shortens well.
+"""Packs a splat into few bytes for the viewer: fixed-point numbers, stored in planes of bytes, compressed with gzip.
 
-What a viewer decodes: `count` Gaussians in columns; of each column `width` planes of `count` bytes, the highest byte
-first. A value is `low + step * integer`. Positions are in world units, scales natural logarithms. Of a unit quaternion
-w, x, y, z the component `largest` is left out, which is positive; the other three follow in order. Harmonics are
-`value * |value|` of what is stored, so that small ones keep their digits, in the order of PLY files: k, then r, g, b.
+The format: `count` Gaussians, stored in columns of one number per Gaussian. A column consists of `width` planes of
+`count` bytes each; the first plane holds the most significant bytes. A value is `low + step * integer`.
+
+Positions are in world units, scales are natural logarithms. Quaternions w, x, y, z have length 1 and lack the component
+with the largest magnitude, which is positive and whose place is `largest`; the other three are stored in order.
+Harmonics are the signed square roots of the coefficients, so that small ones keep more digits: a coefficient is
+`value * |value|`. Their order is that of PLY files: by coefficient, then r, g, b.
 """
 
 import math
@@ -21,39 +24,46 @@ from kgs.harmonics import SH_C0
 from kgs.projection import finite_gaussians
 from kgs.types import SH_SIZES, Gaussians, RasterOptions
 
-from .cameras import Array, in_picture, lenses
+from .cameras import Array, lenses, visible_points
 
-PIXEL_ERROR = 0.01  # by which fixed point may move a centre in a picture of the given cameras, in pixels
-FINE, COARSE = 16, 8  # bits of a number
-_MOST_BITS = 32  # of a position
-_SMALLEST = 1e-12  # scale that has a logarithm
-_CELL_BITS = 16  # of a coordinate in the order of neighbours
-_GZIP_HEADER = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # no name, no time, no system
-_LAST_BLOCK = b"\x03\0"  # empty
-_FIT = 0.97  # of the room is aimed at when Gaussians have to go
+PIXEL_ERROR = 0.01  # largest shift of a Gaussian's centre by rounding, in pixels of the given cameras
+FINE, COARSE = 16, 8  # bits per number
+_POSITION_BITS = 8, 32  # fewest and most bits of a coordinate
+_MIN_SCALE = 1e-12  # smaller scales are raised to this one, whose logarithm is finite
+_CELL_BITS = 16  # bits per axis of the cells that sort Gaussians by their place
+_GZIP_HEADER = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # without file name, time and operating system
+_LAST_BLOCK = b"\x03\0"  # an empty DEFLATE block that ends the stream
+_TARGET_SHARE = 0.97  # share of the limit to aim at when Gaussians are left out
 
 
 class Packed(NamedTuple):
-    """A splat for the page."""
+    """A packed splat.
 
-    layout: dict[str, Any]  # count, degree, columns: what a viewer decodes by
-    content: bytes  # gzip of the planes
-    left_out: str  # what the limit of size cost, in words; "" for nothing
+    Args:
+        layout: what a viewer needs to decode the content: `count`, `degree` of the harmonics, and `columns` with the
+            name, width, low and step of each.
+        content: the planes of all columns as one gzip file.
+        left_out: what was reduced to respect the limit of size, in words; "" for nothing.
+    """
+
+    layout: dict[str, Any]
+    content: bytes
+    left_out: str
 
 
 class Column(NamedTuple):
-    """One number of each Gaussian, in fixed point."""
+    """One number per Gaussian in fixed point: `low + step * integers`, each integer `width` bytes wide."""
 
     name: str
-    width: int  # bytes
+    width: int
     low: float
     step: float
     integers: NDArray[np.uint64]
 
     def planes(self) -> bytes:
-        """The highest bytes of all Gaussians, then the next ones."""
+        """The most significant bytes of all Gaussians, then the next bytes, down to the least significant ones."""
         shifts = range(8 * (self.width - 1), -1, -8)
-        return b"".join((self.integers >> np.uint64(s)).astype(np.uint8).tobytes() for s in shifts)
+        return b"".join((self.integers >> np.uint64(shift)).astype(np.uint8).tobytes() for shift in shifts)
 
 
 def pack(
@@ -63,16 +73,18 @@ def pack(
     weights: Callable[[], Tensor] | None = None,
     near_plane: float = RasterOptions.near_plane,
 ) -> Packed:
-    """The Gaussians in at most so many bytes.
+    """Pack Gaussians into at most `most_bytes` bytes.
 
-    What no picture shows is left out: Gaussians that are not finite, or fainter than the threshold of alpha. Where the
-    rest is too large numbers get fewer bits, then harmonics a lower degree, and only then are Gaussians left out.
+    Invisible Gaussians are always left out: those that are not finite, or have an opacity below the alpha threshold. If
+    the rest is too large, first the numbers get fewer bits, then the harmonics a lower degree, and only then are
+    Gaussians left out.
 
     Args:
-        gaussians: with harmonics, or RGB `(N, 3)`.
-        cameras: those that the page has; positions get as many bits as their pictures need, see `PIXEL_ERROR`.
-        most_bytes: of the result's content.
-        weights: what each Gaussian contributes, `(N,)`; asked for where some have to go. None: opacity times area.
+        gaussians: with harmonics, or RGB colours `(N, 3)`.
+        cameras: the cameras of the page. Positions get as many bits as their images need, see `PIXEL_ERROR`.
+        most_bytes: limit for the content of the result.
+        weights: returns the contribution of each Gaussian, `(N,)`; those with the smallest are left out first. It is
+            called only if Gaussians must be left out. None: opacity times area.
         near_plane: of the renderer, in world units.
 
     Raises:
@@ -85,110 +97,130 @@ def pack(
     rows = np.flatnonzero(finite & (values["opacities"] >= RasterOptions.alpha_threshold))
     values = {name: value[rows] for name, value in values.items()}
     degree = SH_SIZES.index(values["colors"].shape[1])
-    found, said = Packed({}, b"", ""), list[str]()
-    for found, said in _attempts(values, cameras, near_plane, degree):
-        if len(found.content) <= most_bytes:
-            return found._replace(left_out=", ".join(said))
-    worth = _worth(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
-    order, kept = np.argsort(-worth, kind="stable"), len(rows)
-    while len(found.content) > most_bytes:
-        kept = min(kept - 1, math.floor(_FIT * kept * most_bytes / len(found.content)))
+    packed, reductions = Packed({}, b"", ""), list[str]()
+    for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
+        if len(packed.content) <= most_bytes:
+            return packed._replace(left_out=", ".join(reductions))
+    contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
+    order = np.argsort(-contributions, kind="stable")
+    kept = len(rows)
+    while len(packed.content) > most_bytes:
+        kept = min(kept - 1, math.floor(_TARGET_SHARE * kept * most_bytes / len(packed.content)))
         if kept < 1:
             raise ValueError(f"most_bytes: expected room for a Gaussian, got {most_bytes} bytes")
-        some = {name: value[order[:kept]] for name, value in values.items()}
-        found = _joined(_compressed(some, cameras, near_plane, COARSE, 0), 0)
-    return found._replace(left_out=", ".join([*said, f"{kept} of {len(rows)} Gaussians"]))
+        chosen = {name: value[order[:kept]] for name, value in values.items()}
+        packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
+    return packed._replace(left_out=", ".join([*reductions, f"{kept} of {len(rows)} Gaussians"]))
 
 
-def _attempts(
+def _with_all_gaussians(
     values: dict[str, Array], cameras: PinholeCamera, near_plane: float, degree: int
 ) -> Iterator[tuple[Packed, list[str]]]:
-    """All Gaussians in ever fewer bytes, and what that cost: bits of the numbers, then degrees of the harmonics."""
-    yield _joined(_compressed(values, cameras, near_plane, FINE, degree), degree), []
-    columns = _compressed(values, cameras, near_plane, COARSE, degree)
+    """All Gaussians in fewer and fewer bytes, with what was reduced: the bits per number, then the degree."""
+    yield _gzip(_compressed_columns(values, cameras, near_plane, FINE, degree), degree), []
+    columns = _compressed_columns(values, cameras, near_plane, COARSE, degree)
     for lower in range(degree, -1, -1):
-        count = len(columns) - 3 * (SH_SIZES[degree] - SH_SIZES[lower])
-        cost = [f"harmonics up to degree {lower} of {degree}"] if lower < degree else []
-        yield _joined(columns[:count], lower), ["numbers of 8 bits", *cost]
+        dropped = 3 * (SH_SIZES[degree] - SH_SIZES[lower])  # the last columns
+        reductions = ["8-bit numbers"]
+        if lower < degree:
+            reductions.append(f"harmonics up to degree {lower} of {degree}")
+        yield _gzip(columns[: len(columns) - dropped], lower), reductions
 
 
-def _compressed(
+def _compressed_columns(
     values: dict[str, Array], cameras: PinholeCamera, near_plane: float, bits: int, degree: int
 ) -> list[tuple[Column, bytes]]:
-    """The columns, and each in DEFLATE blocks that refer to no other and end at a byte."""
-    near, found = _neighbours_together(values["means"]), list[tuple[Column, bytes]]()
-    some = {name: value[near] for name, value in values.items()}
-    for column in _columns(some, _pixels_per_unit(some["means"], cameras, near_plane), bits, degree):
+    """The columns, and the DEFLATE blocks of each, which do not depend on other columns and end at a byte boundary."""
+    order = _by_place(values["means"])
+    ordered = {name: value[order] for name, value in values.items()}
+    pixels_per_unit = _pixels_per_unit(ordered["means"], cameras, near_plane)
+    found = list[tuple[Column, bytes]]()
+    for column in _columns(ordered, pixels_per_unit, bits, degree):
         deflate = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
         found.append((column, deflate.compress(column.planes()) + deflate.flush(zlib.Z_FULL_FLUSH)))
     return found
 
 
-def _joined(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
-    """One gzip file of columns (RFC 1952)."""
-    described = [[column.name, column.width, column.low, column.step] for column, _ in columns]
-    count, check, size = len(columns[0][0].integers), 0, 0
+def _gzip(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
+    """One gzip file of compressed columns (RFC 1952)."""
+    layout = {
+        "count": len(columns[0][0].integers),
+        "degree": degree,
+        "columns": [[column.name, column.width, column.low, column.step] for column, _ in columns],
+    }
+    checksum, size = 0, 0
     for column, _ in columns:
         planes = column.planes()
-        check, size = zlib.crc32(planes, check), size + len(planes)
-    content = _GZIP_HEADER + b"".join(deflated for _, deflated in columns) + _LAST_BLOCK
-    content += struct.pack("<II", check, size % 2**32)
-    return Packed({"count": count, "degree": degree, "columns": described}, content, "")
+        checksum = zlib.crc32(planes, checksum)
+        size += len(planes)
+    blocks = b"".join(deflated for _, deflated in columns)
+    trailer = struct.pack("<II", checksum, size % 2**32)
+    return Packed(layout, _GZIP_HEADER + blocks + _LAST_BLOCK + trailer, "")
 
 
 def _columns(values: dict[str, Array], pixels_per_unit: float, bits: int, degree: int) -> Iterator[Column]:
-    means, norms = values["means"], np.linalg.norm(values["quats"], axis=1, keepdims=True)
-    finest = 2 * PIXEL_ERROR / math.sqrt(3) / max(pixels_per_unit, 1e-12)
+    """All numbers of the Gaussians in fixed point, the harmonics last."""
+    means = values["means"]
+    largest_step = 2 * PIXEL_ERROR / math.sqrt(3) / max(pixels_per_unit, 1e-12)
+    least_bits, most_bits = _POSITION_BITS
     for name, column in zip("xyz", means.T, strict=True):
         span = float(np.ptp(column)) if len(column) else 0.0
-        yield _fixed(name, column, min(_MOST_BITS, max(8, math.ceil(math.log2(span / finest + 2)))))
-    for axis, column in enumerate(np.log(values["scales"].clip(_SMALLEST)).T):
-        yield _fixed(f"scale{axis}", column, bits)
+        needed = math.ceil(math.log2(span / largest_step + 2))
+        yield _fixed_point(name, column, min(most_bits, max(least_bits, needed)))
+
+    for axis, column in enumerate(np.log(values["scales"].clip(_MIN_SCALE)).T):
+        yield _fixed_point(f"scale{axis}", column, bits)
+
+    norms = np.linalg.norm(values["quats"], axis=1, keepdims=True)
     quats = np.where(norms > 0, values["quats"] / np.where(norms > 0, norms, 1.0), [1.0, 0.0, 0.0, 0.0])
     largest = np.abs(quats).argmax(axis=1)
     quats = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
     others = quats[np.arange(4) != largest[:, None]].reshape(-1, 3)
     yield Column("largest", 1, 0.0, 1.0, largest.astype(np.uint64))
-    for axis, column in enumerate(others.T):
-        yield _fixed(f"turn{axis}", column, bits)
-    yield _fixed("opacity", values["opacities"], bits)
+    for i, column in enumerate(others.T):
+        yield _fixed_point(f"quat{i}", column, bits)
+
+    yield _fixed_point("opacity", values["opacities"], bits)
+
     for k in range(SH_SIZES[degree]):
         for channel in range(3):
             column = values["colors"][:, k, channel]
-            yield _fixed(f"sh{k}{'rgb'[channel]}", np.sign(column) * np.sqrt(np.abs(column)), COARSE if k else bits)
+            roots = np.sign(column) * np.sqrt(np.abs(column))
+            yield _fixed_point(f"sh{k}{'rgb'[channel]}", roots, COARSE if k else bits)
 
 
-def _fixed(name: str, values: Array, bits: int) -> Column:
-    """The values between their bounds, in so many bits."""
+def _fixed_point(name: str, values: Array, bits: int) -> Column:
+    """A column whose integers of `bits` bits cover the range of the values."""
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     step = (high - low) / (2**bits - 1) or 1.0
-    return Column(name, math.ceil(bits / 8), low, step, np.rint((values - low) / step).astype(np.uint64))
+    integers = np.rint((values - low) / step).astype(np.uint64)
+    return Column(name, math.ceil(bits / 8), low, step, integers)
 
 
 def _pixels_per_unit(means: Array, cameras: PinholeCamera, near_plane: float) -> float:
-    """By how many pixels at most a centre moves in a picture that shows it when it is moved by a world unit."""
+    """The largest shift of a centre in an image that shows it, in pixels, when it moves by one world unit."""
     most = 0.0
     for k, pose, size in lenses(cameras):
-        points = in_picture(means, k, pose, size, near_plane)
+        points = visible_points(means, k, pose, size, near_plane)
         tangents = points[:, :2] / points[:, 2:]
-        slopes = np.abs(k.diagonal()[:2]).max() / points[:, 2] * np.sqrt(1 + (tangents**2).sum(axis=1))
-        most = max(most, float(slopes.max(initial=0.0)))
+        shifts = np.abs(k.diagonal()[:2]).max() / points[:, 2] * np.sqrt(1 + (tangents**2).sum(axis=1))
+        most = max(most, float(shifts.max(initial=0.0)))
     return most
 
 
-def _worth(values: dict[str, Array]) -> Array:
-    """Opacity times the largest area that a Gaussian can show."""
+def _opacity_times_area(values: dict[str, Array]) -> Array:
+    """The opacity of each Gaussian times the largest area that it can cover."""
     scales = np.sort(values["scales"], axis=1)
-    worth: Array = values["opacities"] * scales[:, 1] * scales[:, 2]
-    return worth
+    product: Array = values["opacities"] * scales[:, 1] * scales[:, 2]
+    return product
 
 
-def _neighbours_together(means: Array) -> NDArray[np.intp]:
-    """An order in which neighbours in space mostly follow each other (along a Morton curve): it compresses better."""
+def _by_place(means: Array) -> NDArray[np.intp]:
+    """An order along a Morton curve, in which Gaussians mostly follow their neighbours: it compresses better."""
     ranks = means.argsort(axis=0, kind="stable").argsort(axis=0, kind="stable").astype(np.uint64)
     cells = ranks * np.uint64(2**_CELL_BITS) // np.uint64(max(1, len(means)))
-    code = np.zeros(len(means), np.uint64)
+    codes = np.zeros(len(means), np.uint64)
     for bit in range(_CELL_BITS):
         for axis in range(3):
-            code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+            codes |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(codes, kind="stable")

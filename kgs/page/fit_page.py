@@ -1,4 +1,4 @@
-"""The page of a fit, index.html: what the fit knows, for :mod:`kgs.page`."""
+"""The page of a fit, index.html: collects the content for :func:`kgs.page.write_page` from a fit and its files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,13 +18,13 @@ from kgs.fit.run import Finished
 from kgs.fit.saved import SavedFit
 from kgs.io.console import each, say
 from kgs.io.json_files import read_json
-from kgs.io.outputs import is_own
+from kgs.io.ownership import is_own
 from kgs.model import GaussianModel
 
 from . import Picture, write_page
 
 PAGE = "index.html"
-MOST_PICTURES = 6
+MOST_PICTURES = 6  # photos that are shown beside their renders
 
 Render = Callable[[PinholeCamera], Tensor]
 
@@ -47,37 +47,42 @@ def write_fit_page(
     """Write the page of one or more fits of a scene; the viewer shows one of them.
 
     Args:
-        path: of the page.
+        path: the file to write.
         title: of the page.
         scene: photos and cameras.
-        model: what the viewer shows.
-        near_plane: of its renderer.
-        renders: from a camera to `(1, 3, H, W)`, by the name of the run.
-        runs: what metrics.json holds, by the name of the run.
-        shown: some of the test views, or without those of the training views; None: `MOST_PICTURES` of them. Only
-            these need pixels.
+        model: the splat in the viewer.
+        near_plane: of the model's renderer, in world units.
+        renders: functions from a camera to an image `(1, 3, H, W)`, by the name of the run.
+        runs: the content of metrics.json, by the name of the run.
+        shown: the views to show beside their renders; only these need pixels. None: up to `MOST_PICTURES` test views,
+            or training views if there are no test views.
         words: what training and test views are called.
-        notes: sentences for the reader.
-        settings: config.json.
-        report: a JSON file about how the cameras were found; left aside where it is not there.
+        notes: sentences to show below the measures.
+        settings: the content of config.json.
+        report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
 
     Returns:
-        What the page's limit of size cost, in words; "" for nothing.
+        What was reduced to respect the page's limit of size, in words; "" for nothing.
     """
     views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
     shown = shown or views.select(spread(len(views), MOST_PICTURES))
-    known = {run: _levels(metrics) for run, metrics in runs.items()}
+    psnr = {run: _psnr_of_views(metrics) for run, metrics in runs.items()}
     pictures = list[Picture]()
     for i in each(range(len(shown)), "page", "view"):
         name, camera = shown.names[i], shown.camera(i)
-        level = [f"{run} {known[run][name]:.2f} dB".strip() for run in renders if name in known.get(run, {})]
-        seen = {run: shown.as_photo(draw(camera)[0]) for run, draw in renders.items()}
-        pictures.append(Picture(name, shown.images[i], seen, ": ".join([name, *([", ".join(level)] if level else [])])))
+        images = {run: shown.as_photo(render(camera)[0]) for run, render in renders.items()}
+        values = [f"{run} {psnr[run][name]:.2f} dB".strip() for run in renders if name in psnr.get(run, {})]
+        caption = f"{name}: {', '.join(values)}" if values else name
+        pictures.append(Picture(name, shown.images[i], images, caption))
     found: dict[str, Any] = {}
-    with suppress(DataError):
-        found = read_json(report) if report is not None and report.is_file() else {}
+    if report is not None and report.is_file():
+        with suppress(DataError):
+            found = read_json(report)
     with torch.no_grad():
         gaussians = model()
+    sentences = [*notes]
+    for run, metrics in runs.items():
+        sentences += [*_coverage_note(metrics, run), *_poses_note(metrics)]
     return write_page(
         path,
         title,
@@ -88,12 +93,12 @@ def write_fit_page(
         near_plane=near_plane,
         background=scene.background,
         pictures=pictures,
-        pictures_note=_note(len(shown), len(views), word),
+        pictures_note=_pictures_note(len(shown), len(views), word),
         runs=runs,
         left_out=left_out(next(iter(runs.values()), {}).get("needs") or {}),
-        notes=[*notes, *(line for run, metrics in runs.items() for line in (*_seen(metrics, run), *_moved(metrics)))],
+        notes=sentences,
         settings=_settings(settings or {}),
-        report=_report(found),
+        report=_report_facts(found),
         weights=lambda: contributions(model, scene.train, near_plane),
     )
 
@@ -131,10 +136,10 @@ def _write_page_of(
 
 
 def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:
-    """Write the page of a fit that is in a folder again, with other measures; not in place of a user's own file."""
+    """Write the page in the folder of a fit again, with other measures. A file that kgs did not write is kept."""
     path = out / PAGE
     if path.exists() and not is_own(path):
-        say(f"{path} was not written by kgs, and is left as it is")
+        say(f"{path} was not written by kgs and is kept")
         return
 
     def render(camera: PinholeCamera) -> Tensor:
@@ -145,13 +150,13 @@ def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str,
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What config.json says, without the steps at which things happened."""
-    parts = {name: value for name, value in config.items() if name != "timetable"}
-    return {**parts.pop("request", {}), **parts.pop("fit", {}), **parts}
+    """The content of config.json in one dict, without the timetable of steps."""
+    rest = {name: value for name, value in config.items() if name not in ("request", "fit", "timetable")}
+    return {**config.get("request", {}), **config.get("fit", {}), **rest}
 
 
-def _report(found: Mapping[str, Any]) -> dict[str, Any]:
-    """What photos.json says of the cameras, without hashes and settings, its lists in a number or two."""
+def _report_facts(found: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of photos.json, without hashes and settings; long lists become a range. Missing parts are skipped."""
     report = {name: value for name, value in found.items() if name not in ("seed", "settings", "sha256", "versions")}
     photos, matches = report.pop("photos", None), report.pop("matches", None)
     with suppress(AttributeError, KeyError, TypeError, ValueError):
@@ -166,42 +171,46 @@ def _report(found: Mapping[str, Any]) -> dict[str, Any]:
     return report
 
 
-def _note(shown: int, count: int, word: str) -> str:
-    photos = f"{word} photos".removeprefix("photo ")
+def _pictures_note(shown: int, count: int, word: str) -> str:
+    """Which photos are shown, as "6 of 8 test photos." or "The test photos."."""
+    photos = "photos" if word == "photo" else f"{word} photos"
     return f"{shown} of {count} {photos}." if shown < count else f"The {photos}."
 
 
-def _seen(metrics: Mapping[str, Any], run: str) -> list[str]:
-    """How good held-out views are where training views show the scene, in words."""
+def _coverage_note(metrics: Mapping[str, Any], run: str) -> list[str]:
+    """The PSNR of held-out views where training views cover the scene and elsewhere, as a sentence; [] if unknown."""
     seen = metrics.get("seen") or {}
     if seen.get("psnr") is None or seen.get("psnr_rest") is None:
         return []
-    share, level = f"{100 * seen['share']:.0f} %", f"{seen['psnr']:.2f} dB there, {seen['psnr_rest']:.2f} dB elsewhere"
-    sentence = f"two training views or more show {share} of what the held-out photos do: PSNR {level}."
-    sentence = f"{run}: {sentence}" if run else sentence
-    return [sentence[0].upper() + sentence[1:]]
+    sentence = (
+        f"{100 * seen['share']:.0f} % of the area of the held-out photos is covered by two or more training views: "
+        f"PSNR {seen['psnr']:.2f} dB there, {seen['psnr_rest']:.2f} dB elsewhere."
+    )
+    return [f"{run}: {sentence}" if run else sentence]
 
 
-def _moved(metrics: Mapping[str, Any]) -> list[str]:
-    """How far a fit moved its training cameras, in words."""
-    if (found := metrics.get("poses")) is None:
+def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
+    """How far a fit moved its training cameras, as a sentence; [] if it did not."""
+    poses = metrics.get("poses")
+    if poses is None:
         return []
-    turned, shifted = f"{found['degrees']:.2f} degrees", f"{100 * found['depths']:.2f} % of the median depth"
-    most = f"at most {found['most_degrees']:.2f} degrees and {100 * found['most_depths']:.2f} %"
-    return [f"The fit moved the training cameras by {turned} and {shifted} in the mean, {most}."]
+    mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
+    most = f"{poses['most_degrees']:.2f} degrees and {100 * poses['most_depths']:.2f} %"
+    return [f"The fit moved the training cameras by {mean} in the mean, and by at most {most}."]
 
 
-def _levels(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The PSNR of each view that was measured and has one."""
+def _psnr_of_views(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The PSNR of each view that has one, by the name of the view."""
     parts = [metrics.get(part) or {} for part in ("test", "train", "views")]
     return {row["name"]: row["psnr"] for part in parts for row in part.get("views", []) if row["psnr"] is not None}
 
 
 def _all_cameras(*parts: Views) -> PinholeCamera:
+    """The cameras of several sets of views in one batch."""
     names = ("intrinsics", "extrinsics", "height", "width")
     return PinholeCamera(*(torch.cat([getattr(views.cameras, name) for views in parts]) for name in names))
 
 
 def spread(count: int, most: int) -> list[int]:
-    """At most so many of the positions, spread evenly, the first and the last among them."""
+    """Indices of at most `most` of `count` items, spread evenly, with the first and the last one."""
     return select_evenly(count, min(count, most)) if count else []

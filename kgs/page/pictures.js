@@ -1,10 +1,13 @@
 "use strict";
-// The slider below a photo lays the render over it, from the right.
+// The slider below a photo uncovers the render over it, from the right.
 
 for (const range of document.querySelectorAll(".wipe input")) {
   const over = range.closest("figure").querySelector(".over");
-  over.src = [...range.closest(".view").querySelectorAll("img.render")].pop().src;  // of the last fit
-  const wipe = () => { over.style.clipPath = `inset(0 0 0 ${range.value}%)`; };
-  range.addEventListener("input", wipe);
-  wipe();
+  const renders = range.closest(".view").querySelectorAll("img.render");
+  over.src = renders[renders.length - 1].src;  // that of the last run
+  const uncover = () => {
+    over.style.clipPath = `inset(0 0 0 ${range.value}%)`;
+  };
+  range.addEventListener("input", uncover);
+  uncover();
 }

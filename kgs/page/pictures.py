@@ -1,4 +1,4 @@
-"""Photos, renders and their differences as JPEG in data URIs: they carry pixels and nothing else."""
+"""Photos, renders and their differences as JPEG data URIs, re-encoded from their pixels and so without metadata."""
 
 import base64
 from collections.abc import Sequence
@@ -11,20 +11,20 @@ from torch import Tensor
 
 from kgs.io.images import eight_bits
 
-GAIN = 4  # by which differences are shown stronger
-_SIDES = (1008, 756, 504, 378, 252)  # pixels of the longer side, the first that fits
-_QUALITY = 90  # of JPEG
+GAIN = 4  # factor by which differences are amplified
+_LONGER_SIDES = (1008, 756, 504, 378, 252)  # pixels; the first one with which all images fit is used
+_JPEG_QUALITY = 90
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A photo and what was rendered in its place.
+    """A photo and its renders.
 
     Args:
-        name: of the photo's file.
+        name: file name of the photo.
         photo: RGB in [0, 1], `(3, H, W)`.
-        renders: of the same shape, by the name of the run; "" where there is one run.
-        caption: what to say of it; "" for its name.
+        renders: RGB, `(3, H, W)`, by the name of the run; "" if there is only one run.
+        caption: text above the images; "": the name.
     """
 
     name: str
@@ -34,14 +34,20 @@ class Picture:
 
 
 def encoded(pictures: Sequence[Picture], most_bytes: int) -> list[dict[str, Any]]:
-    """Name, caption, photo and renders (run, render, difference) of each, in the largest size in which all fit.
+    """Encode all pictures in the largest size in which their data URIs fit into `most_bytes`, or in the smallest one.
 
-    The smallest of these sizes is taken where none does.
+    Args:
+        pictures: photos with their renders.
+        most_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
+
+    Returns:
+        For each picture its name, its caption, the data URI of its photo, and its renders as tuples of the run, the
+        data URI of the render, and that of the difference.
     """
-    for side in _SIDES:
+    rows = list[dict[str, Any]]()
+    for side in _LONGER_SIDES:
         rows = [_encoded(picture, side) for picture in pictures]
-        uris = [uri for row in rows for uri in (row["photo"], *(u for _, *pair in row["renders"] for u in pair))]
-        if sum(map(len, uris)) <= most_bytes:
+        if sum(map(_size, rows)) <= most_bytes:
             break
     return rows
 
@@ -51,19 +57,31 @@ def _encoded(picture: Picture, side: int) -> dict[str, Any]:
     renders = []
     for run, render in picture.renders.items():
         render = render.detach().cpu().float().clamp(0, 1)
-        renders.append((run, _uri(render, side), _uri(GAIN * (render - photo).abs(), side)))
-    name = picture.name
-    return {"name": name, "caption": picture.caption or name, "photo": _uri(photo, side), "renders": renders}
+        difference = GAIN * (render - photo).abs()
+        renders.append((run, _data_uri(render, side), _data_uri(difference, side)))
+    return {
+        "name": picture.name,
+        "caption": picture.caption or picture.name,
+        "photo": _data_uri(photo, side),
+        "renders": renders,
+    }
 
 
-def _uri(image: Tensor, side: int) -> str:
+def _size(row: dict[str, Any]) -> int:
+    """Bytes of all data URIs of a picture."""
+    renders = sum(len(render) + len(difference) for _, render, difference in row["renders"])
+    return len(row["photo"]) + renders
+
+
+def _data_uri(image: Tensor, side: int) -> str:
+    """An image `(3, H, W)` as JPEG, reduced to at most `side` pixels."""
     array = eight_bits(image)
     height, width = array.shape[:2]
     shrink = side / max(height, width)
     if shrink < 1:
         size = max(1, round(width * shrink)), max(1, round(height * shrink))
         array = np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_AREA), np.uint8)
-    done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not done:
-        raise ValueError(f"image: expected one that can be encoded, got {width}x{height} pixels")
+        raise ValueError(f"image: expected one that can be encoded as JPEG, got {width}x{height} pixels")
     return "data:image/jpeg;base64," + base64.b64encode(content.tobytes()).decode()

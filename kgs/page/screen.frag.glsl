@@ -1,5 +1,5 @@
 #version 300 es
-// The finished picture, which was blended in more than 8 bits, onto the canvas.
+// Copies the finished image, which was blended with more than 8 bits per channel, to the canvas.
 precision highp float;
 
 uniform sampler2D picture;

@@ -1,5 +1,5 @@
 #version 300 es
-// A quadrilateral over the whole canvas.
+// One corner of a quadrilateral that covers the whole canvas.
 in vec2 corner;
 
 void main() {

@@ -1,5 +1,5 @@
 #version 300 es
-// The alpha of a Gaussian at a pixel, and its colour times it.
+// The alpha of a Gaussian at a pixel, and its colour multiplied by alpha.
 precision highp float;
 
 in vec2 offset;

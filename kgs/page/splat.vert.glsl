@@ -1,36 +1,39 @@
 #version 300 es
-// One corner of the quadrilateral that covers a Gaussian's footprint; the rules are those of kgs/projection.py.
+// One corner of the quadrilateral that covers a Gaussian's footprint, as kgs/projection.py computes it.
 precision highp float;
 precision highp int;
 precision highp sampler2D;
 
-uniform sampler2D geometry;   // three texels a Gaussian: centre and opacity, covariance xx xy xz yy, yz zz
-uniform sampler2D harmonics;  // one texel (red, green, blue) for each coefficient
+uniform sampler2D geometry;   // three texels per Gaussian: centre and opacity; covariance xx, xy, xz, yy; yz, zz
+uniform sampler2D harmonics;  // one texel (red, green, blue) per coefficient
 uniform int texelsPerRow;
-uniform int coefficients;     // 1, 4, 9 or 16
+uniform int coefficients;     // per Gaussian: 1, 4, 9 or 16
 uniform mat3 rotation;        // world to camera
 uniform vec3 position;        // of the camera
-uniform vec2 focal, centre, size;  // pixels of the canvas, the first pixel's centre at 0
-uniform float nearPlane, lowPass;
+uniform vec2 focal, centre;   // in pixels of the canvas; the centre of the first pixel is 0
+uniform vec2 size;            // of the canvas, in pixels
+uniform vec2 leastTangent, largestTangent;  // limits of x/z and y/z at which footprints are linearised
+uniform float nearPlane;      // in world units
+uniform float lowPass;        // variance added to footprints, in square pixels
 in vec2 corner;               // -1 or 1
-in uint gaussian;
+in uint gaussian;             // index
 out vec2 offset;              // from the centre, in standard deviations
-flat out vec4 colour;         // with the opacity
+flat out vec4 colour;         // and opacity
 
 const float ALPHA_THRESHOLD = 1.0 / 255.0;
-const float MARGIN = 0.15;    // of the image beyond its borders, where the footprint's slope stops growing
 
-vec4 texel(sampler2D source, int place) {
-  return texelFetch(source, ivec2(place % texelsPerRow, place / texelsPerRow), 0);
+vec4 texel(sampler2D source, int index) {
+  return texelFetch(source, ivec2(index % texelsPerRow, index / texelsPerRow), 0);
 }
 
 vec3 coefficient(int k) {
   return texel(harmonics, int(gaussian) * coefficients + k).rgb;
 }
 
-// Real spherical harmonics up to degree 3, as in kgs/harmonics.py.
-vec3 seenFrom(vec3 direction) {
-  float x = direction.x, y = direction.y, z = direction.z, xx = x * x, yy = y * y, zz = z * z;
+// The colour seen in a direction: real spherical harmonics up to degree 3, as in kgs/harmonics.py.
+vec3 colourTowards(vec3 direction) {
+  float x = direction.x, y = direction.y, z = direction.z;
+  float xx = x * x, yy = y * y, zz = z * z;
   vec3 sum = 0.28209479 * coefficient(0) + 0.5;
   if (coefficients > 1) {
     sum += 0.48860251 * (z * coefficient(2) - y * coefficient(1) - x * coefficient(3));
@@ -49,28 +52,36 @@ vec3 seenFrom(vec3 direction) {
 }
 
 void main() {
-  vec4 first = texel(geometry, 3 * int(gaussian)), second = texel(geometry, 3 * int(gaussian) + 1);
+  vec4 first = texel(geometry, 3 * int(gaussian));
+  vec4 second = texel(geometry, 3 * int(gaussian) + 1);
   vec4 third = texel(geometry, 3 * int(gaussian) + 2);
-  float opacity = first.a, reach = sqrt(2.0 * log(max(opacity / ALPHA_THRESHOLD, 1.0)));
-  vec3 point = rotation * (first.xyz - position);
-  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // nothing is drawn
-  if (point.z <= nearPlane || reach == 0.0) return;
-
-  // The first-order footprint, its slope taken at a point that is not far outside the image.
-  vec2 low = -(centre + 0.5 + MARGIN * size) / focal, high = (size - 0.5 - centre + MARGIN * size) / focal;
-  vec2 tangent = clamp(point.xy / point.z, low, high);
-  mat3 slope = mat3(focal.x, 0, 0, 0, focal.y, 0, -focal * tangent, 0) * (1.0 / point.z);
+  vec3 mean = first.xyz;
+  float opacity = first.a;
   mat3 covariance = mat3(second.x, second.y, second.z, second.y, second.w, third.x, second.z, third.x, third.y);
-  mat3 turned = slope * rotation, footprint = turned * covariance * transpose(turned);
-  float xx = footprint[0][0] + lowPass, xy = footprint[0][1], yy = footprint[1][1] + lowPass;
 
-  // Its axes.
-  float mean = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
-  vec2 axis = abs(xy) > 1e-9 * mean ? normalize(vec2(xy, mean + spread - xx)) : vec2(xx >= yy, xx < yy);
-  vec2 deviations = sqrt(max(vec2(mean + spread, mean - spread), 1e-6));
-  offset = reach * corner;
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside of the clip volume: nothing is drawn
+  vec3 point = rotation * (mean - position);
+  float radius = sqrt(2.0 * log(max(opacity / ALPHA_THRESHOLD, 1.0)));  // where alpha is cut, in standard deviations
+  if (point.z <= nearPlane || radius == 0.0) return;
+
+  // The first-order footprint: the covariance in pixels of the canvas.
+  vec2 tangent = clamp(point.xy / point.z, leastTangent, largestTangent);
+  mat3 jacobian = mat3(focal.x, 0, 0, 0, focal.y, 0, -focal * tangent, 0) * (1.0 / point.z);
+  mat3 toPixels = jacobian * rotation;
+  mat3 footprint = toPixels * covariance * transpose(toPixels);
+  float xx = footprint[0][0] + lowPass;
+  float xy = footprint[0][1];
+  float yy = footprint[1][1] + lowPass;
+
+  // Its principal axes.
+  float average = 0.5 * (xx + yy);
+  float spread = length(vec2(0.5 * (xx - yy), xy));
+  vec2 axis = abs(xy) > 1e-9 * average ? normalize(vec2(xy, average + spread - xx)) : vec2(xx >= yy, xx < yy);
+  vec2 deviations = sqrt(max(vec2(average + spread, average - spread), 1e-6));
+
+  offset = radius * corner;
   vec2 shift = offset.x * deviations.x * axis + offset.y * deviations.y * vec2(-axis.y, axis.x);
   vec2 pixel = focal * point.xy / point.z + centre + shift;
   gl_Position = vec4(vec2(2.0, -2.0) * (pixel + 0.5) / size + vec2(-1.0, 1.0), 0.0, 1.0);
-  colour = vec4(seenFrom(normalize(first.xyz - position)), opacity);
+  colour = vec4(colourTowards(normalize(mean - position)), opacity);
 }

@@ -1,183 +1,247 @@
 "use strict";
-// The viewer: turns, moves and zooms an eye over a splat, and flies it to the photos' cameras.
-// Axes are those of OpenCV: the rows of a rotation are right, down and forward in the world.
+// The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos.
+// OpenCV axes: the rows of a rotation are the directions right, down and forward in the world.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const add = (a, b, times = 1) => a.map((value, i) => value + times * b[i]);
-const unit = (a) => a.map((value) => value / Math.hypot(...a));
-const mix = (a, b, share) => a.map((value, i) => value + share * (b[i] - value));
+const add = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
+const normalised = (a) => a.map((value) => value / Math.hypot(...a));
+const interpolated = (a, b, share) => a.map((value, i) => value + share * (b[i] - value));
+const clamped = (value, least, most) => Math.min(most, Math.max(least, value));
 
-const CLICK = 4;  // pixels of the page that a pointer may move without dragging
+const CLICK_PIXELS = 4;  // a pointer that moves farther than this drags
+const FLIGHT_MILLISECONDS = 700;
+const STEEPEST = 1.5;  // largest angle above or below the horizon, in radians
+const TURN_PER_PIXEL = 0.005;  // radians
+const TURN_PER_KEY = 0.06;
+const MOVE_PER_KEY = 20;  // pixels
+const ZOOM_PER_KEY = 0.9;
+const ZOOM_PER_WHEEL_PIXEL = 0.0015;  // natural logarithm of the distance
+const MOST_ZOOM_PER_WHEEL_EVENT = 0.3;
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const ZOOM_KEYS = { "+": ZOOM_PER_KEY, "=": ZOOM_PER_KEY, "-": 1 / ZOOM_PER_KEY };
 
-// A vector turned about a unit axis, by radians.
-function turned(vector, axis, angle) {
-  const c = Math.cos(angle), s = Math.sin(angle), along = dot(axis, vector) * (1 - c), side = cross(axis, vector);
-  return vector.map((value, i) => c * value + s * side[i] + along * axis[i]);
+// A vector rotated about an axis of length 1, by an angle in radians (Rodrigues' formula).
+function rotated(vector, axis, angle) {
+  const cosine = Math.cos(angle), sine = Math.sin(angle);
+  const along = (1 - cosine) * dot(axis, vector);
+  const side = cross(axis, vector);
+  return vector.map((value, i) => cosine * value + sine * side[i] + along * axis[i]);
 }
 
 class Viewer {
-  // `scene` has cameras (name, part, size, focal, centre, rotation, position, distance), up, and pyramid: their size.
+  // `scene` is what `viewer_scene` of kgs/page/cameras.py returns.
   constructor(frame, renderer, scene) {
     this.canvas = frame.querySelector("canvas");
     this.overlay = frame.querySelector("svg");
-    this.choice = frame.querySelector("select");  // of a camera, for the keyboard too
-    Object.assign(this, { renderer, scene, waiting: false, flight: 0, dragged: 0 });
-    this.pyramids = scene.cameras.map((camera, index) => this.pyramid(camera, index));
-    this.place(0);
+    this.choice = frame.querySelector("select");  // of a camera; it can be used with the keyboard
+    this.renderer = renderer;
+    this.scene = scene;
+    this.redrawRequested = false;
+    this.flight = 0;  // number of the latest movement: an earlier flight stops
+    this.dragged = 0;  // pixels since the pointer was pressed
+    this.pyramids = scene.cameras.map((camera, index) => this.addPyramid(camera, index));
+    this.place(scene.first);
     this.listen(frame);
-    new ResizeObserver(() => this.ask()).observe(this.canvas);
+    new ResizeObserver(() => this.requestDraw()).observe(this.canvas);
     this.draw();
   }
 
-  // -- the eye: rotation, position, distance of the point that it turns about, and the lens of a camera
+  // -- The eye: rotation, position, distance to the point that it turns around, and the intrinsics of a photo's camera.
 
+  // Puts the eye at a camera at once.
   place(index) {
     const { rotation, position, distance, size, focal, centre } = this.scene.cameras[index];
     this.eye = { rotation, position, distance, size, focal, centre };
+    this.choice.value = index;
   }
 
+  // Moves the eye to a camera smoothly.
   flyTo(index) {
-    const from = this.eye, begin = performance.now(), flight = ++this.flight;
+    const from = this.eye;
     this.place(index);
-    this.choice.value = index;
-    const to = this.eye, still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    const to = this.eye;
+    const begin = performance.now();
+    const flight = ++this.flight;
+    const jump = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const step = (now) => {
-      if (flight !== this.flight) return;  // something else has moved the eye
-      const share = still ? 1 : Math.min(1, Math.max(0, now - begin) / 700), eased = share * share * (3 - 2 * share);
-      const forward = unit(mix(from.rotation[2], to.rotation[2], eased));
-      const right = mix(from.rotation[0], to.rotation[0], eased);
-      const down = unit(cross(forward, right));
-      this.eye = share === 1 ? to : {
-        ...to,
-        rotation: [cross(down, forward), down, forward],
-        position: mix(from.position, to.position, eased),
-        focal: mix(from.focal, to.focal, eased),
-        centre: mix(from.centre, to.centre, eased),
-      };
+      if (flight !== this.flight) return;
+      const time = jump ? 1 : clamped((now - begin) / FLIGHT_MILLISECONDS, 0, 1);
+      this.eye = this.between(from, to, time * time * (3 - 2 * time));
       this.draw();
-      if (share < 1) requestAnimationFrame(step);
+      if (time < 1) requestAnimationFrame(step);
     };
     requestAnimationFrame(step);
+  }
+
+  // The eye on the way between two others; `share` is 0 at the first and 1 at the second.
+  between(from, to, share) {
+    if (share === 1) return to;
+    const forward = normalised(interpolated(from.rotation[2], to.rotation[2], share));
+    const right = interpolated(from.rotation[0], to.rotation[0], share);
+    const down = normalised(cross(forward, right));
+    return {
+      ...to,
+      rotation: [cross(down, forward), down, forward],
+      position: interpolated(from.position, to.position, share),
+      focal: interpolated(from.focal, to.focal, share),
+      centre: interpolated(from.centre, to.centre, share),
+    };
   }
 
   change(values) {
     this.flight++;
     this.eye = { ...this.eye, ...values };
-    this.ask();
+    this.requestDraw();
   }
 
+  // The point that the eye turns around.
   target() {
     return add(this.eye.position, this.eye.rotation[2], this.eye.distance);
   }
 
-  // About the upright axis through the target, then about the eye's own horizontal one; never over the top.
-  turn(across, along) {
-    const { rotation, distance } = this.eye, { up } = this.scene, target = this.target();
-    const steep = Math.asin(Math.max(-1, Math.min(1, dot(up, rotation[2])))), most = 1.5;
-    const pitch = Math.max(-most, Math.min(most, steep - along)) - steep;
-    const rows = rotation.map((row) => turned(turned(row, rotation[0], pitch), up, -across));
-    this.change({ rotation: rows, position: add(target, rows[2], -distance) });
+  // Turns the eye around its target by angles in radians: `yaw` about the upright axis, `pitch` about the horizontal.
+  turn(yaw, pitch) {
+    const { rotation, distance } = this.eye;
+    const { up } = this.scene;
+    const elevation = Math.asin(clamped(dot(up, rotation[2]), -1, 1));
+    const change = clamped(elevation - pitch, -STEEPEST, STEEPEST) - elevation;
+    const rows = rotation.map((row) => rotated(rotated(row, rotation[0], change), up, -yaw));
+    this.change({ rotation: rows, position: add(this.target(), rows[2], -distance) });
   }
 
+  // Multiplies the distance to the target.
   zoom(factor) {
     const distance = this.eye.distance * factor;
     this.change({ distance, position: add(this.target(), this.eye.rotation[2], -distance) });
   }
 
-  // By pixels of the page: what the eye turns about follows the pointer.
+  // Moves the eye sideways so that its target follows the pointer, by pixels of the page.
   move(x, y) {
-    const { rotation, position, distance, focal } = this.eye, units = distance / (focal[0] * this.scale());
-    this.change({ position: add(add(position, rotation[0], -x * units), rotation[1], -y * units) });
+    const { rotation, position, distance, focal } = this.eye;
+    const unitsPerPixel = distance / (focal[0] * this.scale());
+    const sideways = add(position, rotation[0], -x * unitsPerPixel);
+    this.change({ position: add(sideways, rotation[1], -y * unitsPerPixel) });
   }
 
-  // -- drawing
+  // -- Drawing.
 
-  // Pixels of the page for one of the photo; the whole photo is in the picture.
+  // Pixels of the page per pixel of the photo, such that the whole photo is inside the canvas.
   scale() {
     const [width, height] = this.eye.size;
     return Math.min(this.canvas.clientWidth / width, this.canvas.clientHeight / height);
   }
 
-  ask() {
-    if (this.waiting) return;
-    this.waiting = true;
-    requestAnimationFrame(() => { this.waiting = false; this.draw(); });
-  }
-
-  draw() {
-    const { canvas, eye } = this, ratio = Math.min(2, window.devicePixelRatio || 1);
-    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
-    this.renderer.resize(...sides);
-    const scale = ratio * this.scale();
-    const borders = sides.map((side, axis) => (side - scale * eye.size[axis]) / 2);
-    this.shown = {
-      ...eye, scale, sides, ratio,
-      focal: eye.focal.map((value) => scale * value),
-      centre: eye.centre.map((value, axis) => borders[axis] + scale * (value + 0.5) - 0.5),
-    };
-    this.renderer.draw(this.shown);
-    this.drawPyramids();
-  }
-
-  // -- the cameras
-
-  pyramid(camera, index) {
-    const shape = document.createElementNS("http://www.w3.org/2000/svg", "path");
-    shape.innerHTML = "<title></title>";  // what a pointer that rests on it shows
-    shape.firstChild.textContent = `${camera.part} ${camera.name}`;
-    shape.setAttribute("class", camera.part === "test" ? "held-out" : "");
-    shape.addEventListener("click", () => { if (this.dragged <= CLICK) this.flyTo(index); });
-    this.overlay.append(shape);
-    return shape;
-  }
-
-  drawPyramids() {
-    const { rotation, position, focal, centre, ratio, sides } = this.shown;
-    this.overlay.setAttribute("viewBox", `0 0 ${sides[0] / ratio} ${sides[1] / ratio}`);
-    this.scene.cameras.forEach((camera, index) => {
-      const deep = this.scene.pyramid, [width, height] = camera.size;
-      const corners = [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]];
-      const points = [[0, 0, 0], ...corners.map(([x, y]) => [
-        deep * (x - camera.centre[0]) / camera.focal[0], deep * (y - camera.centre[1]) / camera.focal[1], deep,
-      ])].map(([x, y, z]) => {
-        let world = camera.position;
-        [x, y, z].forEach((value, axis) => { world = add(world, camera.rotation[axis], value); });
-        return rotation.map((row) => dot(row, add(world, position, -1)));
-      });
-      // One that the eye is in, or that is partly behind it, is not drawn.
-      const seen = points.every((point) => point[2] > 0.2 * deep);
-      const [tip, ...base] = points.map(([x, y, z]) => [x, y].map(
-        (value, axis) => ((focal[axis] * value / z + centre[axis] + 0.5) / ratio).toFixed(1)).join(" "));
-      this.pyramids[index].setAttribute("d", seen
-        ? `M${base.join("L")}Z` + base.map((corner) => `M${tip}L${corner}`).join("") : "");
+  // Draws with the next frame of the browser, once.
+  requestDraw() {
+    if (this.redrawRequested) return;
+    this.redrawRequested = true;
+    requestAnimationFrame(() => {
+      this.redrawRequested = false;
+      this.draw();
     });
   }
 
-  // -- what the user does
+  draw() {
+    const { canvas, eye } = this;
+    const ratio = Math.min(2, window.devicePixelRatio || 1);  // pixels of the canvas per pixel of the page
+    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    const scale = ratio * this.scale();
+    const borders = sides.map((side, axis) => (side - scale * eye.size[axis]) / 2);
+    this.view = {
+      scale,
+      ratio,
+      sides,
+      focal: eye.focal.map((value) => scale * value),
+      centre: eye.centre.map((value, axis) => borders[axis] + scale * (value + 0.5) - 0.5),  // integer pixel centres
+    };
+    this.renderer.resize(...sides);
+    this.renderer.draw(eye, this.view);
+    this.drawPyramids();
+  }
+
+  // -- The pyramids that mark the cameras.
+
+  addPyramid(camera, index) {
+    const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+    path.innerHTML = "<title></title>";  // shown while a pointer rests on it
+    path.firstChild.textContent = `${camera.part} ${camera.name}`;
+    path.setAttribute("class", camera.part === "test" ? "held-out" : "");
+    path.addEventListener("click", () => {
+      if (this.dragged <= CLICK_PIXELS) this.flyTo(index);
+    });
+    this.overlay.append(path);
+    return path;
+  }
+
+  drawPyramids() {
+    const { ratio, sides } = this.view;
+    this.overlay.setAttribute("viewBox", `0 0 ${sides[0] / ratio} ${sides[1] / ratio}`);
+    this.scene.cameras.forEach((camera, index) => {
+      this.pyramids[index].setAttribute("d", this.outline(camera));
+    });
+  }
+
+  // The pyramid of a camera as an SVG path; empty if the eye is inside it or part of it is behind the eye.
+  outline(camera) {
+    const depth = this.scene.pyramid;
+    const [width, height] = camera.size;
+    const corners = [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]];
+    const base = corners.map((corner) => {
+      const [x, y] = corner.map((value, axis) => depth * (value - camera.centre[axis]) / camera.focal[axis]);
+      const [right, down, forward] = camera.rotation;
+      return add(add(add(camera.position, right, x), down, y), forward, depth);
+    });
+    const points = [camera.position, ...base].map((point) => this.seen(point));
+    if (points.some((point) => point[2] <= 0.2 * depth)) return "";
+    const [tip, ...rectangle] = points.map((point) => this.pagePixel(point));
+    return `M${rectangle.join("L")}Z` + rectangle.map((corner) => `M${tip}L${corner}`).join("");
+  }
+
+  // A point of the world in the axes of the eye.
+  seen(point) {
+    const relative = add(point, this.eye.position, -1);
+    return this.eye.rotation.map((row) => dot(row, relative));
+  }
+
+  // A point in the axes of the eye as "x y" in pixels of the page.
+  pagePixel([x, y, z]) {
+    const { focal, centre, ratio } = this.view;
+    const pixel = [x, y].map((value, axis) => (focal[axis] * value / z + centre[axis] + 0.5) / ratio);
+    return pixel.map((value) => value.toFixed(1)).join(" ");
+  }
+
+  // -- Input.
 
   listen(frame) {
-    // Pyramids lie over the canvas; what is done to either reaches the stage.
-    const { canvas } = this, stage = frame.querySelector(".stage"), pointers = new Map();
-    const spread = () => {
+    this.listenToPointers(frame.querySelector(".stage"));  // which holds the canvas and, over it, the pyramids
+    this.listenToKeys();
+    this.listenToTools(frame);
+  }
+
+  listenToPointers(stage) {
+    const pointers = new Map();  // positions of those that are pressed
+    const gesture = () => {
       const [a, b = a] = [...pointers.values()];
-      return { middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) };
+      return { middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], spread: Math.hypot(a[0] - b[0], a[1] - b[1]) };
     };
     stage.addEventListener("pointerdown", (event) => {
       if (!pointers.size) this.dragged = 0;
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
     });
     stage.addEventListener("pointermove", (event) => {
-      if (!event.buttons) pointers.delete(event.pointerId);  // let go of outside
+      if (!event.buttons) pointers.delete(event.pointerId);  // released outside of the window
       if (!pointers.has(event.pointerId)) return;
-      const before = spread();
+      const before = gesture();
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
-      const after = spread(), [x, y] = add(after.middle, before.middle, -1);
+      const after = gesture();
+      const [x, y] = add(after.middle, before.middle, -1);
       this.dragged += Math.hypot(x, y);
-      if (this.dragged > CLICK) stage.setPointerCapture(event.pointerId);  // before that a click belongs to a pyramid
+      // Captured earlier, a pyramid would not get its click.
+      if (this.dragged > CLICK_PIXELS) stage.setPointerCapture(event.pointerId);
       if (pointers.size > 1 || event.shiftKey || event.buttons > 1) this.move(x, y);
-      else this.turn(0.005 * x, 0.005 * y);
-      if (pointers.size > 1 && after.apart > 0) this.zoom(before.apart / after.apart);
+      else this.turn(TURN_PER_PIXEL * x, TURN_PER_PIXEL * y);
+      if (pointers.size > 1 && after.spread > 0) this.zoom(before.spread / after.spread);
     });
     for (const end of ["pointerup", "pointercancel"]) {
       stage.addEventListener(end, (event) => pointers.delete(event.pointerId));
@@ -185,22 +249,28 @@ class Viewer {
     stage.addEventListener("contextmenu", (event) => event.preventDefault());
     stage.addEventListener("wheel", (event) => {
       event.preventDefault();
-      this.zoom(Math.exp(Math.max(-0.3, Math.min(0.3, 0.0015 * event.deltaY))));
+      const logarithm = ZOOM_PER_WHEEL_PIXEL * event.deltaY;
+      this.zoom(Math.exp(clamped(logarithm, -MOST_ZOOM_PER_WHEEL_EVENT, MOST_ZOOM_PER_WHEEL_EVENT)));
     }, { passive: false });
-    canvas.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;  // the browser's own
-      const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-      const nearer = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 }[event.key];
-      if (arrow && event.shiftKey) this.move(-20 * arrow[0], -20 * arrow[1]);
-      else if (arrow) this.turn(0.06 * arrow[0], 0.06 * arrow[1]);
-      else if (nearer) this.zoom(nearer);
-      else if (event.key === "0" || event.key === "Home") this.flyTo(0);
+  }
+
+  listenToKeys() {
+    this.canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;  // shortcuts of the browser
+      const arrow = ARROWS[event.key];
+      if (arrow && event.shiftKey) this.move(-MOVE_PER_KEY * arrow[0], -MOVE_PER_KEY * arrow[1]);
+      else if (arrow) this.turn(TURN_PER_KEY * arrow[0], TURN_PER_KEY * arrow[1]);
+      else if (event.key in ZOOM_KEYS) this.zoom(ZOOM_KEYS[event.key]);
+      else if (event.key === "0" || event.key === "Home") this.flyTo(this.scene.first);
       else return;
       event.preventDefault();
     });
-    const pyramids = frame.querySelector(".pyramids");
+  }
+
+  listenToTools(frame) {
     this.choice.addEventListener("change", () => this.flyTo(Number(this.choice.value)));
-    frame.querySelector(".start").addEventListener("click", () => this.flyTo(0));
+    frame.querySelector(".start").addEventListener("click", () => this.flyTo(this.scene.first));
+    const pyramids = frame.querySelector(".pyramids");
     pyramids.addEventListener("click", () => {
       const hidden = this.overlay.toggleAttribute("hidden");
       pyramids.setAttribute("aria-pressed", String(!hidden));
@@ -215,38 +285,41 @@ class Viewer {
 }
 
 async function openViewer() {
-  const frame = document.querySelector(".viewer"), canvas = frame.querySelector("canvas");
+  const frame = document.querySelector(".viewer");
+  const canvas = frame.querySelector("canvas");
   const text = (id) => document.getElementById(id).textContent;
   const { layout, content, scene, settings } = JSON.parse(text("splat"));
   const shaders = {
-    splatVertex: text("splat-vertex"), splatFragment: text("splat-fragment"),
-    screenVertex: text("screen-vertex"), screenFragment: text("screen-fragment"),
+    splatVertex: text("splat-vertex"),
+    splatFragment: text("splat-fragment"),
+    screenVertex: text("screen-vertex"),
+    screenFragment: text("screen-fragment"),
   };
-  const say = (state, words = "") => {
+  const show = (state, message = "") => {
     frame.dataset.state = state;
-    frame.querySelector(".failure").textContent = words;
+    frame.querySelector(".failure").textContent = message;
   };
   const attempt = async (work) => {
     try {
       await work();
-      say("ready");
+      show("ready");
     } catch (error) {
-      say("failed", `The viewer cannot run here: ${error.message}.`);
+      show("failed", `The viewer cannot run here: ${error.message}.`);
     }
   };
   let splat;
-  const renderer = () => new SplatRenderer(canvas, splat, shaders, settings);
+  const newRenderer = () => new SplatRenderer(canvas, splat, shaders, settings);
   await attempt(async () => {
     splat = await decodeSplat(layout, content);
-    window.viewer = new Viewer(frame, renderer(), scene);
+    window.viewer = new Viewer(frame, newRenderer(), scene);
   });
-  // Browsers take the graphics from pages that nobody looks at, and give them back.
+  // Browsers release the graphics context of pages in the background, and restore it later.
   canvas.addEventListener("webglcontextlost", (event) => {
-    event.preventDefault();  // else they stay away
-    say("lost", "The browser has taken back its graphics for now.");
+    event.preventDefault();  // otherwise it is not restored
+    show("lost", "The browser has released the graphics of this page for now.");
   });
   canvas.addEventListener("webglcontextrestored", () => attempt(() => {
-    viewer.renderer = renderer();
+    viewer.renderer = newRenderer();
     viewer.draw();
   }));
 }

@@ -1,4 +1,4 @@
-"""The page itself: everything that it needs in one file, which asks for nothing else."""
+"""Writes the page: one HTML file that contains everything it needs and loads nothing from the network."""
 
 import base64
 import json
@@ -11,19 +11,29 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs import __version__
+from kgs.camera import MARGIN
 from kgs.io.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 
 from .cameras import viewer_scene
 from .data import pack
-from .figures import facts, levels, measures, plot, shareable
+from .figures import facts, headline, measure_table, psnr_plot, without_folders
 from .pictures import GAIN, Picture, encoded
 
-MOST_BYTES = 8_000_000
-_PICTURES = 3_000_000  # bytes of all pictures
-_FILES = ["style.css", "viewer.css", "renderer.js", "viewer.js", "pictures.js"]
-_FILES += ["splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl"]
-_LAYOUT = 8192  # bytes of what describes the splat's columns, and of sizes
+MOST_BYTES = 8_000_000  # of a page
+_PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
+_LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
+_FILES = [
+    "style.css",
+    "viewer.css",
+    "renderer.js",
+    "viewer.js",
+    "pictures.js",
+    "splat.vert.glsl",
+    "splat.frag.glsl",
+    "screen.vert.glsl",
+    "screen.frag.glsl",
+]
 
 
 def write_page(
@@ -46,35 +56,36 @@ def write_page(
     weights: Callable[[], Tensor] | None = None,
     most_bytes: int = MOST_BYTES,
 ) -> str:
-    """Write a page with a viewer of a splat, photos beside renders, measures and facts.
+    """Write a page with a viewer of a splat, photos beside renders, measures and facts. The write is atomic.
 
-    It opens at the first camera. Names of files are shown as they are given; of absolute paths in all other texts only
-    the last name is. The splat gets the bytes that the rest leaves, see :func:`kgs.page.data.pack`.
+    The viewer opens at the training camera nearest the mean pose. File names are shown as they are given; in all other
+    texts absolute paths are shortened to their last part. The splat is packed into the bytes that the rest of the page
+    leaves, see :func:`kgs.page.data.pack`.
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
 
     Args:
-        path: the file to write; it appears whole or not at all.
+        path: the file to write.
         title: of the page.
         gaussians: with harmonics, or RGB.
-        cameras: C >= 1 cameras of one size, those of the photos.
-        names: of the C photos.
-        parts: what each was used for: "training", "test", or another word.
+        cameras: the cameras of the photos, C >= 1 of one image size.
+        names: file names of the C photos.
+        parts: what each photo was used for: "training", "test", or another word.
         near_plane: of the renderer, in world units.
-        background: behind the splat, `(3,)` in [0, 1].
+        background: colour behind the splat, `(3,)` in [0, 1].
         pictures: photos with renders, `kgs.page.Picture`.
-        pictures_note: which photos these are.
-        runs: what metrics.json holds, by the name of the run: "" where there is one.
+        pictures_note: a sentence that says which photos these are.
+        runs: the content of metrics.json by the name of the run; "" if there is only one run.
         left_out: what the fit left out, and why.
-        notes: sentences for the reader, below the measures.
-        settings: numbers of the fit.
-        report: what is known about how the cameras were found.
-        weights: what each Gaussian contributes, `(N,)`; asked for where some have to go.
-        most_bytes: of the page.
+        notes: sentences to show below the measures.
+        settings: the settings of the fit.
+        report: facts about how the cameras were found.
+        weights: returns the contribution of each Gaussian, `(N,)`. It is called if Gaussians must be left out.
+        most_bytes: limit for the page.
 
     Returns:
-        What the limit of size cost, in words; "" for nothing.
+        What was reduced to respect the limit of size, in words; "" for nothing.
 
     Raises:
         ValueError: the page does not fit.
@@ -83,86 +94,96 @@ def write_page(
     import jinja2
     from markupsafe import Markup
 
-    runs, scene = runs or {}, viewer_scene(cameras, names, parts, gaussians.means)
-    first = next(iter(runs.values()), {})
-    head, rows = measures(runs)
-    shown = encoded(pictures, _PICTURES)
+    runs = runs or {}
+    scene = viewer_scene(cameras, names, parts, gaussians.means)
+    width, height = scene["cameras"][0]["size"]
+    first_run = next(iter(runs.values()), {})
+    measures_head, measures = measure_table(runs)
+    folder = resources.files("kgs.page")
     context: dict[str, Any] = {
-        "title": shareable(title),
-        "summary": _summary(len(gaussians), parts, scene["cameras"][0]["size"]),
+        "title": without_folders(title),
+        "summary": f"{len(gaussians)} Gaussians; {_counts(parts)} photos of {width} × {height} pixels.",
         "version": __version__,
-        "size": scene["cameras"][0]["size"][::-1],
+        "aspect": f"{width} / {height}",
         "scene": scene,
-        "levels": levels(runs),
-        "estimate": found if (found := first.get("estimate")) and found["psnr"] is not None else None,
-        "nothing_held_out": bool(first.get("train")) and not first.get("test"),
-        "notes": [shareable(note) for note in notes],
-        "measures_head": head,
-        "measures": rows,
-        "plot": plot(runs),
-        "pictures": shown,
+        "headline": headline(runs),
+        "nothing_held_out": bool(first_run.get("train")) and not first_run.get("test"),
+        "notes": [without_folders(note) for note in notes],
+        "measures_head": measures_head,
+        "measures": measures,
+        "plot": psnr_plot(runs),
+        "pictures": encoded(pictures, _PICTURE_BYTES),
         "pictures_note": pictures_note,
         "difference_gain": GAIN,
-        "cameras": _cameras(scene["cameras"], parts) | facts(report or {}),
+        "cameras": _camera_facts(scene["cameras"], parts) | facts(report or {}),
         "costs": _costs(runs),
-        "left_out": shareable(left_out),
+        "left_out": without_folders(left_out),
         "settings": facts(settings or {}),
-        "versions": facts(first.get("versions") or {"kgs": __version__}),
+        "versions": facts(first_run.get("versions") or {"kgs": __version__}),
+        "files": {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES},
     }
     environment = jinja2.Environment(loader=jinja2.PackageLoader("kgs.page", "."), autoescape=True, trim_blocks=True)
-    folder = resources.files("kgs.page")
-    context["files"] = {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES}
     template = environment.get_template("page.html.jinja")
-    rules = {"nearPlane": near_plane, "lowPass": RasterOptions.eps2d, "background": background.tolist()}
+    viewer_settings = {
+        "nearPlane": near_plane,
+        "lowPass": RasterOptions.eps2d,
+        "margin": MARGIN,
+        "background": background.tolist(),
+    }
 
     def page(splat: Mapping[str, Any], words: Mapping[str, str]) -> bytes:
-        data = json.dumps({"scene": scene, "settings": rules, **splat}, separators=(",", ":"))
+        data = json.dumps({"scene": scene, "settings": viewer_settings, **splat}, separators=(",", ":"))
         html: str = template.render(**context, **words, data=Markup(data.replace("<", "\\u003c")))
-        return html.encode(errors="backslashreplace")  # names of files that are no UTF-8
+        return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
 
-    room = most_bytes - len(page({}, {})) - _LAYOUT
-    packed = pack(gaussians, cameras, max(0, room) * 3 // 4, weights, near_plane)
+    room = max(0, most_bytes - len(page({}, {})) - _LAYOUT_BYTES)
+    packed = pack(gaussians, cameras, room * 3 // 4, weights, near_plane)  # base64 turns 3 bytes into 4
     content = base64.b64encode(packed.content).decode()
     splat = {"layout": packed.layout, "content": content}
-    words = {"scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}"}
-    words |= {"left_out_here": packed.left_out, "page_size": "0.00 MB"}
-    words["page_size"] = f"This page has {_megabytes(len(page(splat, words)))}"
+    words = {
+        "reduced": packed.left_out,
+        "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
+        "page_size": _megabytes(0),  # as many characters as the true size
+    }
+    words["page_size"] = _megabytes(len(page(splat, words)))
     write_whole(path, page(splat, words))
     return packed.left_out
 
 
-def _summary(count: int, parts: Sequence[str], size: Sequence[int]) -> str:
-    return f"{count} Gaussians; {_counts(parts)} photos of {size[0]} × {size[1]} pixels."
-
-
 def _counts(parts: Sequence[str]) -> str:
+    """As "3 training and 2 test", or the number alone if all photos are of one kind."""
     words = list(dict.fromkeys(parts))
-    return " and ".join(f"{list(parts).count(word)} {word}" for word in words) if len(words) > 1 else str(len(parts))
+    if len(words) == 1:
+        return str(len(parts))
+    return " and ".join(f"{list(parts).count(word)} {word}" for word in words)
 
 
-def _cameras(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> dict[str, str]:
+def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> dict[str, str]:
+    """The number of cameras, the size of their photos and their focal lengths, as text."""
     focal = sorted(camera["focal"][0] for camera in cameras)
     span = f"{focal[0]:.1f}" if focal[-1] - focal[0] < 0.1 else f"{focal[0]:.1f} to {focal[-1]:.1f}"
     width, height = cameras[0]["size"]
+    share = focal[len(focal) // 2] / max(width, height)
     return {
         "cameras": _counts(parts),
-        "picture size": f"{width} × {height} pixels",
-        "focal length": f"{span} pixels, {focal[len(focal) // 2] / max(width, height):.2f} of the longer side",
+        "photo size": f"{width} × {height} pixels",
+        "focal length": f"{span} pixels, {share:.2f} of the longer side",
     }
 
 
 def _costs(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Seconds, memory and backend of each run, as text."""
     found = dict[str, str]()
     for run, metrics in runs.items():
-        mark = f"{run}: " if run else ""
+        prefix = f"{run}: " if run else ""
         if metrics.get("seconds") is not None:
-            found[f"{mark}training"] = f"{metrics['seconds']:.1f} s for {metrics.get('steps', '?')} steps"
+            found[f"{prefix}training"] = f"{metrics['seconds']:.1f} s for {metrics.get('steps', '?')} steps"
         for stage, seconds in (metrics.get("stages") or {}).items():
-            found[mark + str(stage)] = f"{seconds:.1f} s" if isinstance(seconds, int | float) else str(seconds)
+            found[f"{prefix}{stage}"] = f"{seconds:.1f} s" if isinstance(seconds, int | float) else str(seconds)
         if metrics.get("peak_rss_mb"):
-            found[f"{mark}memory at most"] = f"{metrics['peak_rss_mb']} MiB"
+            found[f"{prefix}peak memory"] = f"{metrics['peak_rss_mb']} MiB"
         if metrics.get("backend"):
-            found[f"{mark}backend"] = str(metrics["backend"])
+            found[f"{prefix}backend"] = str(metrics["backend"])
     return found
 
 

@@ -85,7 +85,7 @@ class Reach:
         self.tile_size, self.grid = tile_size, (-(-height // tile_size), -(-self._width // tile_size))
         self.total_rows = projected.num_cameras * self.grid[0]
         xx, xy, yy, det = variances(projected.factors, projected.eps2d)
-        cut = torch.where(det < torch.inf, cut_squared(projected.opacities, alpha_threshold), -torch.inf)
+        cut = torch.where(xx + yy < torch.inf, cut_squared(projected.opacities, alpha_threshold), -torch.inf)
         reach = (cut.clamp_min(0.0) * yy).sqrt()
         x, y = projected.means2d.unbind(1)
         top, bottom = torch.ceil(y - reach).clamp(0, height), torch.floor(y + reach).clamp(-1, height - 1)
@@ -97,7 +97,7 @@ class Reach:
         # a column of numbers per Gaussian, gathered once for each row of tiles that it reaches
         columns = [x, y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()]
         table = torch.stack(columns).index_select(1, ids)
-        self._table = torch.where(table.isfinite(), table, torch.inf)
+        self._table = torch.nan_to_num(table, nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
         self._count(max_spans)
 
     def _count(self, max_spans: int) -> None:

@@ -117,13 +117,15 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.run import choose_points, most_bytes
+    from kgs.fit.forecast import most_bytes
+    from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
 
     torch.set_num_threads(1)
     scene = synthetic_scene(train_views=3, test_views=1, size=SIZE, seed=0)
     config = replace(_config(steps, points, max_bytes=2**22), evaluations=1)
-    trainer = Trainer(scene, config, choose_points(scene, config))
+    points = choose_points(scene, config)
+    trainer = Trainer(scene, config, points)
     before, resident = _resident(), []
 
     def note(trainer: Trainer, _: float) -> bool:
@@ -134,7 +136,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     half = resident[len(resident) // 2 :]
     middle = len(half) // 2
     slope = (sum(half[middle:]) / len(half[middle:]) - sum(half[:middle]) / middle) / middle
-    return slope / 1024, max(resident) - before, most_bytes(trainer)
+    return slope / 1024, max(resident) - before, most_bytes(scene.train.images, len(points.points), config)
 
 
 def _resident() -> int:

@@ -22,7 +22,7 @@ from fits import PATIENCE, Fit, memory_of
 
 from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
-from kgs.io.results_folder import CHECKPOINT, UNFINISHED
+from kgs.io.results_folder import CHECKPOINT
 
 SHORT, LONG = 24, 450  # steps
 
@@ -55,7 +55,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
     steps, expected = alone
     trials, longest = (30, 0.6) if steps == LONG else (1, 0.1)
     fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
-    path, corrupt, fallen_back, different, fits, kills = fit.out / UNFINISHED / CHECKPOINT, 0, 0, 0, 0, 0
+    path, corrupt, fallen_back, different, fits, kills = fit.out / "unfinished" / CHECKPOINT, 0, 0, 0, 0, 0
     while kills < trials:
         process = fit.start()
         if fit.wait_for_steps(process):
@@ -105,7 +105,7 @@ def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..
     process.join(PATIENCE)
     code = process.exitcode
     try:
-        step = newest_checkpoint(fit.out / UNFINISHED / CHECKPOINT)[0]["step"]
+        step = newest_checkpoint(fit.out / "unfinished" / CHECKPOINT)[0]["step"]
     except DataError:
         step = -1
     partial = [path.name for path in fit.out.rglob("*.partial")]

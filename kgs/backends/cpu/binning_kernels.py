@@ -39,8 +39,8 @@ def find_rows(begin, end, means2d, factors, opacities, eps2d, threshold, height,
         if not cut > ZERO:
             continue
         f = factors[g]
-        _, _, yy, det = variances(f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], eps2d)
-        if not is_finite(det):
+        xx, _, yy, _ = variances(f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], eps2d)
+        if not is_finite(xx + yy):
             continue
         reach = math.sqrt(cut * yy)
         top, bottom = np.ceil(means2d[g, 1] - reach), np.floor(means2d[g, 1] + reach)

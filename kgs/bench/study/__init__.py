@@ -21,8 +21,8 @@ def study(
     """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
 
     For example:
-      kgs bench study -o study
-      KGS_DATA=SCENES kgs bench study -o study-cpu --preset cpu
+      kgs study -o study
+      KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
 
     Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. For many machines:
     `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
@@ -60,5 +60,5 @@ def study(
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
             scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
             options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
-            write_report(rows, out, f"{scenes}kgs bench study --preset {options} -o OUT", len(cells))
+            write_report(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
     return int(len(rows) < len(cells))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from photo_folders import exif, planes, with_exif
 
-from kgs.fit.photos.exif import Exif, read_exif
-from kgs.fit.photos.read import read_photos
 from kgs.io.console import silent
+from kgs.sfm.exif import Exif, read_exif
+from kgs.sfm.read import read_photos
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 

@@ -1,12 +1,10 @@
 """Photos and cameras in a folder, as COLMAP has them: `images`, `sparse/0` and `photos.json`, all three or none.
 
-What is new is written to `unfinished-photos`. When all is there that folder is renamed to `finished-photos`, and its
-parts are moved to their places: beside a fit, which belongs to the former cameras, only when the new one is there.
-Whoever opens the folder after a kill in between ends the move first.
+New ones go through `unfinished-photos` and `finished-photos`, see `kgs.io.staging`. Beside a fit, which belongs to the
+former cameras, they wait in the second folder until the new fit is there.
 """
 
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +14,27 @@ from numpy.typing import NDArray
 
 from kgs.datasets.layouts import CAMERAS_REPORT
 from kgs.errors import DataError
-from kgs.io.json_files import read_json, write_json
-from kgs.io.outputs import is_own, write_png
+from kgs.io.json_files import read_json
+from kgs.io.outputs import write_png
+from kgs.io.ownership import is_own
+from kgs.io.staging import Staging
 
-from .mapping import Cameras, quiet_pycolmap
+from .map import Cameras, quiet_pycolmap
 from .read import Photo
 
 REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
-UNFINISHED, WAITING = "unfinished-photos", "finished-photos"
+
+
+def photo_staging(out: Path) -> Staging:
+    """How photos and cameras get to their folder."""
+    return Staging(out, "-photos", replaced=(IMAGES, "sparse"))
 
 
 def check_place(out: Path, folder: Path) -> None:
     """A DataError where the results would lie among the user's photos or in place of files of another program."""
-    advice, photos = "choose another folder with -o", folder.resolve()
-    replaced = [out / name for name in (IMAGES, "sparse", UNFINISHED, WAITING)]
+    advice, photos = "choose another folder", folder.resolve()
+    staging = photo_staging(out)
+    replaced = [out / IMAGES, out / "sparse", staging.unfinished, staging.finished]
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
         raise DataError(out, "", f"holds the photos themselves: {advice}")
     for path in filter(os.path.lexists, replaced):
@@ -89,32 +94,6 @@ def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
     folder.mkdir(parents=True)
     cameras.reconstruction.extract_colors_for_all_images(images)
     cameras.reconstruction.write_binary(folder)
-
-
-def publish(out: Path, report: dict[str, Any]) -> None:
-    """Make `unfinished-photos` whole: the results wait in `finished-photos` for `end_move`."""
-    write_json(out / UNFINISHED / REPORT, report)
-    shutil.rmtree(out / WAITING, ignore_errors=True)
-    os.replace(out / UNFINISHED, out / WAITING)
-
-
-def is_whole(folder: Path) -> bool:
-    """Whether all parts are there: nothing has been moved yet."""
-    return all((folder / name).exists() for name in (IMAGES, "sparse", REPORT))
-
-
-def end_move(out: Path) -> None:
-    """What waits, or is left of a move, goes to its place."""
-    done = out / WAITING
-    if not (done.is_dir() and is_own(done)):
-        return
-    for name in (IMAGES, "sparse"):
-        if (done / name).is_dir():
-            shutil.rmtree(out / name, ignore_errors=True)
-            os.replace(done / name, out / name)
-    if (done / REPORT).exists():
-        os.replace(done / REPORT, out / REPORT)
-    shutil.rmtree(done)
 
 
 def _depths(scene: Any, image: Any) -> NDArray[np.float64]:

@@ -10,15 +10,15 @@ from init_point_scenes import texture
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
 from kgs.cli import main
+from kgs.cli.unposed import settle
 from kgs.errors import DataError
-from kgs.fit import photos
-from kgs.fit.photos import pose_photos
-from kgs.fit.photos.entry import settle
-from kgs.fit.photos.read import blurred, read_photos
-from kgs.fit.photos.write import end_move
 from kgs.io.console import silent
 from kgs.io.json_files import write_json
-from kgs.io.outputs import PNG_MARK, start_folder, write_png
+from kgs.io.outputs import write_png
+from kgs.io.ownership import MARK
+from kgs.sfm import pose, pose_photos
+from kgs.sfm.read import blurred, read_photos
+from kgs.sfm.write import photo_staging
 
 pytest.importorskip("pycolmap")
 
@@ -61,7 +61,7 @@ def folder(tmp_path):
 
 
 def test_no_folder(tmp_path, refused):
-    refused(tmp_path / "none", "expected a folder, there is none")
+    refused(tmp_path / "none", "expected a file or folder that is there, found none")
 
 
 def test_an_empty_folder(folder, refused):
@@ -182,7 +182,7 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
         (folder, "the photos themselves"),
         *((tmp_path / n, "kgs did not write") for n in ("scene", "other")),
     ):
-        refused(folder, "choose another folder with -o", out=out)
+        refused(folder, "choose another folder", out=out)
         with pytest.raises(DataError, match=f"{said}.*: choose another folder"):
             pose_photos(folder, out)
 
@@ -193,13 +193,13 @@ def test_a_users_own_folders_stay(folder, tmp_path, refused, name):
     mine = tmp_path / "project" / name / "deeper" / "IMG_1.HEIC"
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b"mine")
-    refused(write_planes(folder), "choose another folder with -o", out=tmp_path / "project", kept=True)
+    refused(write_planes(folder), "choose another folder", out=tmp_path / "project", kept=True)
     assert mine.read_bytes() == b"mine"
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     images = write_planes(tmp_path / "images")
-    refused(images, "choose another folder with -o", out=tmp_path)
+    refused(images, "choose another folder", out=tmp_path)
     for path in images.iterdir():  # as renders of kgs are
         write_png(path, torch.rand(3, 8, 8))
     with pytest.raises(DataError, match="holds the photos themselves"):
@@ -210,7 +210,7 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
 def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
     out = tmp_path / "project"
     out.mkdir()
-    for name in ("checkpoint.safetensors", "checkpoint.pt"):
+    for name in ("checkpoint.safetensors", "checkpoint.previous.safetensors"):
         (out / name).write_bytes(b"mine")
         refused(write_planes(folder), f"{name}: was not written by kgs", out=out)
         assert (out / name).read_bytes() == b"mine"
@@ -225,15 +225,17 @@ def test_pycolmap_that_is_not_there(folder, monkeypatch):
 
 def test_a_move_that_was_stopped_is_ended(tmp_path):
     """A kill between the renaming of the new folder and the last of its parts."""
-    new = tmp_path / "finished-photos"
-    start_folder(new)
-    (new / "sparse" / "0").mkdir(parents=True)
+    staging = photo_staging(tmp_path)
+    staging.start()
+    (staging.unfinished / "sparse" / "0").mkdir(parents=True)
+    (staging.unfinished / "sparse" / "0" / "cameras.bin").touch()
     save(tmp_path / "images", planes()[:1], ["old.png"])
-    save(new / "images", planes()[:1], ["new.png"])
-    write_json(new / "photos.json", {"versions": {"kgs": "0"}})
-    end_move(tmp_path)
+    save(staging.unfinished / "images", planes()[:1], ["new.png"])
+    write_json(staging.unfinished / "photos.json", {})
+    staging.seal()
+    staging.complete()
     left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
-    assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0"]
+    assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0", "sparse/0/cameras.bin"]
 
 
 def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch):
@@ -245,7 +247,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         (new / "images").mkdir()
         (new / "sparse" / "0").mkdir(parents=True)
         for path in paths:
-            (new / "images" / path.name).write_bytes(PNG_MARK)
+            (new / "images" / path.name).write_bytes(MARK)
         for name in ("cameras", "images", "points3D"):
             (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
         return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}
@@ -254,7 +256,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         """How many photos the cameras in their place are of."""
         return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
 
-    monkeypatch.setattr(photos, "find_cameras", find)
+    monkeypatch.setattr(pose, "find_cameras", find)
     assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
     assert placed() == (3, 3)
     (out / "splat.ply").write_bytes(b"ply")
@@ -287,6 +289,6 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
     def fail(*arguments):
         raise error
 
-    monkeypatch.setattr(f"kgs.fit.photos.{stage}", fail)
+    monkeypatch.setattr(f"kgs.sfm.{stage}", fail)
     refused(write_planes(folder), said, code=code)
     assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]

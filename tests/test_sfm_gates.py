@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from kgs.errors import DataError
-from kgs.fit.photos.gates import disagreement, groups_of, objections, table, unfit, weakest_link
-from kgs.fit.photos.mapping import Cameras, Look
-from kgs.fit.photos.pose import judge
+from kgs.sfm.gates import disagreement, groups_of, judge, objections, table, unfit, weakest_link
+from kgs.sfm.map import Cameras, Look
 
 NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}

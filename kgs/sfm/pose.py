@@ -1,4 +1,4 @@
-"""From photos to cameras that two solvers agree on, in a folder, and what is said of them in the report."""
+"""From photos to cameras that two solvers agree on: the folder they go to, and the report about them."""
 
 import shutil
 import time
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +14,116 @@ import cv2
 import torch
 
 from kgs.errors import DataError
-from kgs.io.console import Stage
+from kgs.io.console import Stage, say, silent
+from kgs.io.json_files import read_json, write_json
 from kgs.io.outputs import png_names
+from kgs.io.results_folder import locked
 from kgs.machine import versions
 
 from .exif import FILM_DIAGONAL
+from .find import find_photos
 from .gates import (
     FEWEST_POINTS,
     FOCAL_RANGE,
     LEAST_RISE,
     MOST_DEGREES,
     MOST_RATIO,
-    Pairs,
-    disagreement,
     faint_focal,
-    objections,
-    refusal,
+    judge,
     unfit,
     unlike_focals,
-    untold,
 )
-from .mapping import Cameras, lens_found, looks, quiet_pycolmap, solve, verify, write_own_matches
-from .matching import exif_focal, lens_of, write_matches
-from .read import Photo, blurred, read_photos
-from .write import IMAGES, MODEL, level_and_scale, write_images, write_model
+from .map import Cameras, lens_found, looks, quiet_pycolmap, solve, verify, write_own_matches
+from .match import exif_focal, lens_of, write_matches
+from .read import Photo, blurred, hash_photos, read_photos
+from .write import (
+    IMAGES,
+    MODEL,
+    REPORT,
+    check_place,
+    is_kept,
+    level_and_scale,
+    photo_staging,
+    write_images,
+    write_model,
+)
 
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
+
+
+SETTINGS = 3  # grows with every change after which the same photos give other files
+
+
+def pose_photos(
+    folder: str | PathLike[str],
+    out: str | PathLike[str],
+    *,
+    seed: int = 0,
+    wait: bool = False,
+    stage: Stage = silent,
+    say: Callable[[str], None] = say,
+) -> dict[str, Any]:
+    """Find the cameras of bare photos, and write a scene that `kgs.datasets.load_scene` reads.
+
+    The folder `out` gets `images` (upright PNGs of one size, at most 1600 pixels long, without metadata), `sparse/0`
+    (COLMAP's binary model: one SIMPLE_RADIAL lens, poses, points with tracks) and `photos.json` (the report). If the
+    photos are those of a former run, what is there is used again.
+
+    Convention:
+        COLMAP's: world-to-camera poses with OpenCV axes, the first pixel's centre at (0.5, 0.5). Up in the world is
+        -y: the cameras' common up. The median depth of a point in the photos that see it is 1.
+
+    Args:
+        folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into.
+        out: the folder for the results, made if it is not there.
+        seed: of what the solvers draw. The same photos and seed give the same files, but for the times in photos.json.
+        wait: leave new files in `out/finished-photos` where `out` holds a fit, which belongs to the former cameras.
+        stage: shows how far each part is, as `kgs.io.console.each` does.
+        say: where lines for the user go.
+
+    Returns:
+        What photos.json holds: "photos" by file name, "matches" of each pair, "size" (width, height), "focal_px",
+        "focal_rise" (by what share squared errors grow where the focal length is a quarter off; None where that of the
+        Exif was held), "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates", "seconds"
+        and others; "reused": whether it is a former run's; and "folder": where the scene is.
+
+    Raises:
+        DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
+            what to do, with the number of matches of each pair.
+        ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
+        OSError: a result cannot be written.
+    """
+    folder, out = Path(folder), Path(out)
+    with quiet_pycolmap():  # a missing package is told before any work
+        pass
+    paths = find_photos(folder)
+    check_place(out, folder)
+    hashes = hash_photos(paths)
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        staging = photo_staging(out)
+        waiting = staging.finished
+        same = {"settings": SETTINGS, "seed": seed, "sha256": hashes}
+        if not (wait and staging.is_waiting):
+            staging.complete()
+        place = next((place for place in (waiting, out) if is_kept(place, same)), None)
+        if place is not None:
+            say(f"cameras: those in {place} are of the same {len(paths)} photos and are used again")
+        if place == out:
+            staging.discard()
+        if place is None:
+            new = staging.unfinished
+            staging.start()
+            try:
+                report = find_cameras(paths, new, seed % 2**31, stage, say)
+                write_json(new / REPORT, same | report)
+                staging.seal()
+            finally:
+                shutil.rmtree(new, ignore_errors=True)
+        if not (wait and (out / "splat.ply").exists()):
+            staging.complete()
+        found = waiting if staging.is_waiting else out
+        return read_json(found / REPORT) | {"reused": place is not None, "folder": str(found)}
 
 
 def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Callable[[str], None]) -> dict[str, Any]:
@@ -112,36 +197,6 @@ def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Cal
         "seconds": seconds,
         "versions": versions() | {"pycolmap": version("pycolmap")},
     }
-
-
-def judge(
-    folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs
-) -> tuple[Cameras, float]:
-    """The cameras that pass the gates, and how far the two solvers are apart in degrees; a DataError if none do.
-
-    If both pass, those whose worst photo sees more points are taken.
-    """
-    against = [objections(cameras, names, longest) for cameras in found]
-    good = [cameras for cameras, reasons in zip(found, against, strict=True) if cameras and not reasons]
-    if not good:
-        raise DataError(folder, "", refusal(against[0], names, pairs))
-    for cameras in found:  # what one of them did not place nothing confirms
-        if missing := [name for name in names if cameras is None or name not in cameras.points]:
-            reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
-            raise DataError(folder, "", refusal([reason], names, pairs))
-    both = [cameras for cameras in found if cameras]
-    if doubt := faint_focal(both):
-        raise DataError(folder, "", untold(doubt, names, pairs))
-    degrees, pair = disagreement(*both)
-    if degrees > MOST_DEGREES:
-        reason = (
-            f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
-        )
-        raise DataError(folder, "", refusal([reason], names, pairs))
-    if doubt := unlike_focals(both):
-        raise DataError(folder, "", untold(doubt, names, pairs))
-    sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE] or good
-    return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
 
 
 def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from photo_folders import NAMES, close, planes, poses, write_photos, write_plane
 
 from kgs.datasets import load_scene
 from kgs.errors import DataError
-from kgs.fit.photos import pose_photos
+from kgs.sfm import pose_photos
 
 pycolmap = pytest.importorskip("pycolmap")
 

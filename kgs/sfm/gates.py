@@ -7,12 +7,14 @@ solver, from other keypoints, has to find the same.
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 
 import torch
 
+from kgs.errors import DataError
 from kgs.geometry import degrees_between
 
-from .mapping import FEWEST_MATCHES, Cameras, Look
+from .map import FEWEST_MATCHES, Cameras, Look
 
 FOCAL_RANGE = 0.4, 3.0  # of the longer side
 FEWEST_POINTS = 50  # that each photo sees
@@ -71,6 +73,36 @@ def unlike_focals(found: Sequence[Cameras]) -> str:
     ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
     unlike = ratio > MOST_RATIO
     return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}" if unlike else ""
+
+
+def judge(
+    folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs
+) -> tuple[Cameras, float]:
+    """The cameras that pass the gates, and how far the two solvers are apart in degrees; a DataError if none do.
+
+    If both pass, those whose worst photo sees more points are taken.
+    """
+    against = [objections(cameras, names, longest) for cameras in found]
+    good = [cameras for cameras, reasons in zip(found, against, strict=True) if cameras and not reasons]
+    if not good:
+        raise DataError(folder, "", refusal(against[0], names, pairs))
+    for cameras in found:  # what one of them did not place nothing confirms
+        if missing := [name for name in names if cameras is None or name not in cameras.points]:
+            reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
+            raise DataError(folder, "", refusal([reason], names, pairs))
+    both = [cameras for cameras in found if cameras]
+    if doubt := faint_focal(both):
+        raise DataError(folder, "", untold(doubt, names, pairs))
+    degrees, pair = disagreement(*both)
+    if degrees > MOST_DEGREES:
+        reason = (
+            f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
+        )
+        raise DataError(folder, "", refusal([reason], names, pairs))
+    if doubt := unlike_focals(both):
+        raise DataError(folder, "", untold(doubt, names, pairs))
+    sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE] or good
+    return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:

@@ -8,11 +8,11 @@ import pytest
 from photo_folders import write_planes
 
 from kgs.errors import DataError
-from kgs.fit.photos import find, read
-from kgs.fit.photos.find import find_photos, list_photos
-from kgs.fit.photos.heic import is_heic
-from kgs.fit.photos.read import read_photos
 from kgs.io.console import silent
+from kgs.sfm import find, read
+from kgs.sfm.find import find_photos, list_photos
+from kgs.sfm.heic import is_heic
+from kgs.sfm.read import read_photos
 
 pi_heif = pytest.importorskip("pi_heif")
 

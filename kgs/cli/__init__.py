@@ -1,0 +1,51 @@
+"""The command `kgs`: from the words of a command line to an exit code.
+
+Nothing heavy is imported here: neither torch, NumPy and OpenCV, nor tyro. A command is found by its name, then tyro
+reads its options and input paths are looked for, and only then torch is loaded, which takes seconds.
+"""
+
+import os
+import sys
+import warnings
+from contextlib import suppress
+
+from .interrupts import leave_at_once
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one command and exit.
+
+    Args:
+        arguments: the words after `kgs`; those of this process unless given.
+
+    Raises:
+        SystemExit: always. The code is 0, 2 for a mistake of the user, 1 for a failure, or 128 + the number of the
+            signal that ended the work.
+    """
+    leave_at_once()
+    from .run import exit_code
+
+    _open_streams()
+    with warnings.catch_warnings():
+        code = exit_code(list(sys.argv[1:] if arguments is None else arguments))
+    _flush_streams()
+    sys.exit(code)
+
+
+def _open_streams() -> None:
+    """Open the standard streams that are closed: the next file that is opened would be taken for one of them."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+
+
+def _flush_streams() -> None:
+    """Write what is left, and where nobody reads it keep Python from complaining at exit."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, AttributeError):
+            with suppress(OSError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -1,0 +1,57 @@
+"""`kgs bench`: what rendering costs on this machine, and how exact it is."""
+
+from .options import Out
+
+
+def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
+    """Measure time and memory of renders and training steps, of torch and numba.
+
+    For example:
+      kgs bench speed -o speed
+      kgs bench speed -o speed --quick --device cuda
+
+    Writes speed.csv, speed.json, speed.md and scaling.png in minutes, with --quick in tens of seconds.
+
+    Args:
+        out: folder for the results, made if it is not there.
+        quick: fewer Gaussians and repetitions.
+        device: where to render: cpu, cuda, cuda:1, ...
+    """
+    from kgs.bench.speed import speed
+
+    speed(out=out, quick=quick, device=device)
+
+
+def precision(*, out: Out, quick: bool = False) -> None:
+    """Measure errors of images and gradients against time, for each option of the renderer.
+
+    For example:
+      kgs bench precision -o precision
+      kgs bench precision -o precision --quick
+
+    Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
+
+    Args:
+        out: folder for the results, made if it is not there.
+        quick: small images with few Gaussians.
+    """
+    from kgs.bench.precision import precision
+
+    precision(out=out, quick=quick)
+
+
+def extremes(*, out: Out) -> int:
+    """Measure errors of stiff and extreme cases, and compare them with their bounds.
+
+    For example:
+      kgs bench extremes -o extremes
+      OMP_NUM_THREADS=1 kgs bench extremes -o extremes-1
+
+    Writes extremes.csv, extremes.json and extremes.md in seconds; the exit code is 1 where a bound is missed.
+
+    Args:
+        out: folder for the results, made if it is not there.
+    """
+    from kgs.bench.extremes import extremes
+
+    return extremes(out=out)

@@ -1,0 +1,99 @@
+"""`kgs demo`: one scene, fitted without and with DropGaussian from equal starts."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kgs.errors import printable
+from kgs.fit.config import DEMO, Backend, FitConfig
+from kgs.io.console import VIEWER, as_line, each, say, say_next
+
+from .options import Out
+
+if TYPE_CHECKING:
+    from kgs.datasets.scene import Scene
+
+
+def demo(
+    *,
+    out: Out = Path("demo"),
+    steps: int = DEMO.steps,
+    size: tuple[int, int] = (189, 252),
+    seed: int = 0,
+    device: str = "cpu",
+    backend: Backend = "auto",
+) -> None:
+    """Fit three photos of a built-in room without and with DropGaussian, and compare views that were not used.
+
+    For example:
+      kgs demo -o demo
+      kgs demo -o demo1 --seed 1
+
+    Args:
+        out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply and .glb, cameras.json and
+            turntable.webm.
+        steps: training steps of each of the two fits; the default takes a minute on 2 cores, without numba 3.
+        size: height and width of the pictures.
+        seed: the scene, the first points and both fits derive from it.
+        device: cpu, cuda, ...
+        backend: as of kgs fit.
+    """
+    from kgs.datasets import synthetic_scene
+    from kgs.io.outputs import EXPORTS, check_folder
+    from kgs.machine import check_tools
+
+    config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
+    if min(size) < 12:  # the window of SSIM
+        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
+    check_tools(device, backend, "matplotlib", "jinja2")
+    check_folder(out, ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS])
+    runs = run_demo(synthetic_scene("room", train_views=3, test_views=5, size=size, seed=seed), config, out)
+    say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
+    level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
+    for name, run in runs.items():
+        columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
+        say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
+    gain = level["with"][0] - level["without"][0]
+    say(f"\ndifference on test views: {gain:+.2f} dB (one seed; try --seed 1, 2, ...)")
+    say(f"pictures: {printable(out / 'demo.png')}, {printable(out / 'curve.png')}")
+    say_next(
+        f"open {as_line(out / 'index.html')} in a browser",
+        "kgs fit PHOTOS -o OUT  # three or more photos of your own",
+        VIEWER.format(as_line(out / "splat.ply")),
+    )
+
+
+def run_demo(scene: "Scene", config: FitConfig, out: Path) -> dict[str, dict[str, Any]]:
+    """Fit a scene twice, write its pictures, page, files and the exports, and return what metrics.json holds."""
+    from kgs.fit.exports import write_exports
+    from kgs.fit.run import choose_points, measure, train
+    from kgs.fit.trainer import Trainer
+    from kgs.io.figures import write_curve, write_sheet
+    from kgs.io.json_files import write_json
+    from kgs.io.ply import save_ply
+    from kgs.page.fit_page import PAGE, write_fit_page
+
+    points = choose_points(scene, config, each)
+    height, width = scene.train.images.shape[-2:]
+    say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
+    say(f"first points: {len(points.points)} ({points.kind})")
+    runs, renders, curves = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+    drawn, measured = dict[str, Any](), dict[str, Any]()
+    for name, drop in (("without", 0.0), ("with", config.drop)):
+        trainer, title = Trainer(scene, replace(config, drop=drop), points), f"{name} DropGaussian"
+        if signal := train(trainer, None, title=title):
+            raise SystemExit(128 + signal)
+        runs[name], curves[title] = measure(trainer), trainer.curve
+        drawn[title], measured[title] = trainer.render, runs[name]
+        renders[title] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
+    save_ply(out / "splat.ply", trainer.shown, offset=scene.offset)
+    write_exports(trainer, out)
+    write_json(out / "metrics.json", runs)
+    write_curve(out / "curve.png", curves)
+    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs["without"]["test"]["views"]]
+    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
+    write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
+    notes = [f"The viewer and the sliders show the fit {title}."]
+    write_fit_page(out / PAGE, "kgs demo", scene, trainer.shown, trainer.near_plane, drawn, measured, notes=notes)
+    return runs

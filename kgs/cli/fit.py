@@ -1,0 +1,116 @@
+"""`kgs fit`: from a folder of photos to a splat."""
+
+import os
+from dataclasses import replace
+from itertools import pairwise
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from kgs.errors import DataError, printable
+from kgs.fit.config import FAST, PRESETS, Background, FitConfig
+from kgs.io.console import VIEWER, as_line, say, say_next
+
+from .inputs import load
+from .options import Existing, Out
+
+
+def defaults(words: list[str]) -> dict[str, Any]:
+    """The numbers that a fit has unless an option says else: those of --preset and --fast."""
+    presets = [word.removeprefix("--preset=") for word in words if word.startswith("--preset=")]
+    presets += [value for word, value in pairwise(words) if word == "--preset"]
+    config = PRESETS.get(presets[-1] if presets else "auto", PRESETS["auto"])
+    if "--fast" in words:
+        config = replace(config, steps=FAST.steps, coarse=FAST.coarse)
+    return {"config": config}
+
+
+def fit(
+    scene: Existing,
+    /,
+    *,
+    out: Out,
+    views: int | None = None,
+    hold_out: int | None = None,
+    downscale: float | None = None,
+    background: Background = "black",
+    preset: Literal["auto", "paper", "plain"] = "auto",
+    fast: bool = False,
+    resume: bool = False,
+    lpips_weights: Existing | None = None,
+    config: Annotated[FitConfig, tyro.conf.arg(name="")],
+) -> int:
+    """Turn a folder of photos into a splat, with test metrics.
+
+    For example:
+      kgs fit PHOTOS -o OUT
+      kgs fit fern -o fern-3 --views 3 --downscale 2
+
+    Args:
+        scene: a folder of 3 or more photos, whose cameras are found first (extra sfm) and written to the output folder
+            (images, sparse/0, photos.json); or one with camera poses: LLFF, COLMAP, Blender or nerfstudio.
+        out: folder for index.html, the page to look at, turntable.webm, a film, splat.ply and .glb, cameras.json,
+            metrics.json, test/*.png, curve.png, config.json and the checkpoints.
+        views: training views, spread over the views that are not held out; all of them unless given.
+        hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
+            scene's files name, or else every eighth; of fewer than 9 bare photos none.
+        downscale: shrink the photos by this factor; bare ones on a CPU to 504 pixels unless given.
+        background: behind photos with transparency.
+        preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
+            counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
+        fast: half the steps, a third of them on small pictures: other defaults, see --fast --help.
+        resume: continue from the checkpoint in the output folder.
+        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
+        config: every number of the fit.
+    """
+    del preset, fast  # `defaults` has read them
+    from kgs.datasets.layouts import CAMERAS_REPORT
+    from kgs.fit.prune import left_out
+    from kgs.fit.run import fit_scene
+    from kgs.io.outputs import check_folder
+    from kgs.io.ownership import is_own
+    from kgs.io.results_folder import fit_staging, is_finished, replaced_files
+    from kgs.machine import check_tools
+    from kgs.metrics.evaluate import in_words
+    from kgs.metrics.lpips import Lpips
+    from kgs.page.fit_page import write_own_page
+
+    from .unposed import find_scene, is_bare, settle
+
+    check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
+    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
+    check_folder(out, replaced_files(out), scene, make=False)
+    request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
+    request["hold_out"] = hold_out
+    request["points"] = config.init if config.init == "model-points" else "none"
+    place = out
+    if bare := is_bare(scene):
+        request, place = find_scene(scene, out, request, config)
+    elif is_own(out / CAMERAS_REPORT):
+        raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
+    loaded = load(request, place)
+    height, width = loaded.train.images.shape[-2:]
+    say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
+    metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)
+    kept = bool(stopped_by) and is_finished(out)  # the former fit
+    if bare and not kept:
+        settle(out)
+    say(in_words(metrics))
+    posed = out if bare else scene
+    splat = (fit_staging(out).unfinished if kept else out) / "splat.ply"
+    renders, by = out / "renders", request["downscale"]
+    shrunk = ("--downscale", f"{by:g}") if by else ()
+    say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
+    if what := left_out(metrics["needs"]):
+        say(f"left out: {what}")
+    if stopped_by:
+        say_next("the same command with --resume goes on where it stopped")
+        return 128 + stopped_by
+    say_next(
+        f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
+        f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
+        f"{as_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
+        VIEWER.format(as_line(splat)),
+    )
+    return 0

@@ -1,0 +1,39 @@
+"""What several commands load: scenes, cameras and splats."""
+
+from pathlib import Path
+from typing import Any
+
+from kgs.fit.config import Recipe
+from kgs.io.console import say
+
+
+def load(request: dict[str, Any], out: Path) -> Any:
+    """The scene; the folder "." is that of the results itself."""
+    from kgs.datasets import load_scene
+
+    names = ("train_views", "downscale", "hold_out", "background", "points")
+    scene = load_scene(out / request["scene"], **{name: request[name] for name in names})
+    for note in scene.notes:
+        say(note)
+    return scene
+
+
+def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any:
+    """The scene without its photos, of which there may be hundreds."""
+    from kgs.datasets import load_scene
+
+    scene = load_scene(cameras, None, downscale, photos=False, **options)
+    for note in scene.notes:
+        say(note)
+    return scene
+
+
+def load_splat(ply: Path, scene: Any, place: Any, backend: str) -> tuple[Any, Any]:
+    """The Gaussians in the frame of the scene, and a renderer whose near plane follows from them."""
+    from kgs.geometry import typical_depths
+    from kgs.io.ply import load_ply
+    from kgs.renderer import GaussianRenderer
+
+    model = load_ply(ply, origin=scene.offset)
+    near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
+    return model.to(place), GaussianRenderer(near_plane=near_plane, backend=backend).eval()

@@ -1,0 +1,60 @@
+"""`kgs render`: pictures of a splat."""
+
+from typing import Literal
+
+from kgs.errors import printable
+from kgs.fit.config import Backend, Background
+from kgs.io.console import VIEWER, as_line, each, say, say_next
+
+from .inputs import load_cameras, load_splat
+from .options import Existing, Out
+
+
+def render(
+    ply: Existing,
+    /,
+    *,
+    cameras: Existing,
+    out: Out,
+    downscale: float | None = None,
+    background: Literal[Background, "transparent"] = "black",
+    device: str = "cpu",
+    backend: Backend = "auto",
+) -> None:
+    """Render a splat from every camera of a scene into PNGs.
+
+    For example:
+      kgs render fern-3/splat.ply --cameras fern -o renders
+      kgs render fern-3/splat.ply --cameras fern -o small --downscale 8 --background white
+
+    Args:
+        ply: a 3DGS PLY file.
+        cameras: the scene (LLFF, COLMAP, Blender or nerfstudio folder) whose cameras to use.
+        out: folder for the PNGs, named like the scene's photos; not where these are.
+        downscale: shrink the pictures by this factor.
+        background: behind the splat; transparent: PNGs with an alpha channel.
+        device: cpu, cuda, ...
+        backend: as of kgs fit.
+    """
+    import torch
+
+    from kgs.camera import move_camera
+    from kgs.io.outputs import check_folder, png_names, write_png
+    from kgs.machine import check_tools
+
+    place = check_tools(device, backend)
+    check_folder(out, (), cameras, make=False)
+    clear = background == "transparent"
+    scene = load_cameras(cameras, downscale, background="black" if clear else background)
+    model, renderer = load_splat(ply, scene, place, backend)
+    posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
+    names = png_names(name for name, _ in posed)
+    check_folder(out, names.values(), scene.root)
+    outputs, behind = ("image", "alpha") if clear else ("image",), scene.background.to(place)
+    for name, camera in each(posed, "pictures", "view"):
+        with torch.no_grad():
+            seen = renderer(model(), move_camera(camera, place), behind, outputs)
+        image = torch.cat([seen.image / seen.alpha.clamp_min(1e-6), seen.alpha], 1) if clear else seen.image
+        write_png(out / names[name], image[0])
+    say(f"{len(names)} pictures in {printable(out)}")
+    say_next(VIEWER.format(as_line(ply)))

@@ -1,0 +1,187 @@
+"""Finds a command, reads its options, calls it, and turns what goes wrong into a line and an exit code."""
+
+import difflib
+import errno
+import inspect
+import sys
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import fields
+from functools import partial, wraps
+from importlib import import_module
+from typing import Any, get_args
+
+from kgs.errors import DataError, TrainingDiverged, printable
+from kgs.fit.config import FitConfig, Recipe
+from kgs.io.console import say
+
+from .interrupts import interrupt_as_usual
+
+# The module of this package and the function in it that are a command.
+_COMMANDS = {
+    "demo": ("demo", "demo"),
+    "fit": ("fit", "fit"),
+    "render": ("render", "render"),
+    "eval": ("evaluate", "evaluate"),
+    "page": ("page", "page"),
+    "bench speed": ("bench", "speed"),
+    "bench precision": ("bench", "precision"),
+    "bench extremes": ("bench", "extremes"),
+    "study": ("study", "study"),
+}
+_HEAVY = ("torch", "kornia", "cv2", "numba")
+_EXTRAS = {
+    "numba": "fast",
+    "pi_heif": "heic",
+    "pycolmap": "sfm",
+    "distributed": "study",
+    "pandas": "study",
+    "scipy": "study",
+}
+_OF_THE_USER = {
+    errno.EACCES,
+    errno.EEXIST,
+    errno.EISDIR,
+    errno.ENAMETOOLONG,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EROFS,
+}
+_OTHER_NAMES = {"train_views": "views"}  # arguments of the library, and their options
+
+
+def exit_code(words: list[str]) -> int:
+    """Run one command; errors and warnings are a line each, on stderr."""
+    warnings.showwarning = lambda text, *_: say(f"kgs: {text}", sys.stderr)
+    flags: dict[str, str] = {}
+    message, code = "", 2
+    try:
+        name, words = _find(words)
+        command, defaults = _load(name)
+        flags |= _flags_of(command)
+        call = _parse(command, f"kgs {name}", words, defaults(words))
+        for module in _HEAVY:
+            with suppress(ImportError):  # numba may be missing; the command says what it needs
+                import_module(module)
+        interrupt_as_usual()
+        return int(call() or 0)
+    except SystemExit as stop:
+        message, code = (stop.code, 2) if isinstance(stop.code, str) else ("", stop.code or 0)
+    except ModuleNotFoundError as error:
+        message = _of_a_missing_package(error)
+    except DataError as error:
+        message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
+    except ValueError as error:
+        argument, colon, reason = str(error).partition(":")
+        message = printable(flags.get(argument, argument) + colon + reason)
+    except TrainingDiverged as error:
+        message, code = printable(f"training diverged: {error}"), 1
+    except BrokenPipeError:
+        code = 0  # the reader has what it wanted
+    except OSError as error:
+        place = f"{printable(error.filename)}: " if error.filename else ""
+        message, code = f"{place}{error.strerror}", 2 if error.errno in _OF_THE_USER else 1
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not any(cause in str(error) for cause in ("allocate", "of memory")):
+            raise
+        message, code = f"not enough memory: {error}".partition("\n")[0], 1
+    except KeyboardInterrupt:
+        code = 130
+    finally:
+        interrupt_as_usual()
+    if message:
+        say(f"kgs: {message}", sys.stderr)
+    return code
+
+
+def _of_a_missing_package(error: ModuleNotFoundError) -> str:
+    package = (error.name or "").partition(".")[0]
+    if package == "kgs":
+        raise error
+    extra = _EXTRAS.get(package, "app")
+    return (
+        f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '
+        f'or pip install "kgs-splat[{extra}]" where an index has it'
+    )
+
+
+def _find(words: list[str]) -> tuple[str, list[str]]:
+    """The name of the command that the first words are, and the words after it."""
+    if words[:1] == ["--version"]:
+        _say_versions()
+        raise SystemExit(0)
+    group = "bench" if words[:1] == ["bench"] else ""
+    prefix = f"{group} " if group else ""
+    name, *rest = words[len(prefix.split()) :] or ["--help"]
+    names = [each.removeprefix(prefix) for each in _COMMANDS if each.startswith(prefix)]
+    if name in ("-h", "--help"):
+        _say_commands(prefix)
+        raise SystemExit(0)
+    if name not in names:
+        known = list(dict.fromkeys(each.partition(" ")[0] for each in names))
+        near = difflib.get_close_matches(name, known, 1)
+        meant = f": did you mean {near[0]}?" if near else ""
+        whole = f"kgs {group}".strip()
+        raise SystemExit(f"expected a command of {whole}, one of {', '.join(known)}, got {printable(name)!r}{meant}")
+    return prefix + name, rest
+
+
+def _say_versions() -> None:
+    from kgs.machine import versions
+
+    found = versions()
+    found.setdefault("numba", "is not installed: the extra fast brings it")
+    say("\n".join(f"{name} {version}" for name, version in found.items()))
+
+
+def _say_commands(prefix: str) -> None:
+    lines = [f"usage: kgs {prefix}COMMAND ...", ""]
+    for name in _COMMANDS:
+        if name.startswith(prefix):
+            summary = str(_load(name)[0].__doc__).partition("\n")[0]
+            lines.append(f"  {name.removeprefix(prefix):<16} {summary}")
+    say("\n".join([*lines, "", f"kgs {prefix}COMMAND --help lists the options and gives examples."]))
+
+
+def _load(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], dict[str, Any]]]:
+    """The function of a command, and that of the defaults which follow from its words."""
+    module, function = _COMMANDS[name]
+    home = import_module(f"kgs.cli.{module}")
+    return getattr(home, function), getattr(home, "defaults", lambda _: {})
+
+
+def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
+    """What the command line calls the arguments that errors of the library name."""
+    paths: dict[str, str] = {}
+    parameters = inspect.signature(command).parameters
+    if "config" in parameters:
+        paths |= {entry.name: f"recipe.{entry.name}" for entry in fields(Recipe)}
+        paths |= {f"recipe.{entry.name}": f"recipe.{entry.name}" for entry in fields(Recipe)}
+        paths |= {entry.name: entry.name for entry in fields(FitConfig)}
+    paths |= {name: name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY}
+    paths |= _OTHER_NAMES
+    return {name: "--" + path.replace("_", "-") for name, path in paths.items()}
+
+
+def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: dict[str, Any]) -> Callable[[], Any]:
+    """Read the options; returns the call that they ask for, once its input paths are there."""
+    import tyro
+
+    from .options import EXISTS
+
+    @wraps(command)
+    def bind(*arguments: Any, **options: Any) -> Callable[[], Any]:
+        bound = inspect.signature(command).bind(*arguments, **options)
+        for name, value in bound.arguments.items():
+            hint = command.__annotations__[name]
+            is_input = any(EXISTS in get_args(part) for part in (hint, *get_args(hint)))  # optional ones too
+            if isinstance(value, FitConfig):
+                is_input, value = True, value.init_file
+            if is_input and value is not None and not value.exists():
+                raise DataError(value, "", f"expected {EXISTS}, found none")
+        return partial(command, *arguments, **options)
+
+    function = partial(bind, **defaults) if defaults else bind
+    call: Callable[[], Any] = tyro.cli(function, prog=prog, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    return call

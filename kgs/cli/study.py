@@ -1,0 +1,47 @@
+"""`kgs study`: what DropGaussian is worth."""
+
+from typing import Literal
+
+from .options import Existing, Out
+
+
+def study(
+    *,
+    out: Out,
+    preset: Literal["quick", "cpu", "paper"] = "quick",
+    processes: int | None = None,
+    scheduler: str | None = None,
+    lpips_weights: Existing | None = None,
+    report_only: bool = False,
+) -> int:
+    """Compare fits with and without DropGaussian, its schedules and rivals, over scenes and seeds.
+
+    For example:
+      kgs study -o study
+      KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
+
+    Writes sparse.jsonl, a line per finished fit, and the report, also when it is interrupted; the same command goes on
+    where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and
+    --scheduler.
+
+    Args:
+        out: folder for the results; fits that its sparse.jsonl has are not repeated.
+        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA; paper is the
+            paper's 10 000 steps on every scene there in the size it has, for a large machine.
+        processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
+        scheduler: address of a Dask scheduler whose workers run the fits instead; they find scenes and weights under
+            the same paths.
+        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out, also of fits that are
+            done.
+        report_only: fit nothing; write the report of the fits that are done.
+    """
+    from kgs.bench.study import study
+
+    return study(
+        out=out,
+        preset=preset,
+        processes=processes,
+        scheduler=scheduler,
+        lpips_weights=lpips_weights,
+        report_only=report_only,
+    )

@@ -1,0 +1,58 @@
+"""`kgs fit` of bare photos: their cameras first, and then a scene like any other, in the folder of the results."""
+
+from pathlib import Path
+from typing import Any
+
+from kgs.datasets.images import VIDEO_SUFFIXES
+from kgs.datasets.layouts import nearest_scene
+from kgs.fit.config import FitConfig
+from kgs.io.console import each, say
+from kgs.io.results_folder import locked
+
+LONGEST = 504  # pixels of the longer side in a fit on a CPU
+FEW = 9  # photos: of fewer none is held out
+
+
+def is_bare(scene: Path) -> bool:
+    """Whether this can only be photos without cameras, or a video of them: no scene, and none right below or above."""
+    if scene.is_file():
+        return scene.suffix.lower() in VIDEO_SUFFIXES
+    return scene.is_dir() and nearest_scene(scene) is None
+
+
+def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConfig) -> tuple[dict[str, Any], Path]:
+    """Find the cameras of bare photos; returns how the scene is to be loaded, as config.json has it, and from where.
+
+    That folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
+
+    Args:
+        photos: the folder of the photos.
+        out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
+        request: what the user asked for; None stands for what was left open.
+        config: of the fit; on a CPU the photos are fitted at `LONGEST` pixels unless `request` says else.
+
+    Raises:
+        DataError: as of `pose_photos`.
+    """
+    from kgs.sfm import pose_photos
+
+    report = pose_photos(photos, out, seed=config.seed, wait=True, stage=each, say=say)
+    count, longest = len(report["photos"]), max(report["size"])
+    if request["hold_out"] is None and count < FEW:
+        request = request | {"hold_out": 0}
+    downscale = _downscale(request["downscale"], longest, config)
+    request = request | {"downscale": downscale, "scene": ".", "title": photos.resolve().name}
+    return request, Path(report["folder"])
+
+
+def settle(out: Path) -> None:
+    """Put cameras that waited for a fit in their place, beside its results."""
+    from kgs.sfm.write import photo_staging
+
+    with locked(out):
+        photo_staging(out).complete()
+
+
+def _downscale(asked: float | None, longest: float, config: FitConfig) -> float | None:
+    """By how much posed photos are shrunk for the fit; `longest` is their longer side in pixels."""
+    return max(1.0, longest / LONGEST) if asked is None and config.device == "cpu" else asked
