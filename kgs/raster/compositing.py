@@ -213,7 +213,7 @@ class DepthSlice:
     def __init__(
         self, lists: TileLists, gaussians: Columns, thresholds: Thresholds, settings: DeviceSettings, cut: Cut
     ) -> None:
-        self._lists, self._gaussians, self._thresholds, self._settings = lists, gaussians, thresholds, settings
+        self.lists, self._gaussians, self._thresholds, self._settings = lists, gaussians, thresholds, settings
         # Sums along the layers of a GPU are not deterministic for torch
         self._by_layer = settings.by_layer or torch.are_deterministic_algorithms_enabled()
         lengths, order = torch.sort(lists.offsets.diff(), descending=True, stable=True)
@@ -263,7 +263,7 @@ class DepthSlice:
             behind: V behind the last layer, `(P, T)`; becomes V before the first.
             moments, features: which are wanted.
         """
-        lists, width = self._lists, 6 * moments + grads.shape[0] * features
+        lists, width = self.lists, 6 * moments + grads.shape[0] * features
         own_grads, own_behind = grads.index_select(2, self._tiles), behind.index_select(1, self._tiles)
         rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
         while self._steps:
