@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.vector import Vector3
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel
@@ -163,8 +164,9 @@ def times(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (vectors[..., None, :] * matrix).sum(-1)
 
 
-def lenses(cameras: Cameras, size: tuple[int, int]) -> list[Lens]:
-    """The cameras of a batch, one by one, for images of `size` (height, width)."""
+def lenses(cameras: Cameras, size: tuple[int, int] | None = None) -> list[Lens]:
+    """The cameras of a batch, one by one; `size` is (height, width) of their images, where it is known."""
+    size = size or image_size(cameras)
     if isinstance(cameras, PinholeCamera):
         return [_pinhole(cameras, c, size) for c in range(cameras.batch_size)]
     return [_modelled(cameras, c) for c in range(cameras.extrinsics.shape[0])]
@@ -177,7 +179,8 @@ def _pinhole(cameras: PinholeCamera, c: int, size: tuple[int, int]) -> Lens:
     limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], *size)
 
     def pixels(points: Tensor) -> Tensor:
-        return times(matrix[:2, :3], points) / points[:, 2:]
+        found: Tensor = convert_points_from_homogeneous(times(matrix[:3, :3], points))
+        return found
 
     def jacobian(points: Tensor) -> Tensor:
         return _perspective_jacobian(matrix[:2, :2], points, limits)

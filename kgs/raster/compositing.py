@@ -219,9 +219,7 @@ class DepthSlice:
         lengths, order = torch.sort(lists.offsets.diff(), descending=True, stable=True)
         counts = [length for length in lengths.tolist() if length > 0]
         self._tiles = order[: len(counts)]
-        self._starts, self._ends = (
-            x.index_select(0, self._tiles) for x in (lists.offsets[:-1], lists.offsets[1:])
-        )
+        self._starts, self._ends = (x.index_select(0, self._tiles) for x in (lists.offsets[:-1], lists.offsets[1:]))
         self._steps = cut(counts, lists.tile_size**2)
         pairs = lists.tile_size**2 * sum(s.layers * (s.tiles.stop - s.tiles.start) for s in self._steps)
         self.alpha_bytes = pairs * gaussians.table.element_size()  # to keep all alphas
@@ -258,10 +256,8 @@ class DepthSlice:
     def differentiate(self, grads: Tensor, behind: Tensor, moments: bool, features: bool) -> Tensor:
         """What each Gaussian gets: six moments of dL/d ln alpha about its centre, and dL/d features, `(n, 6 + F)`.
 
-        Args:
-            grads: dL/d features of the pixels, `(F, P, T)`.
-            behind: V behind the last layer, `(P, T)`; becomes V before the first.
-            moments, features: which are wanted.
+        `grads` are dL/d features of the pixels, `(F, P, T)`. `behind` is V behind the last layer, `(P, T)`, and becomes
+        V before the first. Where `moments` or `features` are not wanted, their columns are left out.
         """
         lists, width = self.lists, 6 * moments + grads.shape[0] * features
         own_grads, own_behind = grads.index_select(2, self._tiles), behind.index_select(1, self._tiles)
