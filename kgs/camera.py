@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.vector import Vector3
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel
@@ -26,7 +27,6 @@ from kornia.sensors.camera.projection_model import OrthographicProjection
 from numpy.polynomial import Polynomial
 from torch import Tensor
 
-from .full_precision import in_full_precision
 from .types import check_tensor
 
 MARGIN = 0.15
@@ -76,7 +76,7 @@ class Lens:
     """One posed camera, reduced to what projection needs."""
 
     extrinsics: Tensor  # world-to-camera, (4, 4)
-    project: Callable[[Tensor, Tensor], Tensor]  # (world points, camera points), both (M, 3), to pixels (M, 2)
+    project: Callable[[Tensor], Tensor]  # camera points (M, 3) to pixels (M, 2)
     jacobian: Callable[[Tensor], Tensor]  # camera points to the derivative of the pixel, (M, 2, 3)
     parallel: bool = False  # whether all rays have one direction (orthographic)
     sees: Callable[[Tensor], Tensor] | None = None  # whether camera points lie before the fold, (M,); None: all do
@@ -138,7 +138,8 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
     if isinstance(cameras, PosedCamera):
         sizes = {(int(cameras.model.height), int(cameras.model.width))}
     elif isinstance(cameras, PinholeCamera):
-        sizes = set(zip(map(int, cameras.height.tolist()), map(int, cameras.width.tolist()), strict=True))
+        pairs = torch.stack([cameras.height, cameras.width], 1).tolist()
+        sizes = {(int(height), int(width)) for height, width in pairs}
     else:
         raise TypeError(f"cameras: expected a kornia PinholeCamera or a kgs.PosedCamera, got {type(cameras).__name__}")
     if len(sizes) != 1:
@@ -154,27 +155,37 @@ def intrinsics(cameras: Cameras) -> Tensor:
     return cameras.intrinsics if isinstance(cameras, PinholeCamera) else cameras.model.params
 
 
-def lenses(cameras: Cameras) -> list[Lens]:
-    """The cameras of a batch, one by one."""
+def times(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """The product of a matrix `(I, J)` with each of some vectors, `(*, J)` to `(*, I)`.
+
+    As a sum of products of numbers: unlike products of matrices, torch never rounds these to bfloat16 or TF32, as
+    `torch.autocast` and `torch.set_float32_matmul_precision` ask for. Of a pixel coordinate 8 bits would be left.
+    """
+    return (vectors[..., None, :] * matrix).sum(-1)
+
+
+def lenses(cameras: Cameras, size: tuple[int, int] | None = None) -> list[Lens]:
+    """The cameras of a batch, one by one; `size` is (height, width) of their images, where it is known."""
+    size = size or image_size(cameras)
     if isinstance(cameras, PinholeCamera):
-        return [_pinhole(cameras, c) for c in range(cameras.batch_size)]
+        return [_pinhole(cameras, c, size) for c in range(cameras.batch_size)]
     return [_modelled(cameras, c) for c in range(cameras.extrinsics.shape[0])]
 
 
-def _pinhole(cameras: PinholeCamera, c: int) -> Lens:
+def _pinhole(cameras: PinholeCamera, c: int, size: tuple[int, int]) -> Lens:
     with torch.inference_mode(False):  # autograd takes a clone of what was made in inference mode
         both = [x.clone() if x.is_inference() else x for x in (cameras.intrinsics, cameras.extrinsics)]
-    matrix, pose, *size = (x[c : c + 1] for x in (*both, cameras.height, cameras.width))
-    limits = tangent_limits(matrix[0].diagonal()[:2], matrix[0, :2, 2], *map(int, size))
+    matrix, pose = (x[c] for x in both)
+    limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], *size)
 
-    def pixels(matrix: Tensor, pose: Tensor, world: Tensor) -> Tensor:
-        found: Tensor = PinholeCamera(matrix, pose, *size).project(world[None])[0]
+    def pixels(points: Tensor) -> Tensor:
+        found: Tensor = convert_points_from_homogeneous(times(matrix[:3, :3], points))
         return found
 
     def jacobian(points: Tensor) -> Tensor:
-        return _perspective_jacobian(matrix[0, :2, :2], points, limits)
+        return _perspective_jacobian(matrix[:2, :2], points, limits)
 
-    return Lens(pose[0], lambda world, _: in_full_precision(pixels, matrix, pose, world), jacobian)
+    return Lens(pose, pixels, jacobian)
 
 
 def _modelled(cameras: PosedCamera, c: int) -> Lens:
@@ -205,7 +216,7 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
         return _reverse_jacobian(pixels, points)
 
     sees = None if plain else _before_fold(params.tolist(), brown_conrady)
-    return Lens(poses[c], lambda _, points: pixels(points), jacobian, parallel, sees)
+    return Lens(poses[c], pixels, jacobian, parallel, sees)
 
 
 def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor], Tensor] | None:
@@ -242,7 +253,7 @@ def _perspective_jacobian(k: Tensor, points: Tensor, limits: Tensor) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
     inverse = 1.0 / points[:, 2]
     tangents = [_held(points[:, i] * inverse, low, high) for i, (low, high) in enumerate(limits)]
-    last = -inverse[:, None] * in_full_precision(torch.matmul, torch.stack(tangents, 1), k.T)
+    last = -inverse[:, None] * times(k, torch.stack(tangents, 1))
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
 

@@ -133,11 +133,9 @@ def whitening(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> tuple[Tensor, 
 
 
 def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
-    """`(10, M)` for compositing: ln o; x, y; the coefficients of dx^2, dx dy, dy^2 in -q/2; two whitening vectors."""
-    ax, ay, bx, by = whitening(*variances(factors, eps2d))
+    """`(7, M)` for compositing: ln o; x, y; the two whitening vectors."""
     x, y = means2d.unbind(1)
-    quadratic = -0.5 * (ax * ax + bx * bx), -(ax * ay + bx * by), -0.5 * (ay * ay + by * by)
-    return torch.stack([opacities.log(), x, y, *quadratic, ax, ay, bx, by])
+    return torch.stack([opacities.log(), x, y, *whitening(*variances(factors, eps2d))])
 
 
 def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,8 +9,6 @@ import math
 import torch
 from torch import Tensor
 
-from .full_precision import in_full_precision
-
 SH_C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
@@ -45,5 +43,5 @@ def evaluate_harmonics(colors: Tensor, directions: Tensor) -> Tensor:
         value = SH_C0 * colors[:, 0] + 0.5
     else:
         basis = harmonics_basis(directions, math.isqrt(colors.shape[1]) - 1)
-        value = in_full_precision(torch.bmm, basis[:, None], colors)[:, 0] + 0.5
+        value = (basis[:, :, None] * colors).sum(1) + 0.5
     return value.masked_fill(value < 0, 0.0)  # the gradient of clamp_min at 0 is not that of every torch

@@ -11,9 +11,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from .camera import Cameras, Lens, lenses
+from .camera import Cameras, Lens, lenses, times
 from .covariance import footprint_factors, rotation_matrices, variances
-from .full_precision import full_precision, in_full_precision
 from .harmonics import evaluate_harmonics
 from .types import Gaussians, ProjectedGaussians, RasterOptions
 
@@ -24,11 +23,10 @@ def project_torch(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`kgs.project` in torch, for every camera, device and dtype; trusts its arguments."""
-    device, views, finite = gaussians.means.device, lenses(cameras), finite_gaussians(gaussians)
+    device, views, finite = gaussians.means.device, lenses(cameras, size), finite_gaussians(gaussians)
     reach = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
     touches, near = partial(_touches_image, size, options.eps2d, reach), options.near_plane
-    with full_precision(device):
-        parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]
+    parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]
     counts = torch.tensor([part[0].shape[0] for part in parts], device=device)
     camera_ids = torch.repeat_interleave(torch.arange(len(parts), device=device), counts)
     joined = [field[0] if len(parts) == 1 else torch.cat(field) for field in zip(*parts, strict=True)]
@@ -48,7 +46,7 @@ def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussian
     normal = turned.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
     with torch.no_grad():
         means, away = gaussians.means.index_select(0, ids), []
-        for c, lens in enumerate(lenses(cameras)):
+        for c, lens in enumerate(lenses(cameras, projected.image_size)):
             away.append(_directions(_rows(means, (projected.camera_ids == c).nonzero()[:, 0]), lens))
         backwards = (normal * torch.cat(away)).sum(1, keepdim=True) > 0
     return torch.where(backwards, -normal, normal)
@@ -71,17 +69,17 @@ def _project_one(
     """The fields gaussian_ids to colors of `ProjectedGaussians` for one camera."""
     rotation, translation = lens.extrinsics[:3, :3], lens.extrinsics[:3, 3]
     with torch.no_grad():
-        ids = ((gaussians.means @ rotation[2] + translation[2] > near_plane) & finite).nonzero()[:, 0]
+        ids = ((times(rotation[2:], gaussians.means)[:, 0] + translation[2] > near_plane) & finite).nonzero()[:, 0]
         if lens.sees is not None:
-            seen = lens.sees(torch.addmm(translation, _rows(gaussians.means, ids), rotation.T))
+            seen = lens.sees(times(rotation, _rows(gaussians.means, ids)) + translation)
             ids = _rows(ids, seen.nonzero()[:, 0])
 
     def footprints(ids: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         means = _rows(gaussians.means, ids)
-        points = in_full_precision(torch.addmm, translation, means, rotation.T)
-        rows = in_full_precision(torch.matmul, lens.jacobian(points), rotation)
+        points = times(rotation, means) + translation
+        rows = times(rotation.T, lens.jacobian(points))
         factors = footprint_factors(rows, _rows(gaussians.quats, ids), _rows(gaussians.scales, ids))
-        return means, points, lens.project(means, points), factors
+        return means, points, lens.project(points), factors
 
     means, points, means2d, factors = footprints(ids)
     with torch.no_grad():
@@ -124,7 +122,7 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
     inverse, turned = inverse_turn(lens.extrinsics)
     if lens.parallel and turned:
         return inverse[:, 2].expand_as(means)
-    camera = in_full_precision(torch.mv, inverse, lens.extrinsics[:3, 3])
+    camera = times(inverse, lens.extrinsics[:3, 3])
     offsets = inverse[:, 2].expand_as(means) if lens.parallel else means + camera
     offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # the squares of 1e20 would overflow
     unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
@@ -134,7 +132,7 @@ def _directions(means: Tensor, lens: Lens) -> Tensor:
 def inverse_turn(extrinsics: Tensor) -> tuple[Tensor, bool]:
     """The inverse of a pose's 3x3 block, and whether that is a rotation, whose inverse is its transpose."""
     rotation = extrinsics[:3, :3]
-    product = rotation.detach() @ rotation.detach().T
+    product = times(rotation.detach(), rotation.detach())
     turned = bool(((product - torch.diag_embed(product.new_ones(3))).abs() <= 1e-3).all())
     return rotation.T if turned else torch.linalg.inv(rotation), turned
 

@@ -10,8 +10,8 @@ from oracles import near_threshold
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kgs import backends, composite, project
-from kgs.raster.tasks import Slice
-from kgs.raster.tiles import bin_to_tiles
+from kgs.raster import compositing
+from kgs.raster.binning import bin_to_tiles
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -111,15 +111,15 @@ def torch_alone(monkeypatch):
 
 
 @pytest.fixture
-def made(monkeypatch, torch_alone):
-    """The slices that are made from here on."""
-    found, init = [], Slice.__init__
+def drawn(monkeypatch, torch_alone):
+    """The depth slices that are drawn from here on, and whether their alphas were kept."""
+    found, draw = [], compositing.DepthSlice.draw
 
-    def noted(part, *arguments):
-        init(part, *arguments)
-        found.append(part)
+    def noted(part, canvas, keep, keep_alphas):
+        found.append((part, keep_alphas))
+        return draw(part, canvas, keep, keep_alphas)
 
-    monkeypatch.setattr(Slice, "__init__", noted)
+    monkeypatch.setattr(compositing.DepthSlice, "draw", noted)
     return found
 
 
@@ -138,35 +138,31 @@ def tightest(projected, features, threshold=TH, **options):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_byte_budget_changes_nothing(dtype, made):
+def test_byte_budget_changes_nothing(dtype, drawn):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     free, free_gradients = loss_and_gradients(projected, colors, weights)
-    assert len(made) == 1
+    assert len(drawn) == 1
     budget = tightest(projected, colors)
-    made.clear()
+    drawn.clear()
     tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
-    assert len(made) >= 2 * 3, "row slices, forward and again backward"
+    assert len(drawn) >= 2 * 3, "row slices, forward and again backward"
     assert torch.equal(tight, free)
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_alphas_made_again_are_those_that_were_kept(dtype, made, monkeypatch):
-    monkeypatch.setattr("kgs.raster.tasks.buffer_bytes", lambda *_: 2**20)  # so that groups stay the same
+def test_alphas_made_again_are_those_that_were_kept(dtype, drawn, monkeypatch):
+    settings = dataclasses.replace(compositing.SETTINGS["cpu"], pairs=2**12)  # steps that fit whatever the budget
+    monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
-
-    def steps():
-        return [step for part in made for group in part.groups for step in group.steps]
-
     kept, kept_gradients = loss_and_gradients(projected, colors, weights)
-    assert len(steps()) > 0
-    assert all(step.alpha is not None for step in steps())
+    assert all(keep_alphas for _, keep_alphas in drawn)
     budget = 2**30
-    while any(step.alpha is not None for step in steps()):  # until there is room for the lists alone
-        made.clear()
+    while any(keep_alphas for _, keep_alphas in drawn):  # until there is room for the lists alone
+        drawn.clear()
         budget = int(0.9 * budget)
         lean, lean_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
-    assert len(made) == 1
+    assert len(drawn) == 1
     assert torch.equal(lean, kept)
     assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
 
@@ -174,7 +170,7 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, made, monkeypatch):
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
 @pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP), (TH, 0.1)])
 @pytest.mark.parametrize("tight", [False, True])
-def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, made, monkeypatch):
+def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, drawn, monkeypatch):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     opacities = projected.opacities.sqrt()  # some tiles get dark before the last layer
@@ -183,11 +179,12 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, made, monk
     median = composite(projected, colors, median_depth=True, **options).median_depth
     if tight:  # and in row slices
         options["max_bytes"] = tightest(projected, colors, thresholds[0])
-    made.clear()
+    drawn.clear()
     layers = 6 if thresholds[0] else 20  # without a threshold each of the 300 is in the list of each tile
-    monkeypatch.setattr("kgs.raster.torch_passes._LAYERS", layers)
+    settings = dataclasses.replace(compositing.SETTINGS["cpu"], layers=layers)
+    monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)
     layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
-    entries = [len(part.lists.entries) for part in made]
+    entries = [len(part.lists.entries) for part, _ in drawn]
     assert len(entries) > (6 if tight else 3)
     if thresholds[1] == 0.1:  # what lies behind the end of the light is not listed
         assert sum(entries) < 0.9 * (2 if tight else 1) * len(bin_to_tiles(projected).entries)
@@ -199,16 +196,7 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, made, monk
 @pytest.fixture
 def as_on_a_gpu(monkeypatch, torch_alone):
     """Scans and sizes of steps as a GPU gets them."""
-    made = Slice.__init__
-
-    def init(part, *arguments):
-        made(part, *arguments)
-        part.by_layer = False
-
-    monkeypatch.setattr(Slice, "__init__", init)
-    monkeypatch.setattr("kgs.raster.tasks._STEP_PAIRS", {"cpu": 2**24})
-    monkeypatch.setattr("kgs.raster.tasks._PAIRS_TO_SHARE", 2**60)
-    monkeypatch.setattr("kgs.raster.tasks.choose_chunk_size", lambda _: 32)
+    monkeypatch.setitem(compositing.SETTINGS, "cpu", compositing.SETTINGS["cuda"])
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])
@@ -236,9 +224,7 @@ class _Launches(TorchDispatchMode):
         return result
 
 
-def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu, monkeypatch):
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)  # the counter sees this thread alone
-
+def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu):
     def launches(n, size):
         projected, colors, weights = scene_footprints(n, 1, torch.float32, size, image_size=80)
         with _Launches() as mode:

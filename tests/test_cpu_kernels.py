@@ -10,7 +10,7 @@ from compositing_checks import TH, many_bands  # noqa: F401 - a fixture for all
 from kernel_checks import assembly, avx_assembly
 from tile_checks import scene
 
-from kgs.raster.tiles import bin_to_tiles
+from kgs.raster.binning import bin_to_tiles
 
 nb = pytest.importorskip("numba")
 

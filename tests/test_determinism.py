@@ -8,7 +8,6 @@ from factories import random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 
 from kgs import DropGaussian, GaussianRenderer, Gaussians
-from kgs.raster.threads import run_all
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -58,22 +57,6 @@ def test_one_and_two_threads_are_equal(threads, dtype, size, n):
     first = run(dtype, n, size=size)
     threads(2)
     assert_equal_bits(run(dtype, n, size=size), first)
-
-
-@pytest.mark.parametrize("pieces", [1, 8])
-def test_each_piece_of_work_has_one_thread_of_torch(threads, pieces):
-    threads(2)
-    seen = []
-
-    def make_worker():
-        def work(_):
-            torch.ones(100000).sum()  # the first parallel operator of a thread sets its number of threads up
-            seen.append(torch.get_num_threads())
-
-        return work
-
-    run_all(range(pieces), make_worker, torch.device("cpu"))
-    assert seen == [1] * pieces
 
 
 def test_one_and_two_threads_are_equal_under_a_byte_budget(threads):

@@ -97,13 +97,13 @@ class Blobs(nn.Module):
         return ((light * alphas) @ self.colors).T.reshape(1, 3, self.size, self.size)
 
 
-def photo():
-    return Blobs(nn.Identity(), seed=5)().detach()
+def photo(dtype=torch.float32):
+    return Blobs(nn.Identity(), seed=5).to(dtype)().detach()
 
 
 def fit(network, step=None, steps=30):
     """A plain training loop; returns the losses."""
-    target = photo()
+    target = photo(network.places.dtype)
     adam = torch.optim.Adam(network.parameters(), lr=0.05)
 
     def plain(network):
@@ -132,11 +132,12 @@ def test_a_foreign_trainer_needs_one_line(seed):
 
 
 @pytest.mark.parametrize("seed", [pytest.param(None, marks=pytest.mark.slow), 3])
-def test_a_compiled_step_is_the_step(seed):
+@pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
+def test_a_compiled_step_is_the_step(seed, dtype):
     def run(compiled):
         torch._dynamo.reset()
         torch.manual_seed(0)
-        network, target = Blobs(DropGaussian(p=0.3, seed=seed)), photo()
+        network, target = Blobs(DropGaussian(p=0.3, seed=seed)).to(dtype), photo(dtype)
 
         def step(network):
             return photometric_loss(network(), target)
@@ -145,8 +146,11 @@ def test_a_compiled_step_is_the_step(seed):
 
     (losses, network), (expected, eager) = run(True), run(False)
     assert losses == pytest.approx(expected, abs=1e-6)
-    for one, two in zip(network.parameters(), eager.parameters(), strict=True):
-        torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
+    # Adam divides a gradient by its own size: where one is nearly 0, its rounding moves the parameter. In float64 that
+    # is little; in float32 it depends on the processor's order of sums, here on that of a product of matrices
+    if dtype == torch.float64:
+        for one, two in zip(network.parameters(), eager.parameters(), strict=True):
+            torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 
 
 # -- replicas, as nn.DataParallel makes them in each step ----------------------------------------------------------

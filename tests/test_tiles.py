@@ -6,7 +6,7 @@ from factories import footprints, random_camera, random_gaussians
 from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, scene
 
 from kgs import Gaussians, project
-from kgs.raster.tiles import Reach, bin_to_tiles
+from kgs.raster.binning import Reach, bin_to_tiles
 
 
 def needles(seed, ratio, size=(45, 67)):

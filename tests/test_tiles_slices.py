@@ -5,7 +5,7 @@ import torch
 from factories import footprints
 from tile_checks import THRESHOLD, check_structure, dots, listed, scene, tiles_of_entries
 
-from kgs.raster.tiles import Reach, bin_to_tiles
+from kgs.raster.binning import Reach, bin_to_tiles
 
 # -- many tiles ----------------------------------------------------------------------------------------------------
 
@@ -61,8 +61,8 @@ def test_a_batch_of_cameras_is_its_cameras_one_by_one():
 def test_row_slices_cover_all_rows_within_the_budget_and_together_are_the_whole(share, max_spans):
     projected = scene(0, cameras=3)
     reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    needs = 5 * reach.spans_per_row + 7 * reach.entries_per_row
-    budget = max(int(share * needs.sum()), int(needs.max()))
+    needs = [5 * spans + 7 * entries for spans, entries in zip(reach.spans_per_row, reach.entries_per_row, strict=True)]
+    budget = max(int(share * sum(needs)), max(needs))
     slices = reach.row_slices(budget, 5, 7)
     assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
     assert slices[-1][1] == 3 * whole.grid[0]
@@ -122,13 +122,13 @@ def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, r
 def test_spans_and_entries_per_row_are_what_the_rows_hold(max_spans):
     projected = scene(0, cameras=2)
     reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    assert torch.equal(reach.entries_per_row, whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1))
+    assert reach.entries_per_row == whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1).tolist()
     assert reach.num_entries == len(whole.entries)
-    assert reach.spans_per_row.tolist() == [len(reach.spans(row, row + 1).ranks) for row in range(12)]
+    assert reach.spans_per_row == [len(reach.spans(row, row + 1).ranks) for row in range(12)]
 
 
 def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
     reach = Reach(scene(0), 8, THRESHOLD)
-    most = int(reach.entries_per_row.max())
+    most = max(reach.entries_per_row)
     with pytest.raises(ValueError, match=rf"max_bytes: one row of tiles needs {most} bytes, .* got {most - 1}"):
         reach.row_slices(most - 1, 0, 1)

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from kgs.camera import Cameras
 from kgs.projection import project_torch
-from kgs.raster.torch_compositing import TorchCompositing
+from kgs.raster.compositing import TorchCompositing
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from .base import Backend, Compositor

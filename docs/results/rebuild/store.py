@@ -228,7 +228,7 @@ def settings_of_a_gpu() -> Iterator[None]:
         except ImportError:
             from kgs.raster import compositing
 
-            stack.enter_context(compositing.settings_of("cuda"))
+            stack.enter_context(mock.patch.dict(compositing.SETTINGS, cpu=compositing.SETTINGS["cuda"]))
             yield
             return
         stack.enter_context(mock.patch.dict(tasks._STEP_PAIRS, {"cpu": tasks._STEP_PAIRS["cuda"]}))

@@ -1,4 +1,4 @@
-"""Kernels that find which Gaussian reaches which tile, front to back; spans as in `kgs.raster.tiles`.
+"""Kernels that find which Gaussian reaches which tile, front to back; spans as in `kgs.raster.binning`.
 
 In depth order, for each of the n Gaussians that reach a row of tiles:
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.backends.base import Inputs
-from kgs.raster.tiles import row_slices
+from kgs.raster.binning import row_slices
 from kgs.types import ProjectedGaussians, RasterOptions
 
 from . import compositing_kernels as kernels

@@ -1,20 +1,19 @@
-"""Which Gaussian reaches which tile, front to back.
+"""The lists of the tiles: which Gaussian reaches which tile, front to back.
 
 A Gaussian reaches a pixel where alpha = o exp(-q/2) is at least the threshold: inside the ellipse q <= 2 ln(o/th).
 For each row of tiles the columns that the ellipse touches are closed form, because an ellipse is convex: its rightmost
 point within a horizontal strip lies at its own rightmost point if that is in the strip, else on the strip's nearer
 edge. Every tile of this span is touched, every other is not; no tile has to be tested.
 
-Rows of tiles are numbered through all cameras.
+Rows of tiles are numbered through all cameras. On a GPU each question for a number waits until all work is done, so
+sizes that follow from others are computed on the host.
 """
 
-import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from kgs.covariance import variances
@@ -48,8 +47,8 @@ class TileLists:
     @property
     def gaussian_offsets(self) -> Tensor:
         """Where the entries of each of `ids` begin in `by_gaussian`, `(n,)` int64; computed at each call."""
-        counts = torch.bincount(self.entries, minlength=self.ids.shape[0])
-        return torch.cumsum(counts, 0) - counts
+        sorted_entries = self.entries.index_select(0, self.by_gaussian)
+        return torch.searchsorted(sorted_entries, _arange(self.ids))
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,9 @@ class Spans:
     first: Tensor  # first column
     counts: Tensor  # columns, may be 0
 
-    def take(self, where: Tensor | slice) -> Self:
+    def take(self, where: slice) -> Self:
         """Some of the spans."""
-        found = {k: x[where] if isinstance(where, slice) else x.index_select(0, where) for k, x in vars(self).items()}
-        return replace(self, **found)
+        return replace(self, **{name: value[where] for name, value in vars(self).items()})
 
 
 class Reach:
@@ -75,7 +73,7 @@ class Reach:
     Attributes:
         ids: `(n,)`, rows of `projected` that reach a tile, in depth order; equal depths keep their order.
         total_rows: R, rows of tiles of all cameras.
-        spans_per_row, entries_per_row: `(R,)` int64.
+        spans_per_row, entries_per_row: how many each of the R rows has.
         num_spans, num_entries: of all rows.
     """
 
@@ -106,33 +104,36 @@ class Reach:
         """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
         ends, n = torch.cumsum(self._num_rows, 0), self.ids.shape[0]
         self.num_spans = int(ends[-1]) if n else 0
+        self._all: Spans | None = None
         cuts = range(max_spans, self.num_spans, max_spans)
-        bounds = [0, *(torch.searchsorted(ends, ends.new_tensor(cuts)).unique().tolist() if cuts else []), n]
-        self.entries_per_row, self._all, up_to = self.ids.new_zeros(self.total_rows), None, []
-        self.spans_per_row, self.num_entries = self.entries_per_row, 0
+        inner = torch.searchsorted(ends, ends.new_tensor(cuts)).tolist() if cuts else []
+        bounds = [0, *sorted(set(inner) - {0, n}), n]
+        per_row = ends.new_zeros(2, self.total_rows)  # spans, entries
+        up_to = []
         for low, high in pairwise(bounds):
             spans = self.spans(0, self.total_rows, low, high)
-            self.spans_per_row = self.spans_per_row + torch.bincount(spans.rows, minlength=self.total_rows)
-            self.entries_per_row.index_add_(0, spans.rows, spans.counts.long())
-            last = ends[low:high] - 1  # span of each Gaussian
-            up_to.append(torch.cumsum(spans.counts, 0).index_select(0, last - ends[low - 1] if low else last))
-            if low:
-                up_to[-1] += self.num_entries
-            self.num_entries = int(self.entries_per_row.sum())
+            last_spans = ends[low:high] - 1 - (ends[low - 1] if low else 0)
+            up_to.append(torch.cumsum(spans.counts, 0).index_select(0, last_spans) + per_row[1].sum())
+            added = torch.stack([torch.ones_like(spans.counts), spans.counts]).long()
+            per_row.index_add_(1, spans.rows, added)
             self._all = spans if len(bounds) == 2 else None
-        self._entries_up_to = torch.cat(up_to) if len(up_to) > 1 else up_to[0]
+        self._entries_up_to = torch.cat(up_to)
+        self.spans_per_row, self.entries_per_row = per_row.tolist()
+        self.num_entries = sum(self.entries_per_row)
 
     def row_slices(self, max_bytes: int, per_span: int, per_entry: int) -> list[tuple[int, int]]:
         """Consecutive rows whose spans and entries take at most `max_bytes` together; an error where one takes more."""
-        needs = self.spans_per_row * per_span + self.entries_per_row * per_entry
-        return row_slices(needs.tolist(), max_bytes)
+        counts = zip(self.spans_per_row, self.entries_per_row, strict=True)
+        return row_slices([spans * per_span + entries * per_entry for spans, entries in counts], max_bytes)
 
     def depth_slices(self, layers: int) -> list[tuple[int, int]]:
         """Consecutive ranges of `ids`, nearest first, of about `layers` entries per tile each."""
-        count = max(1, round(self.num_entries / max(1, layers * self.total_rows * self.grid[1])))
+        n, count = self.ids.shape[0], round(self.num_entries / max(1, layers * self.total_rows * self.grid[1]))
+        if count <= 1:
+            return [(0, n)]
         targets = torch.arange(1, count, device=self.ids.device) * (self.num_entries // count)
-        cuts = torch.searchsorted(self._entries_up_to, targets).unique().tolist()
-        return list(pairwise([0, *(cut for cut in cuts if cut > 0), self.ids.shape[0]]))
+        cuts = torch.searchsorted(self._entries_up_to, targets).tolist()
+        return list(pairwise([0, *sorted(set(cuts) - {0, n}), n]))
 
     def spans(self, begin: int, end: int, low: int = 0, high: int | None = None) -> Spans:
         """The spans of the Gaussians `ids[low:high]` in the rows `begin` to `end` (exclusive)."""
@@ -172,27 +173,24 @@ class Reach:
         They hold a depth slice, the range `ranks` of `ids`, or all; those of the tiles that are not `live` are empty.
         """
         low, high = ranks or (0, self.ids.shape[0])
-        if (low, high) != (0, self.ids.shape[0]):
+        if (low, high) == (0, self.ids.shape[0]):
+            size = sum(self.entries_per_row[begin:end])
+        else:
             cuts = torch.searchsorted(spans.ranks, torch.tensor([low, high], device=self.ids.device)).tolist()
             spans = spans.take(slice(*cuts))
-        columns = self.grid[1]
-        if live is not None:
-            alive = F.pad(torch.cumsum(live.int(), 0, dtype=torch.int32), (1, 0))
-            left = (spans.rows - begin) * columns + spans.first
-            spans = spans.take(
-                (alive.index_select(0, left + spans.counts) > alive.index_select(0, left)).nonzero()[:, 0]
-            )
-        counts, num_tiles = spans.counts, (end - begin) * columns
+            size = int(spans.counts.sum(dtype=torch.int64))
+        columns, counts = self.grid[1], spans.counts
         # in the order of the Gaussians: entry e of a span is tile (row, first + e)
         start = torch.cumsum(counts, 0, dtype=torch.int32) - counts
-        span = torch.repeat_interleave(_arange(counts), counts, output_size=int(counts.sum(dtype=torch.int64)))
+        span = torch.repeat_interleave(_arange(counts), counts, output_size=size)
         tiles = _arange(span) + ((spans.rows - begin) * columns + spans.first - start).index_select(0, span)
         entries = (spans.ranks - low).index_select(0, span)
         if live is not None:
             inside = live.index_select(0, tiles).nonzero()[:, 0]
             tiles, entries = tiles.index_select(0, inside), entries.index_select(0, inside)
+        num_tiles = (end - begin) * columns
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
-        offsets = F.pad(torch.cumsum(torch.bincount(keys, minlength=num_tiles), 0), (1, 0))
+        offsets = torch.searchsorted(keys, torch.arange(num_tiles + 1, dtype=keys.dtype, device=keys.device))
         entries, ids = entries.index_select(0, order), self.ids[low:high]
         return TileLists(self.tile_size, self.grid, begin * columns, offsets, entries, ids, order)
 
@@ -220,22 +218,6 @@ def bin_to_tiles(
     """The lists of all tiles of all cameras at once, see `Reach`."""
     reach = Reach(projected, tile_size, alpha_threshold)
     return reach.lists(reach.spans(0, reach.total_rows), 0, reach.total_rows)
-
-
-def to_images(tiles: Tensor, grid: tuple[int, int], image_size: tuple[int, int]) -> Tensor:
-    """`(C * rows * columns, F, P)` to `(C, F, H, W)`."""
-    (rows, columns), size, (height, width) = grid, math.isqrt(tiles.shape[2]), image_size
-    cameras, channels = tiles.shape[0] // (rows * columns), tiles.shape[1]
-    images = tiles.view(cameras, rows, columns, channels, size, size).permute(0, 3, 1, 4, 2, 5)
-    return images.reshape(cameras, channels, rows * size, columns * size)[:, :, :height, :width].clone()
-
-
-def to_tiles(images: Tensor, grid: tuple[int, int], size: int) -> Tensor:
-    """The inverse of `to_images`; pixels beyond the image are 0."""
-    (rows, columns), (cameras, channels, height, width) = grid, images.shape
-    images = F.pad(images, (0, columns * size - width, 0, rows * size - height))
-    tiles = images.view(cameras, channels, rows, size, columns, size).permute(0, 2, 4, 1, 3, 5)
-    return tiles.reshape(cameras * rows * columns, channels, size * size)
 
 
 def _arange(like: Tensor) -> Tensor:

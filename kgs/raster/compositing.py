@@ -1,0 +1,396 @@
+"""Compositing in torch, for every device and dtype; formulas as in `kgs.raster`.
+
+Tiles are the last dimension of all tensors here, and P the pixels of a tile: an operator works on the same pixel of
+many tiles side by side. A row slice is drawn in depth slices; within one, tiles are sorted by the length of their lists
+and cut into steps: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
+
+Nothing here is a product of matrices, which torch may be told to round (`torch.set_float32_matmul_precision`,
+`torch.autocast`), and which adds in an order that depends on sizes. Nothing is added atomically. On a CPU the layers of
+a pixel are added one by one, so that no bit of the image depends on how they were cut into steps.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kgs.covariance import footprint_table, moment_gradients
+from kgs.types import ProjectedGaussians, RasterOptions
+
+from .binning import Reach, TileLists
+
+ALPHA_MAX = 0.99
+
+
+@dataclass(frozen=True)
+class DeviceSettings:
+    """How work is cut for a kind of device."""
+
+    pairs: int  # of a Gaussian and a pixel in a step, at most
+    layers: int  # entries per tile in a depth slice: few pixels see more before their light is gone
+    by_layer: bool  # scans are made layer by layer: least memory is passed, and many operators are called
+    may_ask: bool  # whether a question for a number is cheap; a GPU would have to finish all work before
+
+
+SETTINGS = {"cpu": DeviceSettings(2**19, 192, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
+_LEAST_LAYERS = 8  # of a step with many tiles
+_ARRAYS = 9  # numbers per pair that a step holds at the same time
+
+
+class TorchCompositing:
+    """A compositor for every device and dtype, see `kgs.backends.base.Compositor`."""
+
+    def __init__(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool,
+        chunk_size: int | None,
+    ) -> None:
+        self._settings = SETTINGS.get(features.device.type, SETTINGS["cuda"])
+        tile_size, number = options.tile_size or 8, features.element_size()
+        step_bytes = min(self._settings.pairs * _ARRAYS * number, options.max_bytes // 4)
+        budget = options.max_bytes - step_bytes
+        # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved light
+        per_span, per_entry = 32 + 16 * number, 80 + (8 + 2 * features.shape[1] + tile_size**2 // 8) * number
+        self._reach = Reach(projected, tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span)))
+        self._row_slices = self._reach.row_slices(budget, per_span, per_entry)
+        self._depth_slices = self._reach.depth_slices(self._settings.layers)
+        lists_bytes = per_entry * self._reach.num_entries + per_span * self._reach.num_spans // 4
+        self._spare = budget - lists_bytes if len(self._row_slices) == 1 else 0  # to keep alphas
+        self._image_size, self._eps2d = projected.image_size, projected.eps2d
+        self._depths = projected.depths.detach() if median_depth else None
+        self._cut = Cut(step_bytes // (_ARRAYS * number), chunk_size)
+        self._thresholds = Thresholds.of(options, features.dtype)
+
+    def forward(self, inputs: tuple[Tensor, ...], keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
+        """See `Compositor`: one row slice is kept, several are made again."""
+        keep = keep and len(self._row_slices) == 1
+        canvases, kept = zip(*(self._draw(inputs, rows, keep) for rows in self._row_slices), strict=True)
+        light, median, features = (torch.cat(x, 2) for x in zip(*canvases, strict=True))
+        grid, size = self._reach.grid, self._image_size
+        images = (to_images(features, grid, size), to_images(light, grid, size), to_images(median, grid, size))
+        return images, kept[0] if keep else None
+
+    def backward(
+        self,
+        inputs: tuple[Tensor, ...],
+        kept: Any,
+        grad_features: Tensor,
+        grad_transmittance: Tensor,
+        needs: tuple[bool, ...],
+    ) -> tuple[Tensor | None, ...]:
+        """See `Compositor`."""
+        reach = self._reach
+        grads, behind = (to_tiles(x, reach.grid, reach.tile_size) for x in (grad_features, grad_transmittance))
+        moments, width = any(needs[:3]), grads.shape[0] if needs[3] else 0
+        total = grads.new_zeros(reach.ids.shape[0], 6 * moments + width)  # of each Gaussian
+        for begin, end in self._row_slices:
+            light, slices = self._draw(inputs, (begin, end), keep=True)[1] if kept is None else kept
+            kept = None
+            tiles = slice(begin * reach.grid[1], end * reach.grid[1])
+            later = torch.where(light[0] > 0, behind[0, :, tiles], 0.0)
+            while slices:
+                (low, high), part = slices.pop()
+                total[low:high] += part.differentiate(grads[:, :, tiles], later, moments, width > 0)
+        found: tuple[Tensor | None, ...] = (None, None, None, total[:, total.shape[1] - width :])
+        if moments:
+            factors, opacities = (x.index_select(0, reach.ids) for x in inputs[1:3])
+            found = (*moment_gradients(total[:, :6], factors, opacities, self._eps2d), found[3])
+
+        def of_all(value: Tensor) -> Tensor:
+            return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, reach.ids, value)
+
+        return tuple(of_all(x) if needed and x is not None else None for x, needed in zip(found, needs, strict=True))
+
+    def _draw(self, inputs: tuple[Tensor, ...], rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
+        """A row slice, one depth slice after the other while light is left; and what `backward` wants."""
+        reach, spare, live = self._reach, self._spare, None
+        tiles, pixels = (rows[1] - rows[0]) * reach.grid[1], reach.tile_size**2
+        widths = (0 if self._depths is None else 1, inputs[3].shape[1])
+        median, features = (inputs[0].new_zeros(width, pixels, tiles) for width in widths)
+        canvas = (inputs[0].new_ones(1, pixels, tiles), median, features)
+        spans = reach.spans(*rows)
+        slices: list[tuple[tuple[int, int], DepthSlice]] = []
+        for ranks in self._depth_slices:
+            lists = reach.lists(spans, *rows, ranks, live)
+            part = DepthSlice(lists, self._gaussians(inputs, lists.ids), self._thresholds, self._settings, self._cut)
+            keep_alphas = keep and part.alpha_bytes <= spare
+            spare -= part.alpha_bytes * keep_alphas
+            part.draw(canvas, keep, keep_alphas)
+            if keep:
+                slices.append((ranks, part))
+            if ranks != self._depth_slices[-1]:
+                live = (canvas[0][0] > 0).any(0)
+                if not bool(live.any()):
+                    break
+        return canvas, (canvas[0], slices) if keep else None
+
+    def _gaussians(self, inputs: tuple[Tensor, ...], ids: Tensor) -> "Columns":
+        """What steps need of some Gaussians, and of a dummy at the end that is never seen."""
+        means2d, factors, opacities, features = (x.index_select(0, ids) for x in inputs)
+        table = F.pad(footprint_table(means2d, factors, opacities, self._eps2d), (0, 1))
+        table[0, -1] = -torch.inf
+        depths = None if self._depths is None else F.pad(self._depths.index_select(0, ids), (0, 1))
+        return Columns(table, F.pad(features.t(), (0, 1)), depths)
+
+
+Canvas = tuple[Tensor, Tensor, Tensor]  # transmittance (1, P, T), median depth (1 or 0, P, T), features (F, P, T)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A column of numbers for each Gaussian of a depth slice."""
+
+    table: Tensor  # (7, n + 1), see `kgs.covariance.footprint_table`
+    features: Tensor  # (F, n + 1)
+    depths: Tensor | None  # (n + 1,), where the median depth is wanted
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What counts as a layer; torch's threshold keeps what is strictly larger than a number."""
+
+    floor: float  # of the exponent: exp is slow where its result is denormal
+    alpha: float  # smaller alphas, and what the floor lets through, are 0
+    transmittance: float  # so much light is no light
+
+    @classmethod
+    def of(cls, options: RasterOptions, dtype: torch.dtype) -> "Thresholds":
+        """Those of `kgs.RasterOptions`."""
+        threshold, stop = options.alpha_threshold, options.transmittance_stop
+        floor = math.log(threshold) - 20 if threshold else math.log(torch.finfo(dtype).tiny) + 8
+        alpha = _below(max(threshold, 1.01 * math.exp(floor)), dtype)
+        return cls(floor, alpha, _below(stop, dtype) if stop else -1.0)
+
+
+@dataclass
+class Step:
+    """K layers of n tiles, and what the backward pass wants of them."""
+
+    tiles: slice  # of the sorted tiles
+    first: int  # position of the first layer in the lists
+    layers: int  # K
+    before: Tensor | None = field(default=None, repr=False)  # transmittance before the first layer, (P, n)
+    alpha: Tensor | None = field(default=None, repr=False)  # (K, P, n), where there is memory to keep it
+    ended: bool = False  # whether the light of a pixel may have ended
+
+
+@dataclass(frozen=True)
+class Cut:
+    """How lists are cut into steps."""
+
+    pairs: int  # of a Gaussian and a pixel, at most
+    layers: int | None  # K; None chooses
+
+    def __call__(self, lengths: Sequence[int], pixels: int) -> list[Step]:
+        """The steps of tiles with lists of these lengths, in descending order."""
+        most_tiles = max(1, self.pairs // (pixels * (self.layers or _LEAST_LAYERS)))
+        steps = []
+        for begin in range(0, len(lengths), most_tiles):
+            end, first = min(begin + most_tiles, len(lengths)), 0
+            while first < lengths[begin]:
+                while lengths[end - 1] <= first:
+                    end -= 1
+                # as many layers as a quarter of the lists still has: the longest take another step, with few tiles
+                fitting = max(self.pairs // (pixels * (end - begin)), 1)
+                wanted = max(lengths[begin + (end - begin) // 4] - first, fitting // 4)
+                layers = self.layers or min(wanted, fitting, lengths[begin] - first)
+                steps.append(Step(slice(begin, end), first, layers))
+                first += layers
+        return steps
+
+
+class DepthSlice:
+    """The tiles of a row slice with their entries of a depth slice, the longest list first."""
+
+    def __init__(
+        self, lists: TileLists, gaussians: Columns, thresholds: Thresholds, settings: DeviceSettings, cut: Cut
+    ) -> None:
+        self.lists, self._gaussians, self._thresholds, self._settings = lists, gaussians, thresholds, settings
+        # Sums along the layers of a GPU are not deterministic for torch
+        self._by_layer = settings.by_layer or torch.are_deterministic_algorithms_enabled()
+        lengths, order = torch.sort(lists.offsets.diff(), descending=True, stable=True)
+        counts = [length for length in lengths.tolist() if length > 0]
+        self._tiles = order[: len(counts)]
+        self._starts, self._ends = (x.index_select(0, self._tiles) for x in (lists.offsets[:-1], lists.offsets[1:]))
+        self._steps = cut(counts, lists.tile_size**2)
+        pairs = lists.tile_size**2 * sum(s.layers * (s.tiles.stop - s.tiles.start) for s in self._steps)
+        self.alpha_bytes = pairs * gaussians.table.element_size()  # to keep all alphas
+        self._entries = F.pad(lists.entries, (0, 1), value=lists.ids.shape[0])
+        # coordinates of the columns and rows of pixels of each tile, (side, tiles)
+        tile, side = self._tiles + lists.first_tile, torch.arange(lists.tile_size, device=order.device)
+        row = torch.div(tile, lists.grid[1], rounding_mode="floor")
+        corner = torch.stack([tile - row * lists.grid[1], row % lists.grid[0]]) * lists.tile_size
+        self._columns, self._rows = (corner[:, None] + side[:, None]).to(gaussians.table.dtype)
+        self._clamps = self._may(gaussians.table[0] > math.log(ALPHA_MAX))
+
+    def draw(self, canvas: Canvas, keep: bool, keep_alphas: bool) -> None:
+        """Add the layers to the tiles of a canvas, front to back."""
+        state = [x.index_select(2, self._tiles) for x in canvas]
+        for step in self._steps:
+            light, median, features = (x[:, :, step.tiles] for x in state)
+            _, ids = self._entries_of(step)
+            alpha = self._alphas(*self._offsets(step, ids))
+            layers = self._light(alpha, light[0])
+            ended = self._may(layers[-1] <= self._thresholds.transmittance)
+            if ended:  # T never grows, so cutting afterwards is cutting at each layer
+                F.threshold(layers, self._thresholds.transmittance, 0.0, inplace=True)
+            if keep:
+                step.before, step.alpha, step.ended = light[0].clone(), alpha if keep_alphas else None, ended
+            if self._gaussians.depths is not None:
+                crossing = (layers[:-1] >= 0.5) & (layers[1:] < 0.5)
+                depths = self._gaussians.depths.index_select(0, ids.view(-1)).view_as(ids)
+                median += (crossing * depths[:, None]).sum(0)
+            self._add(features, ids, alpha * layers[:-1])
+            light[0] = layers[-1]
+        for whole, part in zip(canvas, state, strict=True):
+            whole.index_copy_(2, self._tiles, part)
+
+    def differentiate(self, grads: Tensor, behind: Tensor, moments: bool, features: bool) -> Tensor:
+        """What each Gaussian gets: six moments of dL/d ln alpha about its centre, and dL/d features, `(n, 6 + F)`.
+
+        `grads` are dL/d features of the pixels, `(F, P, T)`. `behind` is V behind the last layer, `(P, T)`, and becomes
+        V before the first. Where `moments` or `features` are not wanted, their columns are left out.
+        """
+        lists, width = self.lists, 6 * moments + grads.shape[0] * features
+        own_grads, own_behind = grads.index_select(2, self._tiles), behind.index_select(1, self._tiles)
+        rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
+        while self._steps:
+            step = self._steps.pop()  # whose memory is free afterwards
+            positions, ids = self._entries_of(step)
+            pixels = own_grads[:, :, step.tiles]
+            found = self._step_gradients(step, ids, pixels, own_behind[:, step.tiles], moments, features)
+            rows.index_copy_(0, positions.view(-1), torch.stack(found, -1).view(-1, width))
+        behind.index_copy_(1, self._tiles, own_behind)
+        # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
+        return F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
+
+    def _step_gradients(
+        self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, moments: bool, features: bool
+    ) -> list[Tensor]:
+        """Six moments and dL/d features of the entries of a step, each `(K, n)`; `behind` moves before the step."""
+        table, dx, dy = self._offsets(step, ids)
+        alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
+        assert step.before is not None
+        light = self._light(alpha, step.before)
+        if step.ended:  # nothing is seen behind the end of the light
+            F.threshold(light, self._thresholds.transmittance, 0.0, inplace=True)
+            alpha.mul_(light[:-1].sign())
+        weights = alpha * light[:-1]
+        found = []
+        if moments:
+            value = torch.zeros_like(alpha)  # c . g
+            for color, grad in zip(self._features(ids), grads, strict=True):
+                value.addcmul_(color[:, None], grad)
+            later = self._later(alpha, light, weights, value, behind)
+            behind.copy_(later[0])
+            value.sub_(later[1:]).mul_(weights)
+            if self._clamps:  # no derivative where alpha is held at its maximum
+                value.mul_((ALPHA_MAX - alpha).sign_())
+            found += _moments(value, dx, dy)
+        if features:
+            found += [(weights * grad).sum(1) for grad in grads]
+        return found
+
+    def _entries_of(self, step: Step) -> tuple[Tensor, Tensor]:
+        """Where the entries of a step are in the lists, and their Gaussians, `(K, n)`; beyond a list the dummy."""
+        layers = torch.arange(step.first, step.first + step.layers, device=self._starts.device)
+        positions = self._starts[step.tiles] + layers[:, None]
+        positions = positions.where(positions < self._ends[step.tiles], self._entries.shape[0] - 1)
+        return positions, self._entries.index_select(0, positions.view(-1)).view_as(positions)
+
+    def _features(self, ids: Tensor) -> Tensor:
+        """`(F, K, n)`."""
+        return self._gaussians.features.index_select(1, ids.view(-1)).view(-1, *ids.shape)
+
+    def _offsets(self, step: Step, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Columns of the Gaussians `(7, K, n)`, and from these to columns and rows of pixels, `(K, side, n)`."""
+        table = self._gaussians.table.index_select(1, ids.view(-1)).view(-1, *ids.shape)
+        dx = self._columns[:, step.tiles] - table[1][:, None]
+        dy = self._rows[:, step.tiles] - table[2][:, None]
+        return table, dx, dy
+
+    def _alphas(self, table: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+        """Alphas `(K, P, n)`: the exponent is the sum of two squares, each linear in x and y."""
+        log_opacity, _, _, ax, ay, bx, by = table[:, :, None]
+        a = (ax * dx)[:, None] + (ay * dy)[:, :, None]
+        alpha = torch.addcmul(log_opacity[:, None], a, a, value=-0.5)
+        b = torch.add((bx * dx)[:, None], (by * dy)[:, :, None], out=a)
+        alpha.addcmul_(b, b, value=-0.5).clamp_(min=self._thresholds.floor).exp_()
+        if self._clamps:
+            alpha.clamp_(max=ALPHA_MAX)
+        return F.threshold(alpha, self._thresholds.alpha, 0.0, inplace=True).flatten(1, 2)
+
+    def _light(self, alpha: Tensor, before: Tensor) -> Tensor:
+        """The transmittance before each layer and after the last, `(K + 1, P, n)`, without the stop."""
+        if not self._by_layer:
+            return torch.cat([before[None], 1 - alpha]).cumprod_(0)
+        light = alpha.new_empty(alpha.shape[0] + 1, *alpha.shape[1:])
+        layers = light.unbind(0)
+        layers[0].copy_(before)
+        for k, layer in enumerate(alpha.unbind(0)):
+            torch.addcmul(layers[k], layers[k], layer, value=-1, out=layers[k + 1])
+        return light
+
+    def _add(self, features: Tensor, ids: Tensor, weights: Tensor) -> None:
+        """Add the layers `(K, P, n)` to the sums `(F, P, n)`."""
+        colors = self._features(ids)
+        if self._by_layer:
+            for color, weight in zip(colors.unbind(1), weights.unbind(0), strict=True):
+                features.addcmul_(color[:, None], weight)
+        else:
+            for total, color in zip(features, colors, strict=True):
+                total += (weights * color[:, None]).sum(0)
+
+    def _later(self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor) -> Tensor:
+        """V of each layer and behind the last, `(K + 1, P, n)`."""
+        if not self._by_layer:
+            # the light that comes from behind a layer over the light that gets there; both are 0 behind the end
+            seen = torch.cat([weights * value, (light[-1] * behind)[None]])
+            return seen.flip(0).cumsum_(0).flip(0).div_(light.clamp_(min=torch.finfo(light.dtype).tiny))
+        later = torch.empty_like(light)
+        layers = later.unbind(0)
+        layers[-1].copy_(behind)
+        for k in reversed(range(alpha.shape[0])):
+            torch.lerp(layers[k + 1], value[k], alpha[k], out=layers[k])
+        return later
+
+    def _may(self, condition: Tensor) -> bool:
+        """Whether a condition holds anywhere; where asking is dear, that it may."""
+        return not self._settings.may_ask or bool(condition.any())
+
+
+def _moments(slope: Tensor, dx: Tensor, dy: Tensor) -> list[Tensor]:
+    """Sums over the pixels of `slope` `(K, P, n)` times 1, x, y, xx, xy, yy about the Gaussian's centre, `(K, n)`."""
+    square = slope.unflatten(1, (dy.shape[1], dx.shape[1]))
+    columns, rows, turning = square.sum(1), square.sum(2), (square * dx[:, None]).sum(2)
+    x, y = columns * dx, rows * dy
+    return [columns.sum(1), x.sum(1), y.sum(1), (x * dx).sum(1), (turning * dy).sum(1), (y * dy).sum(1)]
+
+
+def to_images(tiles: Tensor, grid: tuple[int, int], image_size: tuple[int, int]) -> Tensor:
+    """`(F, P, C * rows * columns)` to `(C, F, H, W)`."""
+    (rows, columns), side, (height, width) = grid, math.isqrt(tiles.shape[1]), image_size
+    channels, cameras = tiles.shape[0], tiles.shape[2] // (rows * columns)
+    images = tiles.view(channels, side, side, cameras, rows, columns).permute(3, 0, 4, 1, 5, 2)
+    return images.reshape(cameras, channels, rows * side, columns * side)[:, :, :height, :width].clone()
+
+
+def to_tiles(images: Tensor, grid: tuple[int, int], side: int) -> Tensor:
+    """The inverse of `to_images`; pixels beyond the image are 0."""
+    (rows, columns), (cameras, channels, height, width) = grid, images.shape
+    images = F.pad(images, (0, columns * side - width, 0, rows * side - height))
+    tiles = images.view(cameras, channels, rows, side, columns, side).permute(1, 3, 5, 0, 2, 4)
+    return tiles.reshape(channels, side * side, cameras * rows * columns)
+
+
+def _below(value: float, dtype: torch.dtype) -> float:
+    """The largest number below `value`."""
+    return float(np.nextafter(np.dtype(str(dtype).removeprefix("torch.")).type(value), 0))
