@@ -7,10 +7,11 @@ Without Pillow sizes are those of the decoded images, which no bound holds for t
 
 import io
 import warnings
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -168,7 +169,7 @@ def _read_header_of_file(path: Path) -> Metadata:
         raise DataError(path, "", f"cannot be read ({error.strerror})") from error
 
 
-def _read_header(path: Path, file: io.BufferedIOBase, length: int) -> Metadata:
+def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
     """Size and tags of an image file of `length` bytes."""
     kind = _kind(path, file.read(_LONGEST_SIGNATURE))
     file.seek(0)
@@ -190,7 +191,7 @@ def _read_header(path: Path, file: io.BufferedIOBase, length: int) -> Metadata:
     return Metadata(size, tags)
 
 
-def _open(kind: str, file: io.BufferedIOBase) -> "Opened":
+def _open(kind: str, file: IO[bytes]) -> "Opened":
     """An image that Pillow has read the header of.
 
     The classes are called rather than `PIL.Image.open`, whose bound on pixels does not depend on the file's bytes.
@@ -200,8 +201,9 @@ def _open(kind: str, file: io.BufferedIOBase) -> "Opened":
     if kind == "HEIC":
         import pi_heif
 
-        return pi_heif.HeifImageFile(file)
-    classes = {
+        opened: Opened = pi_heif.HeifImageFile(file)
+        return opened
+    classes: dict[str, Callable[[IO[bytes]], Opened]] = {
         "PNG": PngImagePlugin.PngImageFile,
         "JPEG": JpegImagePlugin.JpegImageFile,
         "WebP": WebPImagePlugin.WebPImageFile,
@@ -277,8 +279,9 @@ def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
 def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     """RGB of a JPEG. What lies behind its end, such as a phone's video, is ignored."""
     if has_pillow():
-        image = _open("JPEG", io.BytesIO(data))
-        end = image.fp.tell()  # of the header of the first scan
+        file = io.BytesIO(data)
+        image = _open("JPEG", file)
+        end = file.tell()  # of the header of the first scan
         # Only progressive images need its last three bytes. Some phones leave them 0 in others, which decoders warn of.
         if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
             data = data[: end - 3] + b"\0\x3f\0" + data[end:]
