@@ -70,7 +70,7 @@ class FrameSet:
     frames: Sequence[Frame]  # all, or, where the files hold some out, those to choose training views from
     test: Sequence[Frame] | None = None  # those that the files hold out; None: every eighth by name
     published: Sequence[int] = ()  # positions of the published training views, taken when just as many are asked for
-    points: PointCloud = NO_POINTS  # first points that the layout always gives
+    points: PointCloud = NO_POINTS  # initial points that the layout always gives
     # the points of the scene's COLMAP model, if there is one, that at least two of the given frames see
     model_points: Callable[[Sequence[Frame]], PointCloud] | None = None
     notes: tuple[str, ...] = ()  # what the files say that is not used, one sentence each

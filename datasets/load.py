@@ -27,7 +27,7 @@ from .splits import TEST_EVERY, select_evenly, split_by_name
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
 _BORDER = "the photos have a dark border, left by undistortion: it is taken for part of the lens, not of the scene"
-_FINE_PIXELS = 1_000_000  # of the images for the first points: twice the width and height halves the error of depths
+_FINE_PIXELS = 1_000_000  # of the images for the initial points: twice the width and height halves the error of depths
 
 
 def load_scene(

@@ -80,8 +80,9 @@ class Views:
         """One view as a dict, which `torch.utils.data.DataLoader` collates; an IndexError where there is none.
 
         Returns:
-            image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.cameras` and `kgs.rasterization`
-            take them with `pixel_centers="integer"`, index, name, and mask `(1, H, W)` where there are masks.
+            image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.pinhole_cameras` and
+            `kgs.rasterization` take them with `pixel_centers="integer"`, index, name, and mask `(1, H, W)` where there
+            are masks.
         """
         if not -len(self) <= (given := operator.index(index)) < len(self):
             raise IndexError(f"index: expected a whole number below {len(self)}, the number of views, got {given}")
@@ -142,7 +143,7 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Training and test views in one world frame, with what the layout itself says about first points.
+    """Training and test views in one world frame, with what the layout itself says about initial points.
 
     Args:
         train: the views to fit. Nothing of a fit may depend on `test`.
@@ -153,7 +154,7 @@ class Scene:
         offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
         background: `(3,)`, the colour behind the scene, in [0, 1].
         root: the folder the scene was read from.
-        finer: the training views in more pixels, to find first points in; None where `train` is as fine as that.
+        finer: the training views in more pixels, to find initial points in; None where `train` is as fine as that.
         notes: what the files say that is not used, one sentence each, to be shown to the user.
     """
 

@@ -13,7 +13,7 @@ TYPE_CHECKING = False  # as type checkers know it: typing would be most of what 
 if TYPE_CHECKING:
     from typing import Any
 
-    from .camera import PosedCamera, cameras
+    from .camera import PosedCamera, pinhole_cameras
     from .densify import Densifier, DensifyReport
     from .drop import DropGaussian, drop_gaussian
     from .geometry import camera_extent
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering
 
 __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization", "project", "composite"]
-__all__ += ["Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering", "PosedCamera", "cameras"]
+__all__ += ["Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering", "PosedCamera", "pinhole_cameras"]
 __all__ += ["GaussianModel", "Densifier", "DensifyReport", "camera_extent", "save_ply", "load_ply"]
 __all__ += ["DataError", "TrainingDiverged"]
 
@@ -33,7 +33,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "PosedCamera": "camera",
-    "cameras": "camera",
+    "pinhole_cameras": "camera",
     "Densifier": "densify",
     "DensifyReport": "densify",
     "DropGaussian": "drop",

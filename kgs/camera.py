@@ -82,7 +82,9 @@ class Lens:
     sees: Callable[[Tensor], Tensor] | None = None  # whether camera points lie before the fold, (M,); None: all do
 
 
-def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers: str = "integer") -> PinholeCamera:
+def pinhole_cameras(
+    viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers: str = "integer"
+) -> PinholeCamera:
     """Kornia's pinhole cameras from matrices and plain sizes; differentiable.
 
     A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make a new one in each step.
@@ -105,7 +107,7 @@ def cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers
     Examples:
         >>> import torch, kgs
         >>> k = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]])
-        >>> kgs.cameras(torch.eye(4), k, width=32, height=24, pixel_centers="half").cx
+        >>> kgs.pinhole_cameras(torch.eye(4), k, width=32, height=24, pixel_centers="half").cx
         tensor([15.5000])
     """
     check_tensor("viewmats", viewmats)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .camera import cameras
+from .camera import pinhole_cameras
 from .renderer import blend
 from .stages import composite, project
 from .types import SH_SIZES, Gaussians, ProjectedGaussians, RasterOptions, check_tensor
@@ -138,7 +138,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
     check_tensor("means", means)
     if backgrounds is not None:
         check_tensor("backgrounds", backgrounds)
-    posed = cameras(viewmats, Ks, width, height, pixel_centers)
+    posed = pinhole_cameras(viewmats, Ks, width, height, pixel_centers)
     count, n = posed.batch_size, means.shape[0] if means.ndim else 0
     image = "RGB" in render_mode
     if colors is None and not image:

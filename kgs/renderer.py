@@ -43,7 +43,7 @@ class GaussianRenderer(nn.Module):
     Examples:
         >>> import torch, kgs
         >>> k = torch.tensor([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
-        >>> camera = kgs.cameras(torch.eye(4), k, width=32, height=24)
+        >>> camera = kgs.pinhole_cameras(torch.eye(4), k, width=32, height=24)
         >>> gaussians = kgs.Gaussians(
         ...     means=torch.tensor([[0.0, 0.0, 2.0]]), quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         ...     scales=torch.full((1, 3), 0.2), opacities=torch.tensor([0.9]), colors=torch.tensor([[1.0, 0.5, 0.0]]))
@@ -57,7 +57,7 @@ class GaussianRenderer(nn.Module):
         >>> optimizer = torch.optim.Adam([shift], lr=0.01)
         >>> for step in range(20):
         ...     pose = torch.eye(4) + torch.nn.functional.pad(shift, (3, 0, 0, 1))
-        ...     image = kgs.GaussianRenderer()(gaussians, kgs.cameras(pose, k, width=32, height=24)).image
+        ...     image = kgs.GaussianRenderer()(gaussians, kgs.pinhole_cameras(pose, k, width=32, height=24)).image
         ...     loss = (image - target).square().mean()
         ...     optimizer.zero_grad(); loss.backward(); optimizer.step()
         >>> bool(loss < 1e-3)

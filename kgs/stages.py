@@ -105,7 +105,7 @@ def composite(
         ...     means=torch.tensor([[0.0, 0.0, 2.0]]), quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         ...     scales=torch.full((1, 3), 0.2), opacities=torch.tensor([0.9]), colors=torch.zeros(1, 3))
         >>> k = torch.tensor([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
-        >>> projected = kgs.project(gaussians, kgs.cameras(torch.eye(4), k, width=32, height=24))
+        >>> projected = kgs.project(gaussians, kgs.pinhole_cameras(torch.eye(4), k, width=32, height=24))
         >>> kgs.composite(projected, torch.rand(len(projected), 8)).features.shape
         torch.Size([1, 8, 24, 32])
     """

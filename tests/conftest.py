@@ -16,7 +16,7 @@ from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  
 
 from kgs import backends
 from kgs.datasets import synthetic_scene
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.io import film
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
@@ -143,7 +143,7 @@ def points():
     """150 random points before its cameras."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(150, 3, generator=generator) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 3.0])
-    return FirstPoints(points, torch.rand(150, 3, generator=generator), "random")
+    return InitialPoints(points, torch.rand(150, 3, generator=generator), "random")
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Scenes for tests of first points: planes warped by homographies (the true depth is known), flat pictures, tracks."""
+"""Scenes for tests of initial points: planes warped by homographies (the true depth is known), flat images, tracks."""
 
 from __future__ import annotations
 

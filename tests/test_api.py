@@ -30,7 +30,7 @@ INVENTORY = {
         "RasterOptions",
         "TrainingDiverged",
         "camera_extent",
-        "cameras",
+        "pinhole_cameras",
         "composite",
         "drop_gaussian",
         "load_ply",

@@ -1,4 +1,4 @@
-"""The measures of first points in closed form, on a plane and on the synthetic scene, and their program."""
+"""The measures of initial points in closed form, on a plane and on the synthetic scene, and their program."""
 
 from __future__ import annotations
 

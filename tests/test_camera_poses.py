@@ -29,7 +29,7 @@ def dot(points, dtype=torch.float64):
     return Gaussians(*(value.to(dtype) for value in values))
 
 
-# --- kgs.cameras ------------------------------------------------------------------------------------------------
+# --- kgs.pinhole_cameras ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("side", [3, 4])
@@ -41,19 +41,19 @@ def test_matrices_become_kornias_cameras(side, count):
     if count is not None:
         poses[:, 2, 3] = torch.arange(count)
     for ks in (k, k[None], k.repeat(count or 1, 1, 1)):
-        made = kgs.cameras(poses, ks, 32, 24)
+        made = kgs.pinhole_cameras(poses, ks, 32, 24)
         assert made.batch_size == (count or 1)
         assert torch.equal(made.camera_matrix, torch.tensor(K).expand(count or 1, 3, 3))
         assert torch.equal(made.intrinsics[:, 3], torch.tensor([[0.0, 0, 0, 1]]).expand(count or 1, 4))
         assert torch.equal(made.extrinsics, poses.reshape(-1, 4, 4))
         assert (made.height.tolist(), made.width.tolist()) == ([24] * (count or 1), [32] * (count or 1))
-    half = kgs.cameras(poses, k, 32, 24, pixel_centers="half")
+    half = kgs.pinhole_cameras(poses, k, 32, 24, pixel_centers="half")
     assert (half.cx[0], half.cy[0], half.fx[0]) == (15.5, 11.5, 30.0)
 
 
 def test_cameras_are_differentiable():
     pose, k = torch.eye(4, requires_grad=True), torch.tensor(K, requires_grad=True)
-    made = kgs.cameras(pose, k, 32, 24, pixel_centers="half")
+    made = kgs.pinhole_cameras(pose, k, 32, 24, pixel_centers="half")
     (made.extrinsics.sum() + made.intrinsics[:, :3, :3].square().sum()).backward()
     assert torch.equal(pose.grad, torch.ones(4, 4))
     expected = torch.tensor(K)
@@ -77,7 +77,7 @@ def test_cameras_are_differentiable():
 def test_wrong_matrices_and_sizes_are_named(name, error, change):
     arguments = {"viewmats": torch.eye(4), "Ks": torch.eye(3), "width": 32, "height": 24} | change
     with pytest.raises(error, match=rf"^{name}: expected"):
-        kgs.cameras(**arguments)
+        kgs.pinhole_cameras(**arguments)
 
 
 # --- nothing in view --------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ def recover(render, parameters, target, steps=50):
 def test_pose_and_focal_length_are_optimised_with_cameras_made_in_the_loop():
     gaussians, renderer = random_gaussians(30, 0, torch.float32, None), GaussianRenderer()
     k, truth = torch.tensor(K), torch.eye(4)
-    target = renderer(gaussians, kgs.cameras(truth, k, 32, 24)).image
+    target = renderer(gaussians, kgs.pinhole_cameras(truth, k, 32, 24)).image
     twist = torch.tensor([0.02, -0.03, 0.01], requires_grad=True)  # a rotation vector
     shift = torch.tensor([0.05, 0.0, -0.04], requires_grad=True)
     focal = torch.tensor([31.0, 27.5], requires_grad=True)
@@ -132,7 +132,7 @@ def test_pose_and_focal_length_are_optimised_with_cameras_made_in_the_loop():
         top = torch.cat([axis_angle_to_rotation_matrix(twist[None])[0], shift[:, None]], 1)
         pose = torch.cat([top, torch.tensor([[0.0, 0, 0, 1]])])
         lens = k - torch.diag(k.diagonal()) + torch.diag(torch.cat([focal, torch.ones(1)]))
-        return renderer(gaussians, kgs.cameras(pose, lens, 32, 24)).image
+        return renderer(gaussians, kgs.pinhole_cameras(pose, lens, 32, 24)).image
 
     recover(render, [twist, shift, focal], target)
 

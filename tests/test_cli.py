@@ -250,7 +250,7 @@ def test_a_warning_is_one_line_without_code(folder, tmp_path, capsys):
     assert run("fit", folder, "-o", tmp_path, "--steps", 1, "--init", "sift", "--init-points", 30) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "SIFT" in line]
     assert len(lines) == 1
-    assert lines[0].startswith("kgs: first points: SIFT found")
+    assert lines[0].startswith("kgs: initial points: SIFT found")
 
 
 def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, capsys):

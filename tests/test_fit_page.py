@@ -16,7 +16,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.config import FitConfig
 from kgs.fit.saved import load_fit
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.metrics.lpips import Lpips
 from kgs.page.fit_page import refresh_page, spread, write_own_page
 
@@ -39,7 +39,7 @@ def fitted(tmp_path_factory: Any) -> Any:
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "choose_points", lambda *_: FirstPoints(points, torch.full((150, 3), 0.5), "random"))
+        patch.setattr(run, "choose_points", lambda *_: InitialPoints(points, torch.full((150, 3), 0.5), "random"))
         request = REQUEST | {"scene": "/photos/mine/room"}
         run.fit_scene(scene, CONFIG, out, request=request, before_publish=write_own_page, say=lambda line: None)
     return out, scene

@@ -134,7 +134,9 @@ print(kgs.machine.peak_rss_mb())
 
 def test_the_package_the_command_and_the_numbers_of_a_fit_are_read_without_heavy_libraries(imported):
     assert imported[0] == "heavy:"
-    assert all(hasattr(kgs.fit, name) for name in ("FirstPoints", "FitConfig", "Trainer", "first_points", "fit_scene"))
+    assert all(
+        hasattr(kgs.fit, name) for name in ("InitialPoints", "FitConfig", "Trainer", "initial_points", "fit_scene")
+    )
 
 
 def test_no_module_of_one_system_alone(imported):

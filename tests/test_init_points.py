@@ -1,4 +1,4 @@
-"""First points: planes of known depth, closed forms, and the real scenes."""
+"""Initial points: planes of known depth, closed forms, and the real scenes."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
 from kgs.geometry import typical_depths
-from kgs.init_points import FirstPoints, first_points
+from kgs.init_points import InitialPoints, initial_points
 from kgs.io.console import each
 
 
 @pytest.fixture(scope="module")
-def found(planes: Views) -> FirstPoints:
-    return first_points(planes, "sift")
+def found(planes: Views) -> InitialPoints:
+    return initial_points(planes, "sift")
 
 
 def depth_errors(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -41,7 +41,7 @@ def depth_errors(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.minimum(to_back, to_front), to_front < to_back
 
 
-def test_sift_points_lie_on_the_planes(found: FirstPoints) -> None:
+def test_sift_points_lie_on_the_planes(found: InitialPoints) -> None:
     errors, front = depth_errors(found.points)
     assert found.kind == "sift"
     assert found.points.dtype == torch.float32
@@ -51,14 +51,14 @@ def test_sift_points_lie_on_the_planes(found: FirstPoints) -> None:
     assert float((errors < 0.03).double().mean()) > 0.97
 
 
-def test_sift_points_have_no_bias_in_depth(found: FirstPoints) -> None:
+def test_sift_points_have_no_bias_in_depth(found: InitialPoints) -> None:
     x, _, z = found.points.double().unbind(1)
     for depth, slope in (BACK, FRONT):
         ratio = z / (depth + slope * x)
         assert abs(float(ratio[(ratio - 1).abs() < 0.03].median()) - 1) < 0.002
 
 
-def test_sift_colors_are_those_of_the_planes(found: FirstPoints) -> None:
+def test_sift_colors_are_those_of_the_planes(found: InitialPoints) -> None:
     _, front = depth_errors(found.points)
     for chosen, tint in ((front, FRONT_TINT), (~front, BACK_TINT)):
         shades = found.colors[chosen] / found.colors[chosen].sum(1, keepdim=True)
@@ -67,13 +67,13 @@ def test_sift_colors_are_those_of_the_planes(found: FirstPoints) -> None:
     assert float(found.colors.std(0).min()) > 0.05
 
 
-def test_the_same_bits_again_for_any_number_of_threads(planes: Views, found: FirstPoints) -> None:
+def test_the_same_bits_again_for_any_number_of_threads(planes: Views, found: InitialPoints) -> None:
     threads = torch.get_num_threads(), cv2.getNumThreads()
     try:
         for count in (1, 3):
             torch.set_num_threads(count)
             cv2.setNumThreads(count)
-            again = first_points(planes, "sift", seed=count)
+            again = initial_points(planes, "sift", seed=count)
             assert torch.equal(again.points, found.points)
             assert torch.equal(again.colors, found.colors)
     finally:
@@ -83,7 +83,7 @@ def test_the_same_bits_again_for_any_number_of_threads(planes: Views, found: Fir
 
 def test_few_matches_fall_back_to_random_points_with_a_warning() -> None:
     with pytest.warns(UserWarning, match=r"SIFT found 0 in 3 training views.*500 random points"):
-        result = first_points(flat(), "sift", count=500)
+        result = initial_points(flat(), "sift", count=500)
     assert result.kind == "random"
     assert result.points.shape == (500, 3)
     assert torch.allclose(result.colors, torch.tensor([0.2, 0.4, 0.6]).expand(500, 3), atol=1e-6)
@@ -97,8 +97,8 @@ def seeing_views(posed: PinholeCamera, points: torch.Tensor) -> torch.Tensor:
     return ((pixels > -0.5 - 1e-3) & (pixels < limits + 1e-3)).all(-1).logical_and(depths > 0).sum(0)
 
 
-def test_random_points_are_seen_by_two_views_and_span_the_sift_depths(planes: Views, found: FirstPoints) -> None:
-    result = first_points(planes, "random", count=2000)
+def test_random_points_are_seen_by_two_views_and_span_the_sift_depths(planes: Views, found: InitialPoints) -> None:
+    result = initial_points(planes, "random", count=2000)
     assert result.kind == "random"
     assert result.points.shape == result.colors.shape == (2000, 3)
     assert int(seeing_views(planes.cameras, result.points).min()) >= 2
@@ -109,7 +109,7 @@ def test_random_points_are_seen_by_two_views_and_span_the_sift_depths(planes: Vi
 
 def test_random_points_depend_on_the_seed_alone() -> None:
     views = flat()
-    first, again, other = (first_points(views, "random", seed=seed, count=300) for seed in (4, 4, 5))
+    first, again, other = (initial_points(views, "random", seed=seed, count=300) for seed in (4, 4, 5))
     assert torch.equal(first.points, again.points)
     assert not torch.equal(first.points, other.points)
 
@@ -117,7 +117,7 @@ def test_random_points_depend_on_the_seed_alone() -> None:
 def test_random_points_fill_the_common_frustum_evenly() -> None:
     # Oracle: rejection from a box. Parallel cameras at x = 0, 1, 2, so the depths are 2 to 40 (1 and 20 baselines).
     posed = cameras(np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]), turn=0.0, size=SMALL)
-    points = first_points(flat(posed), "random", count=20_000).points
+    points = initial_points(flat(posed), "random", count=20_000).points
     assert 2.0 <= float(points[:, 2].min()) < 5.0
     assert 39.0 < float(points[:, 2].max()) <= 40.0
     box = (torch.rand(400_000, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([60.0, 40.0, 38.0])
@@ -137,7 +137,7 @@ def test_random_points_surround_the_place_where_orbiting_cameras_look() -> None:
     extrinsics[:, :3, 3] = torch.tensor([0.0, 0.0, 4.0]) - extrinsics[:, :3, :3] @ target
     sizes = torch.full((6,), SMALL[1]), torch.full((6,), SMALL[0])
     posed = PinholeCamera(cameras(size=SMALL).intrinsics[:1].repeat(6, 1, 1), extrinsics, *sizes)
-    points = first_points(flat(posed), "random", count=2000).points
+    points = initial_points(flat(posed), "random", count=2000).points
     assert float((points.mean(0) - target).norm()) < 0.5
     assert int(seeing_views(posed, points).min()) >= 2
 
@@ -145,16 +145,16 @@ def test_random_points_surround_the_place_where_orbiting_cameras_look() -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_random_points_where_no_two_views_see_the_same(count: int) -> None:
     posed = cameras(np.zeros((count, 3)), turn=np.pi, size=SMALL)  # two cameras back to back
-    points = first_points(flat(posed), "random", count=100).points
+    points = initial_points(flat(posed), "random", count=100).points
     assert points.shape == (100, 3)
     assert int(seeing_views(posed, points).min()) == 1
 
 
 def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixture[str]) -> None:
     small = planes.halved()
-    first_points(small, "dense")
+    initial_points(small, "dense")
     assert capsys.readouterr() == ("", "")  # nothing unless asked for
-    first_points(small, "dense", stage=each)
+    initial_points(small, "dense", stage=each)
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         *(f"keypoints: {k} of 3 views" for k in (1, 2, 3)),
@@ -166,11 +166,11 @@ def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixt
 def test_wrong_arguments() -> None:
     views = flat()
     with pytest.raises(ValueError, match=r"kind: expected one of \['dense', 'sift', 'random', 'file'\], got 'stereo'"):
-        first_points(views, "stereo")
+        initial_points(views, "stereo")
     with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
-        first_points(views, "random", count=0)
+        initial_points(views, "random", count=0)
     with pytest.raises(ValueError, match="file: expected a path"):
-        first_points(views, "file")
+        initial_points(views, "file")
 
 
 def test_typical_depths_are_the_first_percentile_and_the_median() -> None:
@@ -192,7 +192,7 @@ def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> Non
     alone = torch.tensor([[0.2, 0.1, 3.2]])
     monkeypatch.setattr("kgs.init_points.find_tracks", lambda *_: exact_tracks(torch.cat([wall, alone])))
     posed = cameras()
-    found = first_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
+    found = initial_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
     assert found.kind == "sift"
     torch.testing.assert_close(found.points, wall, rtol=1e-4, atol=1e-4)
 
@@ -217,7 +217,7 @@ def test_real_scene_gives_enough_points(kgs_data: Path, name: str, train_views: 
     from kgs.datasets import load_scene
 
     views = load_scene(kgs_data / name, train_views=train_views).train
-    assert len(first_points(views, "sift").points) >= 0.9 * expected
+    assert len(initial_points(views, "sift").points) >= 0.9 * expected
 
 
 @pytest.mark.slow
@@ -230,7 +230,7 @@ def test_real_points_agree_with_the_full_model(kgs_data: Path, name: str, bound:
     differences = []
     for i in range(3):
         pixels, depths = [], []
-        for points in (first_points(scene.train, "sift").points, scene.points):
+        for points in (initial_points(scene.train, "sift").points, scene.points):
             camera = scene.train.camera(i)
             local = points @ camera.rotation_matrix[0].T + camera.translation_vector[0, :, 0]
             pixels.append(camera.project(points[local[:, 2] > 0][None])[0])

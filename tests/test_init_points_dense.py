@@ -1,4 +1,4 @@
-"""Depth maps and dense first points, against the true depths of the synthetic scene and of a plane."""
+"""Depth maps and dense initial points, against the true depths of the synthetic scene and of a plane."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import project_points
-from kgs.init_points import _sweep_range, first_points
+from kgs.init_points import _sweep_range, initial_points
 from kgs.init_points.dense import dense_points
 from kgs.init_points.plane_sweep import _neighbours, planes_wanted, sweep_depths
 from kgs.init_points.sweep_costs import _semi_global, warp
@@ -100,17 +100,17 @@ def test_two_views_and_many(count: int) -> None:
 
 def test_where_nothing_can_be_compared_others_take_over(views: Views) -> None:
     with pytest.warns(UserWarning, match=r"agree on 0 points only"), pytest.warns(UserWarning, match="random points"):
-        assert first_points(views.select([0]), "dense", count=200).kind == "random"
+        assert initial_points(views.select([0]), "dense", count=200).kind == "random"
     grey = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
     with pytest.warns(UserWarning, match="agree on 0"), pytest.warns(UserWarning, match="random points"):
-        assert first_points(grey, "dense", count=200).kind == "random"
+        assert initial_points(grey, "dense", count=200).kind == "random"
 
 
 def test_pictures_that_contradict_each_other_have_no_dense_points(views: Views) -> None:
     """As mirrors do: each photo shows something else."""
     noise = torch.rand(views.images.shape, generator=generator(3))
     with pytest.warns(UserWarning, match="points only; SIFT points"), pytest.warns(UserWarning, match="random points"):
-        assert first_points(Views(views.cameras, noise, views.names), "dense", count=2000).kind == "random"
+        assert initial_points(Views(views.cameras, noise, views.names), "dense", count=2000).kind == "random"
 
 
 def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
@@ -156,7 +156,7 @@ def test_views_from_one_place_have_no_depth(views: Views) -> None:
 
 
 def test_dense_is_a_kind_of_first_points(views: Views) -> None:
-    found = first_points(views, "dense")
+    found = initial_points(views, "dense")
     assert found.kind == "dense"
     assert 1000 <= len(found.points) <= 10_000
 
@@ -215,7 +215,7 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
 
 @pytest.mark.parametrize("draw", ["uniform", "spread"])
 def test_few_points_are_enough_where_many_agree(draw: str) -> None:
-    found = first_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
+    found = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
     assert found.kind == "dense"
     assert 450 <= len(found.points) <= 500
 
@@ -245,4 +245,4 @@ def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float,
 
 def test_another_draw_is_refused(views: Views) -> None:
     with pytest.raises(ValueError, match="draw: expected one of"):
-        first_points(views, draw="even")
+        initial_points(views, draw="even")

@@ -1,4 +1,4 @@
-"""First points from files: point clouds, meshes and splats; damaged and packed files are refused."""
+"""Initial points from files: point clouds, meshes and splats; damaged and packed files are refused."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from init_point_scenes import flat
 
 import kgs
 from kgs.errors import DataError
-from kgs.init_points import first_points
+from kgs.init_points import initial_points
 
 
 def test_file_with_colors(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     points, colors = rng.normal(size=(30, 3)).astype(np.float32), rng.integers(0, 256, (30, 4), dtype=np.uint8)
     trimesh.PointCloud(points, colors=colors).export(tmp_path / "cloud.ply")
-    result = first_points(flat(), "file", file=tmp_path / "cloud.ply")
+    result = initial_points(flat(), "file", file=tmp_path / "cloud.ply")
     assert result.kind == "file"
     assert result.points.dtype == result.colors.dtype == torch.float32
     np.testing.assert_array_equal(result.points.numpy(), points)
@@ -35,7 +35,7 @@ def test_file_without_colors_is_grey(tmp_path: Path) -> None:
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
     for name in ("cloud.ply", "mesh.obj"):
-        result = first_points(flat(), "file", file=tmp_path / name)
+        result = initial_points(flat(), "file", file=tmp_path / name)
         assert result.points.shape == (3, 3)
         assert torch.equal(result.colors, torch.full((3, 3), 0.5))
 
@@ -46,13 +46,13 @@ def test_broken_file(tmp_path: Path, content: bytes | None) -> None:
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(DataError, match=r"cloud\.ply"):
-        first_points(flat(), "file", file=path)
+        initial_points(flat(), "file", file=path)
 
 
 def test_file_with_a_point_that_is_not_finite(tmp_path: Path) -> None:
     trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
     with pytest.raises(DataError, match="finite"):
-        first_points(flat(), "file", file=tmp_path / "cloud.ply")
+        initial_points(flat(), "file", file=tmp_path / "cloud.ply")
 
 
 ENDINGS = (".zip", ".ply.gz", ".gz", ".tar.gz", ".ply")
@@ -95,7 +95,7 @@ def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     points, colors = torch.randn(40, 3, generator=generator), torch.rand(40, 3, generator=generator)
     kgs.save_ply(tmp_path / "splat.ply", kgs.GaussianModel.from_points(points, colors, sh_degree=2))
-    found = first_points(flat(), "file", file=tmp_path / "splat.ply")
+    found = initial_points(flat(), "file", file=tmp_path / "splat.ply")
     assert torch.equal(found.points, points)
     assert torch.allclose(found.colors, colors, atol=1e-6)
 
@@ -106,7 +106,7 @@ def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
     origin = np.array([432_100.25, 5_400_000.5, 120.0])
     rows = "\n".join(" ".join(f"{x:.4f}" for x in row) for row in local + origin)
     (tmp_path / "cloud.xyz").write_text(rows)
-    found = first_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
+    found = initial_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
     np.testing.assert_allclose(found.points.numpy(), local, atol=1e-5)
 
 
@@ -115,7 +115,7 @@ def test_a_file_whose_vertices_have_another_name_has_no_points(tmp_path: Path) -
     content = trimesh.PointCloud(np.ones((5, 3)), colors=np.full((5, 4), 200, np.uint8)).export(file_type="ply")
     (tmp_path / "cloud.ply").write_bytes(content.replace(b"element vertex", b"element vertey"))
     with pytest.raises(DataError, match=r"vertices: expected finite points, at least one, got 0"):
-        first_points(flat(), "file", file=tmp_path / "cloud.ply")
+        initial_points(flat(), "file", file=tmp_path / "cloud.ply")
 
 
 def test_a_text_is_bounded_before_it_is_read(tmp_path: Path) -> None:
@@ -136,5 +136,5 @@ def test_a_text_is_bounded_before_it_is_read(tmp_path: Path) -> None:
             file.truncate(len(start) + 12 * count)
     for name in ("ascii.ply", "comment.ply", "cloud.xyz"):
         with pytest.raises(DataError, match=rf"{name}: is larger than 64 MiB, the most for a text file"):
-            first_points(flat(), "file", file=tmp_path / name)
-    assert len(first_points(flat(), "file", file=tmp_path / "binary.ply").points) == count
+            initial_points(flat(), "file", file=tmp_path / name)
+    assert len(initial_points(flat(), "file", file=tmp_path / "binary.ply").points) == count

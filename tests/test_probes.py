@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs import GaussianModel
 from kgs.datasets import synthetic_scene
-from kgs.fit import FirstPoints, FitConfig, Trainer
+from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit import probes as needs
 from kgs.fit.probes import decide
 from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
@@ -99,7 +99,7 @@ def test_a_probe_knows_nothing_of_the_view_that_is_left_out(monkeypatch, eight):
 
     decide(eight, OPEN, choose)
     assert sum(config.steps for _, config, _ in probes.seen) <= OPEN.steps / 4
-    assert len(asked) == 2  # first points of each left-out view, for both fits
+    assert len(asked) == 2  # initial points of each left-out view, for both fits
     left_out = set()
     for scene, config, _ in probes.seen:
         (name,) = scene.test.names
@@ -132,7 +132,7 @@ def test_the_same_seed_decides_the_same(eight):
 
 def trained(scene, model, **changes):
     """A trainer whose Gaussians are these."""
-    points = FirstPoints(torch.rand(8, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(8, 3), "file")
+    points = InitialPoints(torch.rand(8, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(8, 3), "file")
     config = FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes)
     start = replace(Start.from_points(scene, config, points), model=model, near_plane=0.01)
     return Trainer(scene, config, start)

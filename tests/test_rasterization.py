@@ -164,7 +164,7 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
     renders, _, meta = rasterization(*inputs, pose, k, 32, 24, sh_degree=1, pixel_centers="integer")
     renders.square().sum().backward()
     again, expected = leaves(gaussians)
-    image = GaussianRenderer()(again, kgs.cameras(cameras.extrinsics, k.detach(), 32, 24)).image
+    image = GaussianRenderer()(again, kgs.pinhole_cameras(cameras.extrinsics, k.detach(), 32, 24)).image
     image.square().sum().backward()
     for got, wanted in zip(inputs, expected, strict=True):
         assert torch.allclose(got.grad, wanted.grad, atol=1e3 * bound * float(wanted.grad.abs().max().clamp_min(1)))

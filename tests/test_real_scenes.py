@@ -9,7 +9,7 @@ import pytest
 
 from kgs.cli import main
 from kgs.datasets import synthetic_scene
-from kgs.fit import Trainer, first_points
+from kgs.fit import Trainer, initial_points
 from kgs.fit.config import PAPER
 from kgs.metrics.evaluate import evaluate
 
@@ -49,7 +49,7 @@ def test_dropping_gains_over_seeds():
     gains = []
     for seed in range(5):
         scene = synthetic_scene(train_views=3, size=(54, 72), seed=seed)
-        points = first_points(scene.train, "sift", seed=seed)
+        points = initial_points(scene.train, "sift", seed=seed)
         levels = []
         for drop in (0.0, PAPER.drop):
             config = replace(PAPER, steps=1200, drop=drop, seed=seed, max_gaussians=3000, recipe=recipe)

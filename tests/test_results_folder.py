@@ -23,7 +23,7 @@ from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.run import fit_scene
 from kgs.fit.saved import load_fit
 from kgs.fit.trainer import Trainer
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.io import staging
 from kgs.io.ownership import make_own_folder
 from kgs.io.results_folder import CHECKPOINT, locked
@@ -40,7 +40,7 @@ def scene() -> Any:
 @pytest.fixture(scope="module", autouse=True)
 def _few_points() -> Any:
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
-    first = FirstPoints(points, torch.full((150, 3), 0.5), "random")
+    first = InitialPoints(points, torch.full((150, 3), 0.5), "random")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "choose_points", lambda *_: first)
         yield

@@ -7,7 +7,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from kgs import DataError
-from kgs.fit import FirstPoints, FitConfig, Trainer
+from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.config import Recipe
 
@@ -134,7 +134,7 @@ def test_a_loop_of_ones_own(scene, points):
     assert_same_bits(by_hand, whole)
     with pytest.raises(ValueError, match="steps"):
         by_hand.train_step()
-    other = Trainer(scene, CONFIG, FirstPoints(points.points[:20], points.colors[:20], "random"))
+    other = Trainer(scene, CONFIG, InitialPoints(points.points[:20], points.colors[:20], "random"))
     for trainer in (other, by_hand):  # a fresh one, and back in time
         trainer.load_state_dict(kept)
         assert trainer.step == 3

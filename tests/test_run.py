@@ -20,7 +20,7 @@ from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.run import CHECKPOINT, fit_scene, train
 from kgs.fit.trainer import Trainer
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 
 CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
 
@@ -33,7 +33,7 @@ def scene() -> Any:
 @pytest.fixture(autouse=True)
 def _few_points(monkeypatch: Any) -> None:
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
-    first = FirstPoints(points, torch.full((150, 3), 0.5), "random")
+    first = InitialPoints(points, torch.full((150, 3), 0.5), "random")
     monkeypatch.setattr(run, "choose_points", lambda *_: first)
 
 

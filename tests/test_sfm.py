@@ -1,4 +1,4 @@
-"""Cameras from bare photos: right ones, the same again, in files that other programs read."""
+"""Cameras from unposed photos: right ones, the same again, in files that other programs read."""
 
 import json
 import shutil

@@ -11,7 +11,7 @@ from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.trainer import Trainer
 from kgs.harmonics import SH_C0
-from kgs.init_points import first_points
+from kgs.init_points import initial_points
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -80,7 +80,7 @@ def test_it_is_repeatable_and_says_when_nothing_is_covered():
 
 def test_counts_by_distance():
     scene = synthetic_scene(train_views=2, test_views=0, size=(24, 32))
-    points = first_points(scene.train, "random", count=600)
+    points = initial_points(scene.train, "random", count=600)
     trainer = Trainer(scene, FitConfig(steps=4, max_gaussians=600), points)
     trainer.fit()
     counts = count_over_threshold(trainer, points.points)

@@ -195,9 +195,9 @@ def test_other_tables(markdown):
     assert views[9] == "23.80 / 0.814 / 0.125"
     dense, off = psnrs(rows, "llff/fern", "progressive 0.2"), psnrs(rows, "llff/fern", "off")
     sift = [r["result"]["test"]["psnr"] for r in rows if r["cell"]["start"] == "sift"]
-    (start,) = lines(markdown, "First points", "llff/fern, 3 views", "dense")
+    (start,) = lines(markdown, "Initial points", "llff/fern, 3 views", "dense")
     assert start[8:] == [f"{interval(np.subtract(dense[:2], sift))} (2)", f"{interval(np.subtract(dense, off))} (3)"]
-    assert lines(markdown, "First points", "model-points (sees test views)")
+    assert lines(markdown, "Initial points", "model-points (sees test views)")
     fixed = psnrs(rows, "llff/fern", "fixed 0.3")
     (rate,) = lines(markdown, "Rates and schedules", "fixed 0.3")
     assert rate[5:7] == [f"{np.mean(fixed) / d:.3f} ({np.std(fixed, ddof=1) / d:.3f})" for d in (110, 31)]

@@ -145,7 +145,7 @@ def test_a_limit_that_leaves_no_room_holds_and_is_said_once(scene, points):
     trainer = fitted(scene, points, replace(CONFIG, max_gaussians=170))
     assert len(trainer.model) <= 170
     assert len(trainer.notes) == 1
-    assert "max_gaussians: 170 leaves little room beside the 150 first points" in trainer.notes[0]
+    assert "max_gaussians: 170 leaves little room beside the 150 initial points" in trainer.notes[0]
 
 
 def test_the_usual_limit_is_reached_without_a_word(whole, points):

@@ -16,7 +16,7 @@ import kgs
 from kgs import reference
 from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.densify import Densifier
-from kgs.fit import FirstPoints, FitConfig, Trainer, first_points, fit_scene
+from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
 from kgs.geometry import camera_extent
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
@@ -25,7 +25,7 @@ from kgs.page.fit_page import write_own_page
 
 UPRIGHT = torch.eye(3)
 SCENE = synthetic_scene(train_views=2, test_views=1, size=(16, 16))
-POINTS = first_points(SCENE.train, "random", count=30)
+POINTS = initial_points(SCENE.train, "random", count=30)
 CONFIG = FitConfig(steps=2, evaluations=1, init="random", init_points=50, backend="torch")
 
 
@@ -86,9 +86,12 @@ WRONG = {
         lambda: camera_extent(SCENE.train.cameras),
         "extrinsics: expected a torch.Tensor, got PinholeCamera",
     ),
-    "a scene for its views": (lambda: first_points(SCENE), "views: expected Views, got Scene"),
+    "a scene for its views": (lambda: initial_points(SCENE), "views: expected Views, got Scene"),
     "views for a scene": (lambda: Trainer(SCENE.train, CONFIG, POINTS), "scene: expected Scene, got Views"),
-    "a tensor for points": (lambda: Trainer(SCENE, CONFIG, POINTS.points), "points: expected FirstPoints, got Tensor"),
+    "a tensor for points": (
+        lambda: Trainer(SCENE, CONFIG, POINTS.points),
+        "points: expected InitialPoints, got Tensor",
+    ),
 }
 
 
@@ -152,5 +155,5 @@ def test_a_package_that_results_need_is_missed_before_the_training(monkeypatch, 
 
 
 def test_points_of_the_right_kind_are_taken():
-    points = FirstPoints(POINTS.points, POINTS.colors, "mine")
+    points = InitialPoints(POINTS.points, POINTS.colors, "mine")
     assert Trainer(SCENE, CONFIG, points).init == {"kind": "mine", "points": len(points.points)}

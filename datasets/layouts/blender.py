@@ -19,7 +19,7 @@ def load_blender(root: Path) -> FrameSet:
     """Read the two json files, see :func:`read_transforms`, as NeRF's scenes and your own have them.
 
     All frames of the test file are test views. Eight training views are the published ones, positions in the file.
-    First points are random in [-1, 1]^3, which holds the objects, the same ones each time.
+    Initial points are random in [-1, 1]^3, which holds the objects, the same ones each time.
     """
     train, _, notes = read_transforms(root, "transforms_train.json")
     test, _, more = read_transforms(root, "transforms_test.json")

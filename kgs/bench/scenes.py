@@ -11,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 import kgs.reference
-from kgs.camera import cameras
+from kgs.camera import pinhole_cameras
 from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
@@ -55,7 +55,7 @@ def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:
     """At the origin, float64; `size` is height and width."""
     height, width = size
     matrix = [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
-    return cameras(torch.eye(4).double(), torch.tensor(matrix, dtype=torch.float64), width, height)
+    return pinhole_cameras(torch.eye(4).double(), torch.tensor(matrix, dtype=torch.float64), width, height)
 
 
 def cast_camera(camera: PinholeCamera, dtype: torch.dtype) -> PinholeCamera:

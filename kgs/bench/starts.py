@@ -1,4 +1,4 @@
-"""The first points of a fit where the depths are known: how wrong, how complete and how slow each kind of them is."""
+"""The initial points of a fit where the depths are known: how wrong, how complete and how slow each kind of them is."""
 
 import os
 import time
@@ -14,7 +14,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.geometry import camera_centers, project_points
-from kgs.init_points import first_points
+from kgs.init_points import initial_points
 
 from .output import Row, markdown_table, mean_sd, write_results
 from .scenes import check_scenes
@@ -37,7 +37,7 @@ _SECONDS = {"wall_seconds": ("wall s", 1, 1), "cpu_seconds": ("CPU s", 1, 1)}
 
 
 def starts(*, out: Path, quick: bool = False) -> None:
-    """Depth errors, completeness and times of the first points of a fit.
+    """Depth errors, completeness and times of the initial points of a fit.
 
     For example:
       kgs bench starts -o starts --quick
@@ -88,7 +88,7 @@ def _find(views: Views, asked: str, seed: int) -> tuple[Tensor, Row]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         wall, cpu = time.perf_counter(), time.process_time()
-        found = first_points(views, asked, seed=seed, count=ALL_POINTS if asked == "dense" else RANDOM_POINTS)
+        found = initial_points(views, asked, seed=seed, count=ALL_POINTS if asked == "dense" else RANDOM_POINTS)
         seconds = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
     points = found.points[:RANDOM_POINTS] if found.kind == "random" else found.points
     fallback = "; ".join(str(warning.message) for warning in caught)

@@ -35,7 +35,7 @@ def demo(
             turntable.webm.
         steps: training steps of each of the two fits; the default takes a minute on 2 cores, without numba 3.
         size: height and width of the pictures.
-        seed: the scene, the first points and both fits derive from it.
+        seed: the scene, the initial points and both fits derive from it.
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
@@ -77,7 +77,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path) -> dict[str, dict[str
     points = choose_points(scene, config, each)
     height, width = scene.train.images.shape[-2:]
     say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
-    say(f"first points: {len(points.points)} ({points.kind})")
+    say(f"initial points: {len(points.points)} ({points.kind})")
     runs, renders, curves = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     drawn, measured = dict[str, Any](), dict[str, Any]()
     for name, drop in (("without", 0.0), ("with", config.drop)):

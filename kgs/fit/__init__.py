@@ -1,12 +1,12 @@
 """Fits: turns a scene into a splat, with one call or in a loop of your own.
 
-`first_points` needs the packages of kgs alone; `Trainer`, `fit_scene` and `kgs.sfm` need the extra `app`.
+`initial_points` needs the packages of kgs alone; `Trainer`, `fit_scene` and `kgs.sfm` need the extra `app`.
 
 Examples:
-    >>> from kgs.fit import FitConfig, Trainer, first_points
+    >>> from kgs.fit import FitConfig, Trainer, initial_points
     >>> from kgs.datasets import synthetic_scene
     >>> scene = synthetic_scene(train_views=2, size=(16, 16))
-    >>> trainer = Trainer(scene, FitConfig(steps=2), first_points(scene.train, "random", count=50))
+    >>> trainer = Trainer(scene, FitConfig(steps=2), initial_points(scene.train, "random", count=50))
     >>> while trainer.step < trainer.config.steps:
     ...     loss = trainer.train_step()
 """
@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any
 from .config import FitConfig
 
 if TYPE_CHECKING:
-    from kgs.init_points import FirstPoints, first_points
+    from kgs.init_points import InitialPoints, initial_points
 
     from .run import fit_scene
     from .trainer import Trainer
 
-__all__ = ["FirstPoints", "FitConfig", "Trainer", "first_points", "fit_scene"]
+__all__ = ["InitialPoints", "FitConfig", "Trainer", "initial_points", "fit_scene"]
 
 _HOMES = {
-    "FirstPoints": "kgs.init_points",
+    "InitialPoints": "kgs.init_points",
     "Trainer": "kgs.fit.trainer",
-    "first_points": "kgs.init_points",
+    "initial_points": "kgs.init_points",
     "fit_scene": "kgs.fit.run",
 }
 

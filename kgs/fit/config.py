@@ -65,7 +65,7 @@ class Recipe:
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: what they are lowered to.
         reset_recovery: a reset is left out where fewer steps than this follow before the next one or the end.
-        near_plane: times the 1st percentile of the first points' depths.
+        near_plane: times the 1st percentile of the initial points' depths.
     """
 
     steps: _Steps = 10_000
@@ -112,19 +112,19 @@ class FitConfig:
         refine_poses: move the training cameras too, for poses that are half a degree or more off: good ones lose a
             little. What all cameras have in common stays; test cameras stay as given.
         coarse: share of the steps, the first ones, that see the training views at half their width; in [0, 1].
-        seed: everything random derives from it: first points, order of views, splits and masks.
-        init: first points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
+        seed: everything random derives from it: initial points, order of views, splits and masks.
+        init: initial points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
             view. sift: from matches of their keypoints. random: where at least two images see. scene: the random points
             that Blender's layout prescribes. model-points: those of a COLMAP model, refined with the test views too.
             file: those of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
-        init_points: how many first points random gives, and dense at most.
+        init_points: how many initial points random gives, and dense at most.
         draw: how these are chosen. spread: one from each of as many even cells of the pictures. uniform: all alike.
         training_background: random: another colour in each step, so that nothing may stay transparent, or dark, where
             a photo is opaque. scene: that of the scene, as in test views.
         max_gaussians: densification stops at this number; unless given 10 per step, and at least 1.5 times the first
             points.
-        growth: share of the steps over which that limit rises evenly from the number of first points; 0 sets it at
+        growth: share of the steps over which that limit rises evenly from the number of initial points; 0 sets it at
             once. In [0, 1].
         keep_all: keep Gaussians that no training view shows, and harmonics that change no picture.
         max_bytes: bound for the working memory of a render in bytes; it changes rounding alone.
@@ -220,7 +220,7 @@ def timetable(config: FitConfig) -> Timetable:
 
 
 def most_gaussians(config: FitConfig, points: int) -> int:
-    """The number at which densification stops in a fit from so many first points."""
+    """The number at which densification stops in a fit from so many initial points."""
     return config.max_gaussians or max(10 * config.steps, 3 * points // 2)
 
 

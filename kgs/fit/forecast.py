@@ -40,7 +40,7 @@ def most_bytes(photos: Tensor, points: int, config: FitConfig) -> int:
 
     Args:
         photos: the training images `(V, 3, H, W)`.
-        points: the number of first points.
+        points: the number of initial points.
         config: of the fit.
     """
     return config.max_bytes + bytes_of(most_gaussians(config, points), photos)

@@ -2,7 +2,7 @@
 
 Convention:
     World-to-camera extrinsics. A motion is six numbers in a camera's own frame, as of Kornia's `Se3`: a translation in
-    units of `TRANSLATION` median depths of the first points, and a rotation in radians.
+    units of `TRANSLATION` median depths of the initial points, and a rotation in radians.
 """
 
 import math
@@ -36,7 +36,7 @@ class MovingPoses:
 
     Attributes:
         extrinsics: where the cameras are now, `(V, 4, 4)`, float64 on the CPU.
-        depth: the median depth of the first points, in world units, above 0: to be set before the first step.
+        depth: the median depth of the initial points, in world units, above 0: to be set before the first step.
     """
 
     def __init__(self, given: Tensor, steps: int) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from kgs.datasets.scene import Scene
 from kgs.datasets.splits import select_evenly
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.io.console import Stage, silent
 from kgs.metrics.evaluate import BEST
 
@@ -32,7 +32,7 @@ MIN_GAIN, MIN_ERRORS = 0.1, 2.0
 RATE_FACTOR = 4.0
 MIN_SIDE = 24  # pixels of an image, halved
 MIN_STEPS = 10  # of a probe
-Choose = Callable[[Scene, FitConfig], FirstPoints]
+Choose = Callable[[Scene, FitConfig], InitialPoints]
 
 
 def decide(
@@ -67,7 +67,7 @@ def decide(
     needs: dict[str, dict[str, Any]] = {}
 
     @lru_cache(maxsize=1)  # the fits of one left-out view follow each other
-    def start(fold: int) -> tuple[Scene, FirstPoints]:
+    def start(fold: int) -> tuple[Scene, InitialPoints]:
         small = _without_view(scene, fold)
         with warnings.catch_warnings(action="ignore", category=UserWarning):
             return small, choose(small, _shortened(settled, steps))

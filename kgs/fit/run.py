@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
-from kgs.init_points import FirstPoints, first_points
+from kgs.init_points import InitialPoints, initial_points
 from kgs.io.console import Stage, each, progress, say, silent
 from kgs.io.figures import write_curve
 from kgs.io.json_files import write_json
@@ -36,8 +36,8 @@ from .trainer import Trainer
 _SAVE_SECONDS = 60.0
 _STARTS = {
     "model-points": "points seen in training views, but their positions were refined with test views",
-    "scene": "first points that come with the layout",
-    "file": "first points of a file",
+    "scene": "initial points that come with the layout",
+    "file": "initial points of a file",
 }
 _CONVENTIONS = {
     "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
@@ -120,7 +120,7 @@ def fit_scene(
             if is_own(out / "splat.ply"):
                 say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
             points = choose_points(scene, config, each)
-            say(f"first points: {len(points.points)} ({points.kind})")
+            say(f"initial points: {len(points.points)} ({points.kind})")
             say(forecast(scene.train.images, len(points.points), config))
             config, needs = decide(scene, config, choose_points, each)
             trainer = Trainer(scene, config, points, needs)
@@ -130,7 +130,7 @@ def fit_scene(
         try:
             if source != new:
                 staging.start()
-                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # first points may have taken a minute
+                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # initial points may have taken a minute
             settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
             write_json(new / "config.json", settings)
@@ -184,7 +184,7 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     """What metrics.json holds of one run; None stands for what was not measured."""
     scene, config = trainer.scene, trainer.config
-    start = _STARTS.get(config.init, "first points from training views alone")
+    start = _STARTS.get(config.init, "initial points from training views alone")
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     if trainer.poses is not None:
         poses += ", those of the training views refined by the fit"
@@ -215,18 +215,18 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
     }
 
 
-def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> FirstPoints:
-    """First points as `config.init` asks for; a DataError where the scene, or the file, has none."""
+def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:
+    """Initial points as `config.init` asks for; a DataError where the scene, or the file, has none."""
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
             reason = f"expected points of the layout itself for the init {kind!r}, got none"
             raise DataError(scene.root, "points", reason)
-        return FirstPoints(scene.points, scene.point_colors, scene.init_kind)
+        return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     rules: dict[str, Any] = {"seed": config.seed, "count": config.init_points, "draw": config.draw}
     rules |= {"file": config.init_file, "origin": scene.offset}  # files that kgs writes are in the world's coordinates
-    return first_points(views, kind, stage=stage, backend=config.backend, **rules)
+    return initial_points(views, kind, stage=stage, backend=config.backend, **rules)
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:

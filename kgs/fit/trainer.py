@@ -24,7 +24,7 @@ from kgs.densify import Densifier
 from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged
 from kgs.geometry import camera_extent, typical_depths
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.machine import check_device
 from kgs.metrics.evaluate import mean_psnr
@@ -70,9 +70,9 @@ class Start:
     depth: float
 
     @classmethod
-    def from_points(cls, scene: Scene, config: FitConfig, points: FirstPoints) -> Self:
+    def from_points(cls, scene: Scene, config: FitConfig, points: InitialPoints) -> Self:
         """Gaussians at the initial points; a TypeError where these are something else."""
-        check_kind("points", points, FirstPoints)
+        check_kind("points", points, InitialPoints)
         nearest, median = typical_depths(points.points, scene.train.cameras)
         model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)
         model.sh_degree = 0
@@ -119,7 +119,7 @@ class Trainer:
         saved: the last checkpoint that was written or read, in words; "" before the first.
         shown: what :meth:`render` draws: the model, or after :meth:`show` a part of it.
         needs: what was decided of the scene, for metrics.json.
-        init, extent, near_plane: kind and number of the first points, and the scales that follow from them.
+        init, extent, near_plane: kind and number of the initial points, and the scales that follow from them.
         order, colors, stack: the random streams of views and backgrounds; views that come before `order` is asked.
         poses: the training cameras, where the fit moves them; `scene` has them where they are now.
     """
@@ -128,7 +128,7 @@ class Trainer:
         self,
         scene: Scene,
         config: FitConfig,
-        points: FirstPoints | Start,
+        points: InitialPoints | Start,
         needs: dict[str, Any] | None = None,
     ) -> None:
         check_kind("scene", scene, Scene)
@@ -228,7 +228,7 @@ class Trainer:
             self.densifier.max_gaussians = first + round(share * (most - first))
             capped = self.densifier.step().capped
             if capped and share == 1.0 and most < 1.25 * first:
-                self.note(f"max_gaussians: {most} leaves little room beside the {first} first points")
+                self.note(f"max_gaussians: {most} leaves little room beside the {first} initial points")
         if step in self.times.reset:
             self.densifier.reset_opacity(self.config.recipe.reset_opacity)
         self.seconds += time.perf_counter() - start

@@ -28,7 +28,7 @@ from .files import read_points
 from .tracks import find_tracks
 from .triangulate import triangulate_certain
 
-__all__ = ["FirstPoints", "first_points"]
+__all__ = ["InitialPoints", "initial_points"]
 
 KINDS, DRAWS = ("dense", "sift", "random", "file"), ("uniform", "spread")
 MIN_DENSE = 1000
@@ -38,7 +38,7 @@ MAX_SPACING = 4.0  # of a point, in medians of all
 
 
 @dataclass(frozen=True)
-class FirstPoints:
+class InitialPoints:
     """The points that a fit starts from, with their colours.
 
     Args:
@@ -52,7 +52,7 @@ class FirstPoints:
     kind: str
 
 
-def first_points(
+def initial_points(
     views: Views,
     kind: str = "dense",
     *,
@@ -63,7 +63,7 @@ def first_points(
     stage: Stage = silent,
     backend: str = "auto",
     draw: str = "uniform",
-) -> FirstPoints:
+) -> InitialPoints:
     """Find the points a fit starts from.
 
     Convention:
@@ -103,7 +103,7 @@ def first_points(
     if kind == "file":
         if file is None:
             raise ValueError("file: expected a path for the kind 'file', got None")
-        return FirstPoints(*read_points(Path(file), origin), kind)
+        return InitialPoints(*read_points(Path(file), origin), kind)
     points, tracks = triangulate_certain(find_tracks(views, stage, backend), views.cameras)
     good = _within_typical_depths(points, tracks.seen, views.cameras)
     points, tracks = points[good], tracks.select(good)
@@ -116,18 +116,18 @@ def first_points(
         near, far = _sweep_range(points, views) if len(points) >= MIN_SIFT else (near, far)
         dense, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw)
         if agreed >= min(MIN_DENSE, count):
-            return FirstPoints(dense, colors, kind)
-        message = f"first points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
+            return InitialPoints(dense, colors, kind)
+        message = f"initial points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
         warnings.warn(message, stacklevel=2)
     if kind in ("dense", "sift"):
         if len(points) >= MIN_SIFT:
-            return FirstPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), "sift")
-        message = f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {MIN_SIFT}; "
+            return InitialPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), "sift")
+        message = f"initial points: SIFT found {len(points)} in {len(views)} training views, fewer than {MIN_SIFT}; "
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
     pixels, depths = project_points(points, views.cameras)
     seen = inside_images(pixels, depths, views.cameras, near, far)
-    return FirstPoints(points.float(), _mean_colors(views, pixels, seen), "random")
+    return InitialPoints(points.float(), _mean_colors(views, pixels, seen), "random")
 
 
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:

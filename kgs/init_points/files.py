@@ -1,4 +1,4 @@
-"""First points from a file: a splat of 3D Gaussian Splatting, or any point cloud or mesh that trimesh reads."""
+"""Initial points from a file: a splat of 3D Gaussian Splatting, or any point cloud or mesh that trimesh reads."""
 
 import re
 from pathlib import Path

@@ -33,7 +33,7 @@ def test_all_outputs_are_those_of_the_reference(device, there, dtype, sh_degree)
     gaussians, camera = random_scene(0, dtype, 300, (40, 56), sh_degree)
     out = GaussianRenderer()(there(gaussians), there(camera), outputs=OUTPUTS)
     exact = dataclasses.replace(gaussians, **{name: getattr(gaussians, name).double() for name in FIELDS})
-    wide = kgs.cameras(camera.extrinsics.double(), camera.intrinsics.double(), 56, 40)
+    wide = kgs.pinhole_cameras(camera.extrinsics.double(), camera.intrinsics.double(), 56, 40)
     certain = ~near_threshold(exact, wide)
     expected = kgs.reference.render(exact, wide)
     assert out.image.device.type == device.type
@@ -52,7 +52,7 @@ def test_gradients_of_gaussians_pose_and_intrinsics(device, there, dtype):
         moved, inputs = leaves(move(gaussians.to(kind)))
         matrices = [move(x.to(kind)).requires_grad_() for x in (camera.extrinsics, camera.intrinsics)]
         out = GaussianRenderer(backend="auto" if kind == dtype else "torch")(
-            moved, kgs.cameras(*matrices, width=56, height=40), outputs=("image", "alpha", "depth")
+            moved, kgs.pinhole_cameras(*matrices, width=56, height=40), outputs=("image", "alpha", "depth")
         )
         values = [out.image, out.alpha, out.depth]
         return [x.cpu() for x in torch.autograd.grad(values, [*inputs, *matrices], cotangents(*values))]

@@ -34,7 +34,7 @@ def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
 
 
 def _write_points(path: Path) -> None:
-    """Few first points before the cameras, so that there is much to add."""
+    """Few initial points before the cameras, so that there is much to add."""
     import trimesh
 
     points = np.random.default_rng(0).uniform((-2, -1.5, 3), (2, 1.5, 7), (300, 3))

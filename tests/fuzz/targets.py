@@ -26,7 +26,7 @@ from kgs.datasets.image_file import read_image
 from kgs.fit.config import FitConfig, timetable
 from kgs.fit.saved import read_settings
 from kgs.fit.trainer import Trainer
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.init_points.files import read_points
 from kgs.io.ply import load_ply
 from kgs.metrics.lpips import Lpips
@@ -77,7 +77,7 @@ def _scene() -> Scene:
 
 def _write_checkpoint(folder: Path) -> None:
     points = torch.rand(_POINTS, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 4.0])
-    trainer = Trainer(_scene(), _CONFIG, FirstPoints(points, torch.full((_POINTS, 3), 0.5), "random"))
+    trainer = Trainer(_scene(), _CONFIG, InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random"))
     trainer.fit(lambda trainer, _: trainer.step == 2)
     trainer.save(folder / "checkpoint.safetensors")
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from projection_checks import wide_scene
 
-from kgs import Gaussians, cameras, composite, project
+from kgs import Gaussians, composite, pinhole_cameras, project
 
 
 @pytest.mark.usefixtures("each_backend")
@@ -14,7 +14,7 @@ def test_a_far_gaussian_has_the_colour_of_its_direction():
     """As one on the same ray at a distance of 1e8, whose squares do not overflow."""
     colors = torch.randn(1, 4, 3, generator=torch.Generator().manual_seed(0))
     intrinsics = torch.tensor([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
-    camera = cameras(torch.eye(4), intrinsics, width=32, height=24)
+    camera = pinhole_cameras(torch.eye(4), intrinsics, width=32, height=24)
 
     def seen(distance):
         ray = torch.tensor([[0.2, 0.1, 1.0]])

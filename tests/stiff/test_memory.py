@@ -29,7 +29,7 @@ def gaussians(n):  # lines of 2 px as tall as the image
 
 def run(n, height, max_bytes):
     k = torch.tensor([[500.0, 0, 127.5], [0, 500.0, (height - 1) / 2], [0, 0, 1]])
-    camera = kgs.cameras(torch.eye(4), k, 256, height)
+    camera = kgs.pinhole_cameras(torch.eye(4), k, 256, height)
     kgs.GaussianRenderer(max_bytes=max_bytes)(gaussians(n), camera).image.sum().backward()
 
 

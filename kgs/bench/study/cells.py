@@ -20,7 +20,7 @@ from kgs.fit.probes import decide
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points, measure
 from kgs.fit.trainer import Trainer
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.machine import peak_rss_mb, revision
 from kgs.metrics.evaluate import MEASURES
 from kgs.metrics.lpips import Lpips
@@ -38,8 +38,9 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     """Fit once and measure; fits of the same scene, views, start and seed begin alike and see the views in one order.
 
     Args:
-        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
-            "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test views),
+        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of
+            initial points, or "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test
+            views),
             "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given), and the
             fields of FitConfig and of Rival that are not as it has them.
         data: the folder of the scenes; DataError: the scene is not there or damaged.
@@ -68,7 +69,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
 def fit_and_measure(
     scene: Scene,
     config: FitConfig,
-    points: FirstPoints,
+    points: InitialPoints,
     lpips: Lpips | None = None,
     probed: FitConfig | None = None,
     rival: Rival | None = None,
@@ -106,8 +107,8 @@ def _pictures(scene: Scene, trainer: Trainer) -> list[str]:
 @lru_cache(maxsize=1)  # cells of one start follow each other
 def _start(
     data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int, preset: str
-) -> tuple[Scene, FirstPoints, float]:
-    """A scene, its first points, and the processor's seconds that they took."""
+) -> tuple[Scene, InitialPoints, float]:
+    """A scene, its initial points, and the processor's seconds that they took."""
     if name == SYNTHETIC:
         scene = synthetic_scene(train_views=views, size=(72, 96))
     elif data is None:
@@ -132,9 +133,9 @@ def _config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
     return replace(PRESETS[values.pop("preset")], **values)
 
 
-def _full_model(scene: Scene, seed: int) -> FirstPoints:
+def _full_model(scene: Scene, seed: int) -> InitialPoints:
     """Points of the model that two photos observe, also such as lie between the fit's few views; no test views."""
     everything = load_scene(scene.root, points="model-points")
     chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
     points = everything.points[chosen].double() + (everything.offset - scene.offset)
-    return FirstPoints(points.float(), everything.point_colors[chosen], FULL)
+    return InitialPoints(points.float(), everything.point_colors[chosen], FULL)

@@ -20,7 +20,7 @@ _COMPARISONS = {
     f"The paper's rule ({PAPER}) over no dropping (off)": ("method", PAPER, OFF),
     f"A fixed rate of the same mean ({FIXED}) over no dropping (off)": ("method", FIXED, OFF),
     **{f"A growing rate over the fixed one of the same mean ({a} over {b})": ("method", a, b) for a, b in _EQUAL},
-    f"Dense first points over those of SIFT, both with {PAPER}": ("start", "dense", "sift"),
+    f"Dense initial points over those of SIFT, both with {PAPER}": ("start", "dense", "sift"),
 }
 _MEASURES = {PSNR: ("PSNR [dB]", 2), LPIPS: ("LPIPS (less is better)", 3)}
 _MEAN = "mean and 95 % intervals"

@@ -43,14 +43,14 @@ def coadaptation(
     return total / pixels if pixels else None
 
 
-def count_over_threshold(trainer: Trainer, first_points: Tensor) -> dict[str, Any]:
+def count_over_threshold(trainer: Trainer, initial_points: Tensor) -> dict[str, Any]:
     """Count Gaussians, and those whose mean gradient since the last densification is over the threshold, by distance.
 
-    The distance is that to the nearest training camera, in medians of the first points' distances. The edges of the
+    The distance is that to the nearest training camera, in medians of the initial points' distances. The edges of the
     bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.
     """
     centers = camera_centers(trainer.scene.train.cameras.extrinsics)
-    clouds = (first_points, trainer.model.means)
+    clouds = (initial_points, trainer.model.means)
     first, now = (torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in clouds)
     edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
     bins = torch.bucketize(now, edges[1:-1])

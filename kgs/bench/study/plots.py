@@ -123,15 +123,15 @@ def _in_panels(cells: pd.DataFrame) -> pd.DataFrame:
 
 _SEEDS = "mean over seeds, bars of one sd"
 _SHARES = f"""Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, \
-{OFF} and {PAPER}: {_SEEDS}; each point stands for a sixth of the first points; a fit at its limit of Gaussians keeps \
-those that it could not densify"""
+{OFF} and {PAPER}: {_SEEDS}; each point stands for a sixth of the initial points; a fit at its limit of Gaussians \
+keeps those that it could not densify"""
 # What each plot shows, its axes, and its caption.
 _OVER, _PSNR = "test PSNR over off, same seeds and views [dB]", "test PSNR [dB]"
 _FOREST = "Paired differences of test PSNR over off, with 95 % intervals, of one scene over seeds; n pairs"
-_PLOTS = {"forest": (_forest, _OVER, "", f"{_FOREST}; from the same first points, but for the default's")}
+_PLOTS = {"forest": (_forest, _OVER, "", f"{_FOREST}; from the same initial points, but for the default's")}
 _PLOTS["curves"] = (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}")
 _SCATTERED = {"gap": "overfitting: PSNR, training less test views [dB]", "cost": "CPU time of the fit [s]"}
 for _name, _x in {**_SCATTERED, "coadaptation": "co-adaptation [1e-3]"}.items():
     _caption = f"Test PSNR against {_x}; one point per cell, filled by its start"
     _PLOTS[_name] = (partial(_scattered, x=_name), _x, _PSNR, _caption)
-_PLOTS["thresholds"] = (_thresholds, "distance [median of the first points]", "over the threshold [%]", _SHARES)
+_PLOTS["thresholds"] = (_thresholds, "distance [median of the initial points]", "over the threshold [%]", _SHARES)

@@ -20,7 +20,7 @@ from .pairs import COLUMNS, KEYS, ORIGIN, cells_frame
 from .plots import write_plots
 from .tables import sparse_tables
 
-TITLE = "Sparse views: DropGaussian on and off at equal first points"
+TITLE = "Sparse views: DropGaussian on and off at equal initial points"
 
 
 def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int) -> str:

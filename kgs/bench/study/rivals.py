@@ -17,7 +17,7 @@ from kgs.drop import DropGaussian
 from kgs.fit.config import FitConfig
 from kgs.fit.trainer import Start, Trainer
 from kgs.geometry import camera_centers
-from kgs.init_points import FirstPoints
+from kgs.init_points import InitialPoints
 from kgs.losses import opacity_l1
 from kgs.types import Gaussians
 
@@ -45,7 +45,7 @@ class RivalTrainer(Trainer):
         self,
         scene: Scene,
         config: FitConfig,
-        points: FirstPoints | Start,
+        points: InitialPoints | Start,
         needs: dict[str, Any] | None = None,
         *,
         rival: Rival,

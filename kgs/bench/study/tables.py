@@ -35,7 +35,7 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     default, *families = FAMILIES
     against = FAMILIES[default], (PAPER, OFF, AUTO_OFF)
     tables[default] = _settings(dense, *against) + _means(main, *against)
-    tables |= {_REGRET: regret(frame), "Numbers of views": by_views, "First points": _starts(frame)}
+    tables |= {_REGRET: regret(frame), "Numbers of views": by_views, "Initial points": _starts(frame)}
     for title in families:
         scenes = main[main.method.isin({*FAMILIES[title]} - {*HEAD})].scene
         tables[title] = _settings(main[main.scene.isin(scenes)], (OFF, PAPER, *FAMILIES[title]), (OFF, PAPER))
@@ -122,7 +122,10 @@ def _starts(frame: pd.DataFrame) -> Lines:
             line = {"scene": f"{scene}, {views} views", "method": method}
             line["start"] = f"{start} (gave {', '.join(gave)})" if gave else start + note
             line |= _spread(some[PSNR])
-            line |= {"first points": mean_sd(some["init.points"], 0), "their CPU [s]": mean_sd(some["init.seconds"], 0)}
+            line |= {
+                "initial points": mean_sd(some["init.points"], 0),
+                "their CPU [s]": mean_sd(some["init.seconds"], 0),
+            }
             line["over sift [dB] (pairs)"] = _gain(cells, start, "sift", "start")
             line["over off, same start [dB] (pairs)"] = _gain(same[same.start == start], method, OFF)
             lines.append(line)
