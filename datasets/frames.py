@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kgs.errors import DataError
 
+from .image_file import ImageFile
 from .images import Intrinsics
 
 LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares of them are finite in float32
@@ -23,9 +24,14 @@ class Frame:
 
     source: Path  # the file that gives lens and pose; errors name it
     name: str  # unique within the scene
-    path: Path
+    image: ImageFile
     intrinsics: Intrinsics  # for any size of the photo's aspect
     pose: Tensor  # (4, 4) float64, camera-to-world with OpenCV axes (x right, y down, z forward)
+
+    @property
+    def path(self) -> Path:
+        """The photo's file."""
+        return self.image.path
 
     def __post_init__(self) -> None:
         wrong = partial(DataError, self.source, self.name)

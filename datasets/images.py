@@ -1,26 +1,20 @@
-"""Photos as arrays: reading, removing the lens's distortion, reducing, and the intrinsics that result."""
+"""Photos as arrays: removing the lens's distortion, reducing, and the intrinsics that result; folders of photos."""
 
-import mmap
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 import cv2
 import numpy as np
-from kornia_rs import io as kornia_io
 from numpy.typing import NDArray
 
-from kgs.errors import DataError
-
-from .image_size import image_size, plain_jpeg, plain_tiff
+from .image_file import Image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
 UNREADABLE_SUFFIXES = (*_RAW, ".heic", ".heif", ".hif", ".avif", ".gif", ".jxl", ".jp2", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
-Image = NDArray[np.float32]
 Maps = tuple[Image, Image]
-_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
 _LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
 
 
@@ -69,65 +63,6 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> lis
     """The photos of a folder, sorted by name; hidden files and other kinds of files are passed over."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     return sorted(files, key=lambda p: p.name)
-
-
-def read_bytes(path: Path) -> bytes:
-    """A whole file, or a DataError where it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
-
-
-def read_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header alone, with the errors of :func:`image_size`."""
-    try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            return image_size(path, data)
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
-    except ValueError:  # an empty file cannot be mapped
-        return image_size(path, b"")
-
-
-def read_image(path: Path) -> Image:
-    """Read an 8 or 16 bit PNG, JPEG, WebP, BMP or TIFF as it is stored: a rotation in its metadata is not applied.
-
-    Returns RGB `(H, W, 3)` or, where the file has an alpha channel, RGBA `(H, W, 4)` in [0, 1], not premultiplied.
-    A file of another kind, a truncated or damaged one and a decompression bomb are a DataError.
-    """
-    data, premultiplied = read_bytes(path), False
-    size = image_size(path, data)
-    try:
-        if data.startswith((b"II", b"MM")):
-            data, premultiplied = plain_tiff(data)
-        image = _decode(data)
-    except ValueError as error:
-        raise DataError(path, "", str(error)) from error
-    if image.shape[1::-1] != size:
-        raise DataError(path, "", f"expected {size} pixels as its header says, got {image.shape[1::-1]}")
-    result = np.asarray(image / np.float32(255.0 if image.dtype == np.uint8 else 65535.0), dtype=np.float32)
-    if premultiplied and result.shape[2] == 4:
-        result[..., :3] = np.minimum(result[..., :3] / np.maximum(result[..., 3:], 1 / 65535), 1)
-    return result
-
-
-def _decode(data: bytes) -> NDArray[np.uint8 | np.uint16]:
-    """RGB or RGBA of the bytes of an image; a ValueError where they cannot be decoded."""
-    try:
-        if data.startswith(b"\xff\xd8"):  # OpenCV only prints what is wrong with a JPEG, and gives it in wrong colours
-            return np.asarray(kornia_io.decode_image_jpegturbo(plain_jpeg(data), "rgb"))
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (ValueError, MemoryError):
-        raise
-    except Exception as error:  # cv2.error; kornia_rs has no error of its own
-        raise ValueError("the image is damaged, or has other colours than grey or RGB") from error
-    if image is None:
-        raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
-    channels = image.shape[2] if image.ndim == 3 else 1
-    if image.dtype not in (np.uint8, np.uint16) or channels not in _TO_RGB:
-        raise ValueError(f"expected 8 or 16 bit integers in 1, 3 or 4 channels, got {image.dtype} in {channels}")
-    return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]))
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:

@@ -4,10 +4,11 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
+from typing import Self
 
 import kornia.geometry as kg
 import numpy as np
@@ -18,7 +19,7 @@ from kgs.errors import DataError
 
 from .border import border_light
 from .frames import LARGEST, Frame, FrameSet
-from .images import read_image, read_size, rectification, remap, resize
+from .images import rectification, remap, resize
 from .layouts import find_layout
 from .scene import Scene, Views, pinholes
 from .splits import TEST_EVERY, select_evenly, split_by_name
@@ -98,16 +99,18 @@ def load_scene(
             raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {listed}")
         color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
         offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; no test view enters it
-        height, width = size = _common_size([*train, *test], downscale)
+        scales = [_Scale.of(train[0], downscale or 1.0)]
+        height, width = scales[0].size
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
-        is_finer = photos and downscale is not None and fine_downscale < downscale
+        if photos and downscale is not None and fine_downscale < downscale:
+            scales.append(_Scale.of(train[0], fine_downscale))
         views = partial(_views, offset=offset, background=color, photos=photos)
-        finer = _behind_border(views(train, _common_size(train, fine_downscale))) if is_finer else None
-        first = (cloud.points - offset).float(), cloud.colors.float(), cloud.kind
-        seen, held_out = _behind_border(views(train, size)), views(test, size)
-        notes = (*found.notes, *([_BORDER] if seen.light is not None else []))
+        seen, *finer = [_behind_border(part) for part in views(train, scales)]
+        (held_out,) = views(test, scales[:1])
         held_out = replace(held_out, light=seen.light)
-        return Scene(seen, held_out, *first, offset, color, root, finer, notes)
+        first = (cloud.points - offset).float(), cloud.colors.float(), cloud.kind
+        notes = (*found.notes, *([_BORDER] if seen.light is not None else []))
+        return Scene(seen, held_out, *first, offset, color, root, finer[0] if finer else None, notes)
 
 
 def _behind_border(train: Views) -> Views:
@@ -139,51 +142,83 @@ def _split(
     return [frames[i] for i in chosen], test_frames
 
 
-def _common_size(frames: Sequence[Frame], downscale: float | None) -> tuple[int, int]:
-    """(height, width) of all images after downscaling, from the headers of the photos."""
-    sizes: dict[tuple[int, int], str] = {}
-    for frame in frames:
-        (width, height), lens = read_size(frame.path), frame.intrinsics
-        if not lens.same_aspect(width, height):
-            described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
-            raise DataError(frame.path, "", f"has {width}x{height} pixels, which is no scaled version of {described}")
-        size = max(1, round(height / (downscale or 1))), max(1, round(width / (downscale or 1)))
-        sizes.setdefault(size, f"{width}x{height}")
-        if len(sizes) > 1:
-            first, got = sizes.values()
-            raise DataError(frame.path, "", f"expected {first} pixels as the other images, got {got}")
-    return next(iter(sizes))
+@dataclass(frozen=True)
+class _Scale:
+    """By how much all photos are reduced, and the size that they have then."""
+
+    factor: float
+    size: tuple[int, int]  # (height, width)
+    first: str  # width and height of the photo whose size counts, for messages
+
+    @classmethod
+    def of(cls, frame: Frame, factor: float) -> Self:
+        """That of all photos which are as large as this one."""
+        frame.image.load()
+        width, height = frame.image.size
+        return cls(factor, _reduced(width, height, factor), f"{width}x{height}")
 
 
-def _views(frames: Sequence[Frame], size: tuple[int, int], offset: Tensor, background: Tensor, photos: bool) -> Views:
-    """The frames as views of the given (height, width), their photos decoded or not."""
+def _reduced(width: int, height: int, factor: float) -> tuple[int, int]:
+    return max(1, round(height / factor)), max(1, round(width / factor))
+
+
+def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale]) -> None:
+    """Refuse a photo whose size is not that of its lens, or not that of the other photos."""
+    lens = frame.intrinsics
+    if not lens.same_aspect(width, height):
+        described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
+        raise DataError(frame.path, "", f"has {width}x{height} pixels, which is no scaled version of {described}")
+    for scale in scales:
+        if _reduced(width, height, scale.factor) != scale.size:
+            expected = f"expected {scale.first} pixels as the other images"
+            raise DataError(frame.path, "", f"{expected}, got {width}x{height}")
+
+
+def _views(
+    frames: Sequence[Frame], scales: Sequence[_Scale], offset: Tensor, background: Tensor, photos: bool
+) -> list[Views]:
+    """The frames as views, once for each scale; their photos are decoded once, or not at all."""
     count = len(frames)
     rectify = lru_cache(maxsize=1)(rectification)  # photos of one lens share it
-    images = torch.empty(count, 3, *size, dtype=torch.float32, device="cpu" if photos else "meta")
-    intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
-    alphas: dict[int, Tensor] = {}
+    device = "cpu" if photos else "meta"
+    images = [torch.empty(count, 3, *scale.size, dtype=torch.float32, device=device) for scale in scales]
+    intrinsics = torch.eye(4, dtype=torch.float32).repeat(len(scales), count, 1, 1)
+    alphas: list[dict[int, Tensor]] = [{} for _ in scales]
     for i, frame in enumerate(frames):
-        width, height = read_size(frame.path)
+        image = None
+        if photos:
+            image = frame.image.read()
+            height, width = image.shape[:2]
+        else:
+            width, height = frame.image.size
+        _check_size(frame, width, height, scales)
         try:
             lens, maps = rectify(frame.intrinsics.scaled(width, height))
         except ValueError as error:
             raise DataError(frame.source, frame.name, str(error)) from error
-        if photos:
-            image = read_image(frame.path)
+        if image is not None:
             if image.shape[2] == 4:
                 alpha = image[..., 3:]
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
-            image, lens = resize(remap(image, maps), lens, size[1], size[0])
-            pixels = torch.from_numpy(image).permute(2, 0, 1)
-            images[i] = pixels[:3]
-            if len(pixels) == 4:
-                alphas[i] = pixels[3:]
-        else:
-            lens = lens.scaled(size[1], size[0])
-        intrinsics[i, :3, :3] = torch.from_numpy(lens.matrix())
-    opaque = torch.ones(1, *size, dtype=torch.float32)
-    masks = torch.stack([alphas.get(i, opaque) for i in range(count)]) if alphas else None
+            image = remap(image, maps)
+        for j, scale in enumerate(scales):
+            height, width = scale.size
+            if image is None:
+                reduced_lens = lens.scaled(width, height)
+            else:
+                reduced, reduced_lens = resize(image, lens, width, height)
+                pixels = torch.from_numpy(reduced).permute(2, 0, 1)
+                images[j][i] = pixels[:3]
+                if len(pixels) == 4:
+                    alphas[j][i] = pixels[3:].clone()
+            intrinsics[j, i, :3, :3] = torch.from_numpy(reduced_lens.matrix())
     poses = torch.stack([frame.pose for frame in frames]) if frames else torch.zeros(0, 4, 4, dtype=torch.float64)
     u, _, vh = torch.linalg.svd(poses[:, :3, :3])  # u @ vh is a rotation exactly
     extrinsics = kg.Rt_to_matrix4x4(*kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])).float()
-    return Views(pinholes(intrinsics, extrinsics, size), images, tuple(frame.name for frame in frames), masks)
+    names = tuple(frame.name for frame in frames)
+    views = []
+    for j, scale in enumerate(scales):
+        opaque = torch.ones(1, *scale.size, dtype=torch.float32)
+        masks = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
+        views.append(Views(pinholes(intrinsics[j], extrinsics, scale.size), images[j], names, masks))
+    return views

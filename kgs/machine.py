@@ -1,4 +1,4 @@
-"""What a fit runs on: versions, the commit, memory, and whether the device that is asked for is there."""
+"""The machine that a fit runs on: devices, versions of packages, memory."""
 
 import contextlib
 import os

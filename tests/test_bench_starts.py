@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from init_point_scenes import garden_from_above
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.bench import starts
 from kgs.bench.starts import complete_pixels, depth_errors
-from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Views
-from kgs.datasets.synthetic import synthetic_depths
 from kgs.errors import DataError
 from kgs.geometry import unproject
 
@@ -91,8 +90,7 @@ def test_points_before_nothing_and_outside(plane: tuple[Views, torch.Tensor]) ->
 
 
 def test_points_of_the_exact_depths_of_the_synthetic_scene() -> None:
-    views = synthetic_scene(train_views=3, test_views=0, size=(63, 84), seed=0).train
-    truth = synthetic_depths(views.cameras, seed=0)[:, 0]
+    views, truth = garden_from_above((63, 84))
     points = points_of(views, truth)
     for view in range(3):  # alone: each point falls on the centre of its pixel
         alone = views.select([view]), truth[[view]]
@@ -117,15 +115,14 @@ def test_a_fallback_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row["cpu_seconds"] > 0
 
 
-def test_the_files_of_the_quick_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(starts, "QUICK", (63, 84))
+def test_the_files_of_the_quick_program(tmp_path: Path) -> None:
     starts.starts(out=tmp_path, quick=True)
     rows = json.loads((tmp_path / "starts.json").read_text())["rows"]
     assert (rows[0]["came"], rows[0]["fallback"]) == ("dense", "")
     assert [row["asked"] for row in rows] == ["dense", "sift", "random"]
     with (tmp_path / "starts.csv").open(newline="") as file:
         assert [float(row["median_error"]) for row in csv.DictReader(file)] == [row["median_error"] for row in rows]
-    assert (tmp_path / "starts.md").read_text().count("| forward | 3 | 84x63 | dense | 1 |") == 2
+    assert (tmp_path / "starts.md").read_text().count("| room | 3 | 168x126 | dense | 1 |") == 2
     dense, _, random = rows
     assert dense["median_error"] < 0.02 < 0.1 < random["median_error"]
     assert dense["complete"] > 1.5 * random["complete"]

@@ -60,7 +60,6 @@ def test_config_survives_json():
 WRONG = {
     "steps": (0, True, 2.0, "3", None, 10**8, 10**400, np.bool_(True)),
     "drop": (1.0, -0.1, math.nan, None, "0.2", True),
-    "opacity_l1": (-0.1, math.inf, 10**400),
     "sh_degree": (4, -1),
     "evaluations": (0,),
     "max_gaussians": (0, -5, True, 1.5),

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from kgs.datasets.frames import Frame, path_inside
+from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
@@ -51,7 +52,7 @@ def test_the_scene_itself_may_be_a_link(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), 1e-16, 1e16])
 def test_focal_lengths_that_no_lens_has(name: str, value: float) -> None:
     with pytest.raises(DataError, match=r"photo\.png"):
-        Frame(SOURCE, "photo.png", SOURCE, replace(LENS, **{name: value}), torch.eye(4, dtype=torch.float64))
+        Frame(SOURCE, "photo.png", ImageFile(SOURCE), replace(LENS, **{name: value}), torch.eye(4, dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
@@ -61,4 +62,4 @@ def test_poses_that_no_camera_has(row: int, column: int, value: float) -> None:
     pose = torch.eye(4, dtype=torch.float64)
     pose[row, column] = value
     with pytest.raises(DataError, match=r"photo\.png"):
-        Frame(SOURCE, "photo.png", SOURCE, LENS, pose)
+        Frame(SOURCE, "photo.png", ImageFile(SOURCE), LENS, pose)

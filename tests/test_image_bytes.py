@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kgs.datasets.images import read_image, read_size
+from kgs.datasets.image_file import read_image, read_size
 from kgs.errors import DataError
 
 
@@ -165,8 +165,11 @@ def test_colours_that_a_tiff_multiplies_by_alpha_are_divided_by_it(tmp_path: Pat
 
 
 def test_alpha_of_grey_images_is_used_or_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="grey TIFF with an alpha"):
-        read_image(stored(tmp_path / "a.tif", tiff(pixels(np.uint8, 2))))
+    with pytest.raises(DataError, match="unusual TIFF"):
+        read_image(stored(tmp_path / "a.tif", tiff(pixels(np.uint16, 2))))
+    grey = pixels(np.uint8, 2)
+    image = read_image(stored(tmp_path / "a.tif", tiff(grey)))
+    np.testing.assert_array_equal(image, grey[..., [0, 0, 0, 1]] / np.float32(255))
     rows = b"".join(b"\0" + bytes([200, 51]) * 3 for _ in range(2))
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 8, 4, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
     parts = [struct.pack(">I", len(body)) + k + body + struct.pack(">I", zlib.crc32(k + body)) for k, body in chunks]
@@ -189,7 +192,7 @@ def test_large_plain_images_in_small_files_are_refused_before_they_are_decoded(
 MEASURE = """
 import json, os, sys
 from pathlib import Path
-from kgs.datasets.images import read_image
+from kgs.datasets.image_file import read_image
 def status(name):
     return int(next(l for l in open("/proc/self/status") if l.startswith(name)).split()[1]) * 1024
 for path in sys.argv[1:]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from init_point_scenes import garden_from_above
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
@@ -19,13 +20,18 @@ from kgs.init_points.sweep_costs import _semi_global, warp
 
 
 @pytest.fixture(scope="module")
-def views() -> Views:
-    return synthetic_scene(train_views=3, test_views=1, size=(96, 128), seed=0).train
+def garden() -> tuple[Views, torch.Tensor]:
+    return garden_from_above((96, 128))
 
 
 @pytest.fixture(scope="module")
-def truth(views: Views) -> torch.Tensor:
-    return synthetic_depths(views.cameras, seed=0)[:, 0]
+def views(garden: tuple[Views, torch.Tensor]) -> Views:
+    return garden[0]
+
+
+@pytest.fixture(scope="module")
+def truth(garden: tuple[Views, torch.Tensor]) -> torch.Tensor:
+    return garden[1]
 
 
 @pytest.fixture(scope="module")

@@ -61,7 +61,7 @@ def test_without_steps_for_probes_the_rule_decides(eight):
 
 def test_in_small_pictures_the_rule_decides(eight):
     small = replace(eight, train=eight.train.halved())
-    assert decide(small, OPEN, None)[1]["sh_degree"]["why"] == "too small pictures for probes"
+    assert decide(small, OPEN, None)[1]["sh_degree"]["why"] == "too small images for probes"
 
 
 def test_what_is_given_is_not_decided(eight):
@@ -117,7 +117,7 @@ def test_probes_of_many_views_have_a_dozen_of_them(monkeypatch):
     probes = Probes([20.0] * 4)
     monkeypatch.setattr(needs, "Trainer", probes)
     decide(synthetic_scene(train_views=30, size=(48, 64)), OPEN, choose_points)
-    assert {len(scene.train) for scene, _, _ in probes.seen} == {needs.MOST}
+    assert {len(scene.train) for scene, _, _ in probes.seen} == {needs.MAX_VIEWS}
 
 
 def test_the_same_seed_decides_the_same(eight):

@@ -10,7 +10,8 @@ import torch
 import kgs
 from kgs.cli.page import page
 from kgs.cli.render import render
-from kgs.datasets import load, synthetic_scene
+from kgs.datasets import synthetic_scene
+from kgs.datasets.image_file import ImageFile
 from kgs.errors import DataError
 
 
@@ -83,8 +84,8 @@ def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_pa
 
 
 def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
-    out, decoded, plain = tmp_path / "page.html", [], load.read_image
-    monkeypatch.setattr(load, "read_image", lambda path: decoded.append(path.name) or plain(path))
+    out, decoded, plain = tmp_path / "page.html", [], ImageFile.read
+    monkeypatch.setattr(ImageFile, "read", lambda file: decoded.append(file.path.name) or plain(file))
     page(splat, cameras=llff, out=out)
     text = out.read_text(encoding="utf-8")
     assert len(decoded) == 6  # of ten: there may be hundreds

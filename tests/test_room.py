@@ -6,7 +6,7 @@ import torch
 import trimesh
 from kornia.geometry.depth import depth_to_3d_v2
 
-from kgs.datasets.synthetic import SUPERSAMPLING, room, synthetic_depths, synthetic_scene
+from kgs.datasets.synthetic import SUPERSAMPLING, room, synthetic_depths, synthetic_scene, world
 from kgs.datasets.synthetic.furniture import albedo, book, plain, printed, wood
 from kgs.datasets.synthetic.light import daylight, received
 from kgs.datasets.synthetic.pictures import blank, spine, tone
@@ -108,12 +108,12 @@ def test_the_work_is_bounded(made):
 
 def test_normals_are_smooth_over_a_ball_and_sharp_at_an_edge():
     ball, brick = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box((1.0, 2.0, 3.0))
-    np.testing.assert_allclose(room._normals(ball), ball.triangles, atol=0.02)
-    np.testing.assert_allclose(room._normals(brick), np.repeat(brick.face_normals[:, None], 3, axis=1), atol=1e-12)
+    np.testing.assert_allclose(world._normals(ball), ball.triangles, atol=0.02)
+    np.testing.assert_allclose(world._normals(brick), np.repeat(brick.face_normals[:, None], 3, axis=1), atol=1e-12)
     rng = np.random.default_rng(0)
     faces = rng.integers(len(ball.faces), size=200)
     points = np.einsum("nk,nkd->nd", rng.dirichlet([1, 1, 1], size=200), ball.triangles[faces])
-    mixed = room._between(ball.triangles[faces], room._normals(ball)[faces], points)
+    mixed = world._between(ball.triangles[faces], world._normals(ball)[faces], points)
     np.testing.assert_allclose(mixed, points / np.linalg.norm(points, axis=1, keepdims=True), atol=0.02)
 
 

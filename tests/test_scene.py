@@ -153,7 +153,7 @@ def check_float32(scene):
 def test_cameras_without_decoding_photos(tmp_path, monkeypatch, write, downscale):
     write(tmp_path)
     whole = load_scene(tmp_path, downscale=downscale)
-    monkeypatch.setattr("kgs.datasets.load.read_image", None)  # any decoding fails
+    monkeypatch.setattr("kgs.datasets.image_file._decode", None)  # any decoding fails
     bare = load_scene(tmp_path, downscale=downscale, photos=False)
     for full, part in ((whole.train, bare.train), (whole.test, bare.test)):
         assert part.names == full.names

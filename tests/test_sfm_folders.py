@@ -17,7 +17,7 @@ from kgs.io.json_files import write_json
 from kgs.io.outputs import write_png
 from kgs.io.ownership import MARK
 from kgs.sfm import pose, pose_photos
-from kgs.sfm.read import blurred, read_photos
+from kgs.sfm.read import blurred, open_photos, read_photos
 from kgs.sfm.write import photo_staging
 
 pytest.importorskip("pycolmap")
@@ -162,16 +162,18 @@ def test_a_blurred_photo_is_told(folder):
     images = planes()
     images[1] = cv2.GaussianBlur(images[1], (0, 0), 2.0)
     save(folder, images)
-    assert [photo.path.name for photo in blurred(read_photos(sorted(folder.iterdir()), silent))] == ["1.png"]
+    assert [photo.path.name for photo in blurred(read_photos(open_photos(sorted(folder.iterdir())), silent))] == [
+        "1.png"
+    ]
 
 
 def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
     save(folder, [planes()[0], *(cv2.resize(image, (480, 360)) for image in planes()[1:])])
-    photos = read_photos(sorted(folder.iterdir()), silent)
+    photos = read_photos(open_photos(sorted(folder.iterdir())), silent)
     assert {photo.size for photo in photos} == {(240, 180)}
     large = cv2.resize(planes()[0], (2400, 1800))
-    save(folder, [large] * 3)
-    assert {photo.size for photo in read_photos(sorted(folder.iterdir()), silent)} == {(1600, 1200)}
+    save(folder, [large, large[::-1], large[:, ::-1]])
+    assert {photo.size for photo in read_photos(open_photos(sorted(folder.iterdir())), silent)} == {(1600, 1200)}
 
 
 def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
@@ -242,7 +244,8 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
     """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
     out, found = folder.parent / "out", []
 
-    def find(paths, new, *_):
+    def find(opened, new, *_):
+        paths = [photo.path for photo in opened]
         found.append(len(paths))
         (new / "images").mkdir()
         (new / "sparse" / "0").mkdir(parents=True)

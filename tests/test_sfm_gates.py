@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from kgs.errors import DataError
-from kgs.sfm.gates import disagreement, groups_of, judge, objections, table, unfit, weakest_link
+from kgs.sfm.gates import disagreement, groups_of, judge, objections, table, weakest_link, why_no_cameras
 from kgs.sfm.map import Cameras, Look
 
 NAMES = ["a", "b", "c"]
@@ -95,10 +95,10 @@ def test_groups_links_and_the_table():
 
 def test_photos_that_can_give_no_cameras():
     deep, flat, same = Look(30.0, 0.5), Look(30.0, 0.99), Look(0.1, 1.0)
-    assert unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, flat) | {("a", "c"): deep}) == ""
-    assert "only turned on the spot" in unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, flat))
-    said = unfit(NAMES, PAIRS, dict.fromkeys(PAIRS, deep) | {("a", "b"): same})
+    assert why_no_cameras(NAMES, PAIRS, dict.fromkeys(PAIRS, flat) | {("a", "c"): deep}) == ""
+    assert "only turned on the spot" in why_no_cameras(NAMES, PAIRS, dict.fromkeys(PAIRS, flat))
+    said = why_no_cameras(NAMES, PAIRS, dict.fromkeys(PAIRS, deep) | {("a", "b"): same})
     assert "a and b" in said
     assert "remove one of them" in said
     assert "watermark" in said  # matches at the same pixels can be those of what is printed on the photos
-    assert "no two of the 3" in unfit(NAMES, dict.fromkeys(PAIRS, 0), {})
+    assert "no two of the 3" in why_no_cameras(NAMES, dict.fromkeys(PAIRS, 0), {})

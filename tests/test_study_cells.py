@@ -56,7 +56,7 @@ def test_each_cell_is_there_once_and_is_a_fit(preset, data):
     cells = sparse_cells(preset, data)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
     for cell in cells:
-        fit = {key: value for key, value in cell["fit"].items() if key != "preset"}
+        fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})
         config = FitConfig.from_dict(FitConfig().to_dict() | fit)
         assert config.drop == METHODS[cell["method"]].get("drop", 0.2)
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from kgs.bench.study.overfitting import BINS, coadaptation, count_over_threshold
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
-from kgs.fit.overfitting import BINS, coadaptation, count_over_threshold
 from kgs.fit.trainer import Trainer
 from kgs.harmonics import SH_C0
 from kgs.init_points import first_points

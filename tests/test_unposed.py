@@ -1,4 +1,4 @@
-"""`kgs fit` of bare photos, with their true cameras in the place of those that are found: what follows from them."""
+"""`kgs fit` of unposed photos, with their true cameras in the place of those that are found: what follows from them."""
 
 import json
 import shutil
@@ -9,10 +9,12 @@ import pytest
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from kgs import cli, sfm
-from kgs.cli.unposed import is_bare
+from kgs.cli.unposed import is_unposed
 from kgs.datasets import synthetic_scene
 from kgs.datasets.layouts import nearest_scene
 from kgs.io.json_files import write_json
+from kgs.sfm.find import find_photos
+from kgs.sfm.read import open_photos
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
@@ -31,7 +33,7 @@ def truth():
 
 @pytest.fixture
 def folder(truth, tmp_path):
-    """A folder of bare photos; `folder(4)` has the first four."""
+    """A folder of unposed photos; `folder(4)` has the first four."""
 
     def made(count):
         place = tmp_path / f"photos{count}"
@@ -49,7 +51,9 @@ def asked(truth, monkeypatch):
     """True cameras in the place of found ones; the folders that were asked for."""
     calls = []
 
-    def true_cameras(folder, out, **_):
+    def true_cameras(folder, out, *, on_start=None, **_):
+        if on_start is not None and not (out / "photos.json").exists():
+            on_start(open_photos(find_photos(folder)))
         calls.append(sorted(path.name for path in folder.iterdir() if path.is_file()))
         model = out / "sparse" / "0"
         model.mkdir(parents=True, exist_ok=True)
@@ -102,13 +106,13 @@ def test_of_nine_photos_every_eighth_is_held_out(folder, tmp_path):
 
 
 def test_photos_are_told_from_scenes(folder, tmp_path, asked):
-    bare = folder(4)
-    assert is_bare(bare)
-    assert not is_bare(tmp_path / "nothing")
-    sfm.pose_photos(bare, bare / "out")
-    assert is_bare(bare)  # what kgs made of them does not count
-    assert not is_bare(bare / "out")
-    (bare / "scene" / "sparse" / "0").mkdir(parents=True)
-    shutil.copytree(bare / "out" / "sparse", bare / "scene" / "sparse", dirs_exist_ok=True)
-    assert nearest_scene(bare) == bare / "scene"
-    assert not is_bare(bare)
+    unposed = folder(4)
+    assert is_unposed(unposed)
+    assert not is_unposed(tmp_path / "nothing")
+    sfm.pose_photos(unposed, unposed / "out")
+    assert is_unposed(unposed)  # what kgs made of them does not count
+    assert not is_unposed(unposed / "out")
+    (unposed / "scene" / "sparse" / "0").mkdir(parents=True)
+    shutil.copytree(unposed / "out" / "sparse", unposed / "scene" / "sparse", dirs_exist_ok=True)
+    assert nearest_scene(unposed) == unposed / "scene"
+    assert not is_unposed(unposed)

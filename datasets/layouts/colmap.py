@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
+from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics, image_folder
 from kgs.errors import DataError
 
@@ -30,7 +31,7 @@ def load_colmap(root: Path) -> FrameSet:
         if not path.is_file() and (root / image.name).is_file():
             path = path_inside(images_file, root, image.name)
         lens = _intrinsics(cameras[image.camera_id])
-        frames.append(Frame(images_file, image.name, path, lens, camera_to_world(image)))
+        frames.append(Frame(images_file, image.name, ImageFile(path), lens, camera_to_world(image)))
         ids[path] = image_id
     others = [p.name for p in sorted(folder.parent.iterdir()) if p.name.isdecimal() and p != folder and p.is_dir()]
     notes = (f"sparse/: only model 0 is read, not {', '.join(others[:20])}",) if folder.name == "0" and others else ()

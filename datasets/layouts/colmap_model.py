@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs.datasets.images import read_bytes
+from kgs.datasets.image_file import read_bytes
 from kgs.errors import DataError
 
 T = TypeVar("T")

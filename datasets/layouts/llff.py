@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
+from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics, image_folder, list_images
 from kgs.errors import DataError
 
@@ -58,7 +59,7 @@ def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
     down, right, backward, center, (height, width, focal) = row[:15].reshape(3, 5).T
     pose = np.vstack([np.stack([right, down, -backward, center], axis=1), [0.0, 0.0, 0.0, 1.0]])
     lens = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
-    return Frame(source, path.name, path, lens, torch.from_numpy(pose))
+    return Frame(source, path.name, ImageFile(path), lens, torch.from_numpy(pose))
 
 
 def _model_points(folder: Path, frames: Sequence[Frame], train: Sequence[Frame]) -> PointCloud:

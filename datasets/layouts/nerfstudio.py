@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.frames import Frame, FrameSet, path_inside
-from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics, read_size
+from kgs.datasets.image_file import ImageFile
+from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics
 from kgs.errors import DataError
 from kgs.io.json_files import is_number, read_json
 
@@ -89,13 +90,24 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     split = {f"{part}_filenames" for part in ("train", "val", "test")} if name == "transforms.json" else set[str]()
     notes = _check_keys(source, [{key: data[key] for key in data.keys() - split}, *entries])
     names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
-    paths = [path_inside(source, root, name) for name in names]
-    size = next((read_size(path) for path in paths if path.is_file()), (1, 1))
+    images = [ImageFile(path_inside(source, root, name)) for name in names]
+    size = (1, 1)
+    if not all("w" in said and "h" in said for said in (ChainMap(entry, data) for entry in entries)):
+        size = _first_size(images)
     frames = [
-        Frame(source, name, path, _lens(source, ChainMap(entry, data), size), _opencv_pose(source, entry))
-        for name, path, entry in zip(names, paths, entries, strict=True)
+        Frame(source, name, image, _lens(source, ChainMap(entry, data), size), _opencv_pose(source, entry))
+        for name, image, entry in zip(names, images, entries, strict=True)
     ]
     return frames, data, notes
+
+
+def _first_size(images: list[ImageFile]) -> tuple[int, int]:
+    """Width and height of the first image that is there; 1x1 where none is, which `load_scene` refuses."""
+    for image in images:
+        if image.path.is_file():
+            image.load()  # its pixels will be decoded later: the file is not opened again for them
+            return image.size
+    return 1, 1
 
 
 def _find_photo(source: Path, root: Path, name: str) -> str:

@@ -1,13 +1,13 @@
-"""A synthetic scene with exact poses and exact depth: textured objects before a textured background.
+"""A synthetic scene with exact poses and exact depth: a table with books, a lamp, a plant and a mug.
 
-Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing
-of kgs takes part in making the images. Four rays per pixel are averaged.
-The world, with the axes and the places of `make_world` or `make_room`, depends on `kind` and `seed` only, never on the
-cameras.
+It stands in a room, to be photographed from the front, or in a garden, to be photographed from all around. Meshes are
+trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing of kgs
+takes part in making the images. Four rays per pixel are averaged. The world depends on `kind` and `seed` only, never on
+the cameras.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,44 +19,38 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views, pinholes
 
-from . import room
-from .raycast import Array, Index, raycast
-from .world import CENTER, make_world, shade
+from . import garden, room
+from .raycast import Array, raycast
+from .world import World
 
-KINDS = ("forward", "orbit", "room")
-FOCAL = 0.85  # focal length over the longer side of the image, as a phone's
+KINDS = ("room", "orbit")
 SUPERSAMPLING = 2  # rays along each side of a pixel
-PATCH = np.array([0.48, 0.27, 0.1])  # half the extent of the forward-facing training cameras: 0.4 of the near depth
-ORBIT = (4.2, 2.6)  # radius and mean height above `CENTER` of the orbit
 
 
 class _Stage(NamedTuple):
     """A world, and how it is photographed."""
 
-    triangles: Array  # (F, 3, 3)
-    paint: Callable[[Array, Index], Array]  # colours (n, 3) of points (n, 3) on triangles (n,)
+    world: World
     place: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # eyes of so many training and test cameras
     center: Array  # (3,), what they look at
     focal: float  # focal length over the longer side of the image
 
 
 def synthetic_scene(
-    kind: str = "forward", train_views: int = 3, test_views: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0
+    kind: str = "room", train_views: int = 3, test_views: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Scene:
-    """Make a scene of 20 to 40 objects in some seconds, without any file.
+    """Make a scene in some seconds, without any file.
 
     Convention:
         Kornia's: world-to-camera extrinsics with OpenCV axes, integer pixel centres (cx = (W - 1) / 2). Float32.
 
     Args:
-        kind: "forward": cameras on a small patch of a plane that look into a room, the test views between the
-            training views and a little outside of them. "orbit": cameras on a circle around the objects that look
-            inwards, on a piece of floor before a black background, the test views between the training views.
-            "room": forward-facing, too, before a table with books, a lamp, a plant and a mug; no noise to look at.
+        kind: "room": forward-facing cameras on a small patch before the table in a room, the test views between the
+            training views and a little outside of them. "orbit": cameras on a circle around the table in a garden,
+            which look inwards, the test views between the training views.
         train_views: at least 1.
         test_views: at least 0.
-        size: (height, width) of all images in pixels. The field of view is 61 degrees along the longer side,
-            58 in the room.
+        size: (height, width) of all images in pixels. The field of view is 58 degrees along the longer side.
         seed: of places, textures and cameras, at least 0. The same seed gives the same scene, without points.
 
     Raises:
@@ -79,7 +73,7 @@ def synthetic_scene(
 
 
 def synthetic_views(
-    eyes: NDArray[np.float64], kind: str = "forward", size: tuple[int, int] = (126, 168), seed: int = 0
+    eyes: NDArray[np.float64], kind: str = "room", size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Views:
     """Pictures of the synthetic scene from places of one's own: all of its middle, upright.
 
@@ -93,7 +87,7 @@ def synthetic_views(
     return _views(stage, stage.center + eyes, size, "photo")
 
 
-def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 0) -> Tensor:
+def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) -> Tensor:
     """The true depth of the synthetic scene at the pixel centres of any cameras.
 
     Convention:
@@ -113,7 +107,7 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
-    size, triangles = sizes.pop(), _stage(kind, seed).triangles
+    size, triangles = sizes.pop(), _stage(kind, seed).world.triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
     return torch.from_numpy(np.stack(depths)[:, None])
@@ -122,12 +116,14 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "forward", seed: int = 
 def _stage(kind: str, seed: int) -> _Stage:
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
+    return _make_stage(kind, seed)
+
+
+@lru_cache(maxsize=2)
+def _make_stage(kind: str, seed: int) -> _Stage:
     if kind == "room":
-        made, around = room.make_room(seed), partial(_patch_eyes, middle=room.EYE, patch=room.PATCH)
-        return _Stage(made.triangles, made.shade, around, room.CENTER, room.FOCAL)
-    world = make_world(kind, seed)
-    place = _patch_eyes if kind == "forward" else _orbit_eyes
-    return _Stage(world.triangles, partial(shade, world), place, CENTER, FOCAL)
+        return _Stage(room.make_room(seed), _patch_eyes, room.CENTER, room.FOCAL)
+    return _Stage(garden.make_garden(seed), _orbit_eyes, garden.CENTER, garden.FOCAL)
 
 
 def _views(stage: _Stage, eyes: Array, size: tuple[int, int], split: str) -> Views:
@@ -150,24 +146,22 @@ def _render(stage: _Stage, intrinsics: Array, extrinsics: Array, size: tuple[int
     s, fine = SUPERSAMPLING, intrinsics[:3, :3].copy()
     fine[:2] *= s
     fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
-    depths, faces = raycast(stage.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
+    depths, faces = raycast(stage.world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
     v, u = np.nonzero(faces >= 0)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(fine).T
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
-    colors[v, u] = stage.paint(points, faces[v, u])
+    colors[v, u] = stage.world.shade(points, faces[v, u])
     return np.asarray(colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1))
 
 
-def _patch_eyes(
-    train: int, test: int, rng: np.random.Generator, middle: float | Array = 0.0, patch: Array = PATCH
-) -> tuple[Array, Array]:
+def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Training cameras in a zigzag from left to right, test cameras spread over a patch 1.15 times as large."""
     x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
     # M. Roberts' R2 sequence: evenly spread, however many there are
     spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
     flat = np.concatenate([np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], -1), 1.15 * (2.0 * spread - 1.0)])
-    eyes = middle + patch * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
+    eyes = room.EYE + room.PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
     return eyes[:train], eyes[train:]
 
 
@@ -175,8 +169,9 @@ def _orbit_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array,
     """Training cameras all around at equal angles, test cameras in the middle half of the gaps between them."""
     gaps = np.arange(test) * train // max(test, 1) + rng.uniform(0.25, 0.75, size=test)
     angles = 2 * np.pi / train * np.concatenate([np.arange(train), gaps])
-    heights = ORBIT[1] + rng.uniform(-0.5, 0.5, size=train + test)
-    eyes = CENTER + np.stack([ORBIT[0] * np.sin(angles), -heights, -ORBIT[0] * np.cos(angles)], axis=-1)
+    heights = garden.HEIGHT + rng.uniform(-0.15, 0.15, size=train + test)
+    away = np.stack([garden.RADIUS * np.sin(angles), -heights, -garden.RADIUS * np.cos(angles)], axis=-1)
+    eyes = garden.CENTER + away
     return eyes[:train], eyes[train:]
 
 

@@ -25,7 +25,7 @@ from .study.pairs import grouped
 SPACINGS = tuple(round(0.6 * 1.275**i, 2) for i in range(20))  # degrees between neighbours, up to 61
 EASY = 2.0, 20.0  # degrees between neighbours that overlap and differ
 WRONG = 2.0, 0.1  # degrees in some pair, share of the focal length: more is wrong
-SIZE, DISTANCE = (378, 504), 3.3  # of a photo in pixels, and of the cameras from the middle of the scene
+SIZE, DISTANCE = (378, 504), 2.3  # of a photo in pixels, and of the cameras from the middle of the scene
 
 
 def cameras(*, out: Path, quick: bool = False, processes: int | None = None, scheduler: str | None = None) -> int:
@@ -56,8 +56,8 @@ def cameras(*, out: Path, quick: bool = False, processes: int | None = None, sch
 def arc_cell(cell: Cell) -> dict[str, Any]:
     """Find the cameras of "photos", "spacing" degrees apart on an arc in a "world", and compare with the truth."""
     angles = np.radians(cell["spacing"] * (np.arange(cell["photos"]) - (cell["photos"] - 1) / 2))
-    away = np.stack([np.sin(angles), np.full_like(angles, -0.05), -np.cos(angles)], axis=1)
-    truth = synthetic_views(DISTANCE * away, size=cell.get("size", SIZE), seed=cell["world"])
+    away = np.stack([np.sin(angles), np.full_like(angles, -0.25), -np.cos(angles)], axis=1)
+    truth = synthetic_views(DISTANCE * away, "orbit", size=cell.get("size", SIZE), seed=cell["world"])
     with TemporaryDirectory(prefix="kgs-") as place:
         folder = Path(place) / "photos"
         folder.mkdir()

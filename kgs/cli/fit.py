@@ -53,8 +53,8 @@ def fit(
             metrics.json, test/*.png, curve.png, config.json and the checkpoints.
         views: training views, spread over the views that are not held out; all of them unless given.
         hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
-            scene's files name, or else every eighth; of fewer than 9 bare photos none.
-        downscale: shrink the photos by this factor; bare ones on a CPU to 504 pixels unless given.
+            scene's files name, or else every eighth; of fewer than 9 unposed photos none.
+        downscale: shrink the photos by this factor; unposed ones on a CPU to 504 pixels unless given.
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
             counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
@@ -75,7 +75,7 @@ def fit(
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import write_own_page
 
-    from .unposed import find_scene, is_bare, settle
+    from .unposed import find_scene, is_unposed, settle
 
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
@@ -84,7 +84,7 @@ def fit(
     request["hold_out"] = hold_out
     request["points"] = config.init if config.init == "model-points" else "none"
     place = out
-    if bare := is_bare(scene):
+    if unposed := is_unposed(scene):
         request, place = find_scene(scene, out, request, config)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
@@ -94,10 +94,10 @@ def fit(
     options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
     metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)
     kept = bool(stopped_by) and is_finished(out)  # the former fit
-    if bare and not kept:
+    if unposed and not kept:
         settle(out)
     say(in_words(metrics))
-    posed = out if bare else scene
+    posed = out if unposed else scene
     splat = (fit_staging(out).unfinished if kept else out) / "splat.ply"
     renders, by = out / "renders", request["downscale"]
     shrunk = ("--downscale", f"{by:g}") if by else ()

@@ -1,4 +1,4 @@
-"""`kgs fit` of bare photos: their cameras first, and then a scene like any other, in the folder of the results."""
+"""`kgs fit` of unposed photos: their cameras first, and then a scene like any other, in the folder of the results."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ LONGEST = 504  # pixels of the longer side in a fit on a CPU
 FEW = 9  # photos: of fewer none is held out
 
 
-def is_bare(scene: Path) -> bool:
+def is_unposed(scene: Path) -> bool:
     """Whether this can only be photos without cameras, or a video of them: no scene, and none right below or above."""
     if scene.is_file():
         return scene.suffix.lower() in VIDEO_SUFFIXES
@@ -21,7 +21,7 @@ def is_bare(scene: Path) -> bool:
 
 
 def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConfig) -> tuple[dict[str, Any], Path]:
-    """Find the cameras of bare photos; returns how the scene is to be loaded, as config.json has it, and from where.
+    """Find the cameras of unposed photos; returns how the scene is to be loaded, as config.json has it, and from where.
 
     That folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
 

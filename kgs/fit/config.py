@@ -107,10 +107,6 @@ class FitConfig:
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         drop_until: share of the steps, the first ones, in which Gaussians are dropped; in [0, 1].
-        drop_by: random is the method. The others drop by scores, for comparison: the Gaussians with the highest or
-            lowest mean gradient, those nearest to or farthest from the camera.
-        opacity_l1: weight of the L1 penalty on opacities; 0 leaves it out.
-        opacity_l1_by: the penalty is heavier on Gaussians with a low mean gradient, or at a great distance.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, what the training
             views need, which short fits find out.
         refine_poses: move the training cameras too, for poses that are half a degree or more off: good ones lose a
@@ -145,9 +141,6 @@ class FitConfig:
     drop: Annotated[float, _Range(0, 1, "[)")] = 0.2
     drop_schedule: Literal["linear", "constant"] = "linear"
     drop_until: _Share = 0.9
-    drop_by: Literal["random", "high-gradient", "low-gradient", "near", "far"] = "random"
-    opacity_l1: _Weight = 0.0
-    opacity_l1_by: Literal["gradient", "distance"] = "gradient"
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
     refine_poses: bool = False
     coarse: _Share = 0.0

@@ -1,4 +1,4 @@
-"""What a fitted splat can do without: Gaussians that no training view shows, and harmonics that no picture shows."""
+"""Removes what the training views do not need: Gaussians that contribute to no image, and unused harmonics."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,41 +14,48 @@ from kgs.renderer import GaussianRenderer
 
 from .trainer import Trainer
 
-TOLERANCE = 0.01  # decibels by which the PSNR of a training view may change
+TOLERANCE = 0.01  # dB by which the PSNR of a training view may change
 WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)  # pixels that a Gaussian covers in all training views; -1: all
-QUANTUM = 0.5 / 255  # what an 8-bit picture does not show
+QUANTUM = 0.5 / 255  # a smaller change of an 8-bit image is not visible
 
 
 def prune(trainer: Trainer) -> None:
-    """Show only what the training views need; the fit itself keeps everything. Nothing is done with `keep_all`.
+    """Show only what the training views need; the fit itself keeps everything. Does nothing with `keep_all`.
 
-    Of the limits in `WEIGHTS` the highest is taken that changes the PSNR of no training view by more than `TOLERANCE`,
-    and of the degrees of harmonics the lowest of which that holds too, and that changes no value of the pictures by
-    more than `QUANTUM`.
+    The highest limit of `WEIGHTS` is taken that changes the PSNR of no training view by more than `TOLERANCE`, then the
+    lowest degree of harmonics of which the same holds and that changes no value of the images by more than `QUANTUM`.
 
     It records "gaussians" in `trainer.needs`: how many were "fitted" and "kept", the limit "weight", and "sh_degree".
     """
     if trainer.config.keep_all:
         return
     model, views = trainer.model, trainer.scene.train
-    rules: dict[str, Any] = {"max_bytes": trainer.config.max_bytes, "backend": trainer.backend}
-    weights = contributions(model, views, trainer.near_plane, **rules)
-    trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # also where a part was shown, of a fit that was done before
+    weights = contributions(
+        model, views, trainer.near_plane, max_bytes=trainer.config.max_bytes, backend=trainer.backend
+    )
+    trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # all, also where a finished fit goes on
     levels = _levels(trainer)
     for limit in WEIGHTS:
         rows = weights > limit
         trainer.show(rows, model.sh_degree)
         if _is_close(_levels(trainer), levels):
             break
-    degree, pictures = 0, [trainer.render(views.camera(i)) for i in range(len(views))] if model.sh_degree else []
-    for degree in range(model.sh_degree + 1):
+    degree = _fewest_harmonics(trainer, rows, levels)
+    kept = len(trainer.shown)
+    trainer.record("gaussians", {"fitted": len(model), "kept": kept, "weight": limit, "sh_degree": degree})
+
+
+def _fewest_harmonics(trainer: Trainer, rows: Tensor, levels: list[float]) -> int:
+    """Show the Gaussians at `rows` with the lowest degree that changes no image; returns the degree."""
+    most, views = trainer.model.sh_degree, trainer.scene.train
+    images = [trainer.render(views.camera(i)) for i in range(len(views))] if most else []
+    for degree in range(most + 1):
         trainer.show(rows, degree)
-        renders = (trainer.render(views.camera(i)) for i in range(len(pictures)))
-        same = all(bool(((now - whole).abs() <= QUANTUM).all()) for now, whole in zip(renders, pictures, strict=True))
+        renders = (trainer.render(views.camera(i)) for i in range(len(images)))
+        same = all(bool(((now - before).abs() <= QUANTUM).all()) for now, before in zip(renders, images, strict=True))
         if same and _is_close(_levels(trainer), levels):
             break
-    found = {"fitted": len(model), "kept": len(trainer.shown), "weight": limit, "sh_degree": degree}
-    trainer.record("gaussians", found)
+    return degree
 
 
 def _is_close(levels: list[float], others: list[float]) -> bool:
@@ -60,12 +67,12 @@ def _levels(trainer: Trainer) -> list[float]:
     return [min(trainer.psnr(views.select([i])) or BEST, BEST) for i in range(len(views))]
 
 
-def contributions(model: GaussianModel, views: Views, near_plane: float, **rules: Any) -> Tensor:
+def contributions(model: GaussianModel, views: Views, near_plane: float, **options: Any) -> Tensor:
     """The sum of each Gaussian's blending weights over the pixels of all views, `(N,)`.
 
-    It is the gradient of the pictures' sum by a colour of its own. `rules` are those of the renderer.
+    It is the gradient of the sum of all images by the Gaussian's colour. `options` are those of the renderer.
     """
-    renderer = GaussianRenderer(near_plane=near_plane, **rules).eval()
+    renderer = GaussianRenderer(near_plane=near_plane, **options).eval()
     with torch.no_grad():
         gaussians = model()
     colors = torch.zeros_like(gaussians.means).requires_grad_()

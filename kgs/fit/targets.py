@@ -1,4 +1,4 @@
-"""What a step compares its render with: a photo, what D-SSIM wants of it, where it is transparent, and its border."""
+"""What a training step compares its render with: a photo, its SSIM statistics, its transparency and its border."""
 
 from typing import NamedTuple
 
@@ -17,17 +17,17 @@ class Target(NamedTuple):
     camera: PinholeCamera
     image: Tensor  # (1, 3, H, W)
     moments: TargetMoments
-    clear: Tensor | None  # (1, 1, H, W), how much of the background shows; None: nothing
-    background: Tensor  # (3,), the one that shows
-    light: Tensor | None  # (H, W), what a border lets through; None: everything
+    clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0
+    background: Tensor  # (3,), the background in the photo
+    light: Tensor | None  # (H, W), the transmittance of a dark border; None: 1
 
     def seen(self, render: Tensor) -> Tensor:
-        """A render as the photo would show it: with no value above 1, behind the border."""
+        """A render as the photo would show it: clamped to 1, and darkened by the border."""
         image = render.masked_fill(render > 1, 1.0)  # it is never below 0
         return image if self.light is None else image * self.light
 
     def before(self, background: Tensor) -> tuple[Tensor, TargetMoments]:
-        """The image, and its moments, before another background, `(3,)`."""
+        """The image in front of another background, `(3,)`, and its SSIM statistics."""
         if self.clear is None:
             return self.image, self.moments
         image = self.image + self.clear * (background - self.background)[:, None, None]
@@ -35,7 +35,7 @@ class Target(NamedTuple):
 
 
 def targets(views: Views, background: Tensor, device: torch.device) -> list[Target]:
-    """One for each view; `background`, `(3,)`, is that of the scene."""
+    """One target for each view; `background`, `(3,)`, is that of the scene."""
     images = [image[None].to(device, torch.float32) for image in views.images]
     masks = [None] * len(views) if views.masks is None else [1.0 - mask[None].to(images[0]) for mask in views.masks]
     cameras = [move_camera(views.camera(i), device) for i in range(len(views))]

@@ -21,15 +21,16 @@ from kgs.backends import resolve
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
+from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged
 from kgs.geometry import camera_extent, typical_depths
 from kgs.init_points import FirstPoints
-from kgs.losses import opacity_l1, photometric_loss
+from kgs.losses import photometric_loss
 from kgs.machine import check_device
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import PARAMETERS, GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import check_kind
+from kgs.types import Gaussians, check_kind
 
 from .checkpoint import (
     PLAIN,
@@ -44,7 +45,6 @@ from .checkpoint import (
 from .config import CHOICES, FitConfig, most_gaussians, timetable
 from .divergence import gradient_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
-from .scores import SelectiveDrop, gaussian_scores
 from .targets import targets
 
 # learning rates of the recipe: `lr_means` is that of the parameter `means`
@@ -163,7 +163,7 @@ class Trainer:
             for name, rate in _LEARNING_RATES.items()
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
-        self.drop = SelectiveDrop(config.drop, config.drop_schedule, seed=seed + 1) if config.drop else None
+        self.drop = self.make_drop(seed + 1)
         self.renderer = GaussianRenderer(
             self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes, backend=self.backend
         ).train()
@@ -181,6 +181,17 @@ class Trainer:
         self.colors = torch.Generator().manual_seed(seed + 4)
         if self.poses is not None:
             self.poses.depth = start.depth
+
+    def make_drop(self, seed: int) -> DropGaussian | None:
+        """The layer on the opacities, None without dropping. A subclass may take another one."""
+        return DropGaussian(self.config.drop, self.config.drop_schedule, seed=seed) if self.config.drop else None
+
+    def before_render(self, camera: PinholeCamera) -> None:
+        """Called before each training render, for subclasses."""
+
+    def penalty(self, gaussians: Gaussians, camera: PinholeCamera) -> Tensor | None:
+        """A term that is added to the loss of a step, 0-d; for subclasses."""
+        return None
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
@@ -344,16 +355,14 @@ class Trainer:
         if self.drop is not None:
             self.drop.progress = progress
             self.drop.train(progress <= config.drop_until)
-            if config.drop_by != "random":
-                self.drop.scores = gaussian_scores(config.drop_by, self.densifier, camera)
+        self.before_render(camera)
         gaussians = self.model()
         out = self.renderer(gaussians, camera, background)
         image = view.seen(out.image)
         loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
-        if config.opacity_l1:
-            low = config.opacity_l1_by == "gradient"
-            scores = gaussian_scores("low-gradient" if low else "far", self.densifier, camera)
-            loss = loss + config.opacity_l1 * opacity_l1(gaussians.opacities, scores)
+        penalty = self.penalty(gaussians, camera)
+        if penalty is not None:
+            loss = loss + penalty
         value = float(loss.detach())
         self._stop_if(step_fault(self.model, out.projected.num_nonfinite, value))
         if loss.requires_grad:

@@ -1,4 +1,4 @@
-"""First points of a fit, from the training views alone: nothing here ever sees a test view."""
+"""Initial points of a fit, from the training views alone: test views are never used here."""
 
 import warnings
 from dataclasses import dataclass
@@ -31,15 +31,15 @@ from .triangulate import triangulate_certain
 __all__ = ["FirstPoints", "first_points"]
 
 KINDS, DRAWS = ("dense", "sift", "random", "file"), ("uniform", "spread")
-FEWEST_DENSE = 1000
-FEWEST_POINTS = 20  # a start with fewer SIFT points than this is worse than a random one
+MIN_DENSE = 1000
+MIN_SIFT = 20  # a fit from fewer SIFT points is worse than one from random points
 MAX_SPACING = 4.0  # of a point, in medians of all
 # Quantiles are NumPy's: torch.quantile refuses more than 16 million values.
 
 
 @dataclass(frozen=True)
 class FirstPoints:
-    """What a fit starts from.
+    """The points that a fit starts from, with their colours.
 
     Args:
         points: in the frame of the views, `(P, 3)` float32 on the CPU.
@@ -81,9 +81,9 @@ def first_points(
         count: how many points "random" gives, and "dense" at most; >= 1.
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
-        stage: shows how far the work is: :func:`kgs.io.console.each`, or nothing.
+        stage: shows the progress: :func:`kgs.io.console.each`, or nothing.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
-        draw: of "dense" points: "uniform", or "spread" evenly over the pictures.
+        draw: of "dense" points: "uniform", or "spread" evenly over the images.
 
     Returns:
         The points; their `kind` is what they are, so "random" where "sift" found too few.
@@ -107,22 +107,22 @@ def first_points(
     points, tracks = triangulate_certain(find_tracks(views, stage, backend), views.cameras)
     good = _within_typical_depths(points, tracks.seen, views.cameras)
     points, tracks = points[good], tracks.select(good)
-    if len(points) >= FEWEST_POINTS:
-        good = _in_company(points, tracks.seen, views.cameras)
+    if len(points) >= MIN_SIFT:
+        good = _has_neighbours(points, tracks.seen, views.cameras)
         points, tracks = points[good], tracks.select(good)
     near, far = _depth_range(points, views.cameras)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
-        near, far = _sweep_range(points, views) if len(points) >= FEWEST_POINTS else (near, far)
+        near, far = _sweep_range(points, views) if len(points) >= MIN_SIFT else (near, far)
         dense, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw)
-        if agreed >= min(FEWEST_DENSE, count):
+        if agreed >= min(MIN_DENSE, count):
             return FirstPoints(dense, colors, kind)
         message = f"first points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
         warnings.warn(message, stacklevel=2)
     if kind in ("dense", "sift"):
-        if len(points) >= FEWEST_POINTS:
+        if len(points) >= MIN_SIFT:
             return FirstPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), "sift")
-        message = f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {FEWEST_POINTS}; "
+        message = f"first points: SIFT found {len(points)} in {len(views)} training views, fewer than {MIN_SIFT}; "
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
     pixels, depths = project_points(points, views.cameras)
@@ -131,7 +131,7 @@ def first_points(
 
 
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Whether all views of a point have it between half the 1st and twice the 99th percentile of all depths."""
+    """Whether the depths of a point lie, in all its views, between half the 1st and twice the 99th percentile."""
     _, depths = project_points(points, cameras)
     if not seen.any():
         return torch.zeros(len(points), dtype=torch.bool)
@@ -140,15 +140,15 @@ def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera)
     return good.all(1)
 
 
-def _in_company(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Whether the points' spacing in the image is usual; a false match, alone, would cover much of the images."""
+def _has_neighbours(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
+    """Rejects isolated points: their initial scale would be huge. A false match is usually isolated."""
     _, depths = project_points(points, cameras)
     spacing = log_spacing(points).exp() * (cameras.fx.double().cpu() / depths).masked_fill(~seen, 0.0).amax(1)
     return spacing < MAX_SPACING * spacing.median()
 
 
 def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
-    """Nearest and farthest depth to expect: from points if there are any, else from the cameras."""
+    """The expected range of depths: from the points if there are any, else from the cameras."""
     if len(points) > 1:
         _, depths = project_points(points, cameras)
         least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
@@ -162,23 +162,23 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
 
 
 def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
-    """Beyond all points in an image: a background that is cut off costs decibels, a few more planes cost nothing."""
+    """The depths of the plane sweep, wider than those of all points: cutting the background off costs quality."""
     depths = depths_in_images(points, views.cameras)
     return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 
 
 def _random_points(views: Views, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
-    """Points of even density where at least two views see; where there is no such place, where one sees."""
+    """Points of even density in the space that at least two views see, or one where there is no such space."""
     size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
     found: list[Tensor] = []
-    for fewest in [min(2, len(views))] * 50 + [1] * 50:
+    for required in [min(2, len(views))] * 50 + [1] * 50:
         draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
         view = (torch.rand(4 * count, generator=generator) * len(views)).long()
         depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
         points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
-        # A place that k views see is drawn k times as often as one that a single view sees.
+        # space that k views see is drawn from k times as often
         seeing = inside_images(*project_points(points, views.cameras), views.cameras, near, far).sum(1)
-        found.append(points[(seeing >= fewest) & (draws[:, 3] * seeing < fewest)])
+        found.append(points[(seeing >= required) & (draws[:, 3] * seeing < required)])
         if sum(map(len, found)) >= count:
             break
     return torch.cat(found)[:count]

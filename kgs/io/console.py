@@ -1,4 +1,4 @@
-"""What a fit says while it works: lines, and how far each stage is. Nobody who stops listening can end the work."""
+"""Lines and progress bars on the console. A closed pipe never aborts a fit."""
 
 import shlex
 import sys
@@ -26,12 +26,12 @@ def say(line: str, file: TextIO | None = None) -> None:
 
 
 def say_next(*steps: str) -> None:
-    """Say what the user may do now."""
+    """Suggest next commands to the user."""
     say("\n  ".join(["next:", *steps]))
 
 
 def as_line(*words: object) -> str:
-    """Words as one types them in a shell, on one line."""
+    """Words quoted for a shell, on one line."""
     return " ".join(_quoted(str(word)) for word in words)
 
 
@@ -44,10 +44,10 @@ def _quoted(word: str) -> str:
 
 @contextmanager
 def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """Show on stderr how far a stage of `total` units is: a bar on a terminal, else a line for every tenth.
+    """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a line for every tenth.
 
-    Yields `advance(note="")`, for one more unit that is done; the note stands behind the figures. `done` units were
-    done before. With a total of 0 nothing is shown.
+    Yields `advance(note="")`, to be called after each unit; the note is shown behind the figures. `done` units are
+    already done. With a total of 0 nothing is shown.
     """
     bar: Any = None
     with suppress(OSError, ValueError, AttributeError, ImportError):  # no tqdm, or a stderr that is closed
@@ -64,7 +64,8 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
                 bar.set_postfix_str(note, refresh=False)
                 bar.update()
         elif done * 10 // total > (done - 1) * 10 // total:
-            say(f"{title}: {done} of {total} {unit}s{', ' * bool(note)}{note}", sys.stderr)
+            behind = f", {note}" if note else ""
+            say(f"{title}: {done} of {total} {unit}s{behind}", sys.stderr)
 
     try:
         yield advance
@@ -75,7 +76,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
 
 
 def each(items: Sequence[Any], title: str, unit: str) -> Iterator[Any]:
-    """The items; each that is done moves the stage on."""
+    """Iterate over the items with a progress bar."""
     with progress(len(items), title, unit=unit) as advance:
         for item in items:
             yield item
@@ -83,5 +84,5 @@ def each(items: Sequence[Any], title: str, unit: str) -> Iterator[Any]:
 
 
 def silent(items: Sequence[Any], title: str, unit: str) -> Iterable[Any]:
-    """The items; nothing is shown."""
+    """The items, without a progress bar."""
     return items

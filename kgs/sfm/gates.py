@@ -61,14 +61,14 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
     return worst
 
 
-def faint_focal(found: Sequence[Cameras]) -> str:
+def focal_doubt(found: Sequence[Cameras]) -> str:
     """Why no solver's photos tell the focal length; "" if those of one do."""
     rise = max(0.0, *(cameras.focal_rise for cameras in found))
     told = rise >= LEAST_RISE
     return "" if told else f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {LEAST_RISE:.0%}"
 
 
-def unlike_focals(found: Sequence[Cameras]) -> str:
+def focal_difference(found: Sequence[Cameras]) -> str:
     """How far the solvers' focal lengths are apart, where that is too far; "" if it is not."""
     ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
     unlike = ratio > MOST_RATIO
@@ -91,16 +91,16 @@ def judge(
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
             raise DataError(folder, "", refusal([reason], names, pairs))
     both = [cameras for cameras in found if cameras]
-    if doubt := faint_focal(both):
-        raise DataError(folder, "", untold(doubt, names, pairs))
+    if doubt := focal_doubt(both):
+        raise DataError(folder, "", focal_refusal(doubt, names, pairs))
     degrees, pair = disagreement(*both)
     if degrees > MOST_DEGREES:
         reason = (
             f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
         )
         raise DataError(folder, "", refusal([reason], names, pairs))
-    if doubt := unlike_focals(both):
-        raise DataError(folder, "", untold(doubt, names, pairs))
+    if doubt := focal_difference(both):
+        raise DataError(folder, "", focal_refusal(doubt, names, pairs))
     sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE] or good
     return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
 
@@ -135,7 +135,7 @@ def table(names: Sequence[str], pairs: Pairs) -> str:
     return "\n".join(["Matches of each pair:", head, *rows])
 
 
-def unfit(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Look]) -> str:
+def why_no_cameras(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Look]) -> str:
     """What to say of photos whose matches can give no cameras, and what to photograph next; "" of others.
 
     Args:
@@ -166,7 +166,7 @@ def unfit(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Lo
     return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
 
 
-def untold(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
+def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
     """What to say of photos of which neither they nor their Exif tell the focal length; `doubt` says why."""
     return (
         "no cameras that can be trusted: the photos do not tell the focal length, as a rule because they are close "

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -20,7 +21,6 @@ from kgs.io.outputs import png_names
 from kgs.io.results_folder import locked
 from kgs.machine import versions
 
-from .exif import FILM_DIAGONAL
 from .find import find_photos
 from .gates import (
     FEWEST_POINTS,
@@ -28,14 +28,14 @@ from .gates import (
     LEAST_RISE,
     MOST_DEGREES,
     MOST_RATIO,
-    faint_focal,
+    focal_difference,
+    focal_doubt,
     judge,
-    unfit,
-    unlike_focals,
+    why_no_cameras,
 )
 from .map import Cameras, lens_found, looks, quiet_pycolmap, solve, verify, write_own_matches
 from .match import exif_focal, lens_of, write_matches
-from .read import Photo, blurred, hash_photos, read_photos
+from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .write import (
     IMAGES,
     MODEL,
@@ -63,7 +63,7 @@ def pose_photos(
     stage: Stage = silent,
     say: Callable[[str], None] = say,
 ) -> dict[str, Any]:
-    """Find the cameras of bare photos, and write a scene that `kgs.datasets.load_scene` reads.
+    """Find the cameras of unposed photos, and write a scene that `kgs.datasets.load_scene` reads.
 
     The folder `out` gets `images` (upright PNGs of one size, at most 1600 pixels long, without metadata), `sparse/0`
     (COLMAP's binary model: one SIMPLE_RADIAL lens, poses, points with tracks) and `photos.json` (the report). If the
@@ -90,20 +90,21 @@ def pose_photos(
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
             what to do, with the number of matches of each pair.
-        ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
+        ModuleNotFoundError: pycolmap or Pillow is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    with quiet_pycolmap():  # a missing package is told before any work
+    import_module("PIL")  # a missing package is told before any work
+    with quiet_pycolmap():
         pass
     paths = find_photos(folder)
     check_place(out, folder)
-    hashes = hash_photos(paths)
+    opened = open_photos(paths)
+    same = {"settings": SETTINGS, "seed": seed, "sha256": {photo.path.name: photo.sha256 for photo in opened}}
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         staging = photo_staging(out)
         waiting = staging.finished
-        same = {"settings": SETTINGS, "seed": seed, "sha256": hashes}
         if not (wait and staging.is_waiting):
             staging.complete()
         place = next((place for place in (waiting, out) if is_kept(place, same)), None)
@@ -115,7 +116,7 @@ def pose_photos(
             new = staging.unfinished
             staging.start()
             try:
-                report = find_cameras(paths, new, seed % 2**31, stage, say)
+                report = find_cameras(opened, new, seed % 2**31, stage, say)
                 write_json(new / REPORT, same | report)
                 staging.seal()
             finally:
@@ -126,41 +127,52 @@ def pose_photos(
         return read_json(found / REPORT) | {"reused": place is not None, "folder": str(found)}
 
 
-def find_cameras(paths: list[Path], new: Path, seed: int, stage: Stage, say: Callable[[str], None]) -> dict[str, Any]:
+def find_cameras(
+    opened: list[OpenPhoto], new: Path, seed: int, stage: Stage, say: Callable[[str], None]
+) -> dict[str, Any]:
     """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
 
     Raises:
         DataError: the photos do not fit together, or their cameras cannot be believed.
     """
     seconds, lap = dict[str, float](), _clock()
-    folder, names, work, images = paths[0].parent, [path.name for path in paths], new / "work", new / IMAGES
+    folder, names = opened[0].path.parent, [photo.path.name for photo in opened]
+    work, images = new / "work", new / IMAGES
     for path in (images, work):
         path.mkdir(parents=True)
     with _one_thread():
-        photos = read_photos(paths, stage)
+        photos = read_photos(opened, stage)
         unsharp = [photo.path.name for photo in blurred(photos)]
         if unsharp:
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
         png = png_names(names)
-        write_images(images, photos, list(png.values()))
+        image_names, photo_names = list(png.values()), {image: name for name, image in png.items()}
+        write_images(images, photos, image_names)
         seconds["photos"] = lap()
-        first, second, known = work / "first.db", work / "second.db", {image: name for name, image in png.items()}
+        first, second = work / "first.db", work / "second.db"
         with quiet_pycolmap(), ThreadPoolExecutor(1) as beside:
-            own = beside.submit(write_own_matches, second, images, list(png.values()), lens_of(photos), seed)
-            write_matches(first, photos, list(png.values()), stage)
-            pairs = verify(first, seed, known)
+            second_matches = beside.submit(write_own_matches, second, images, image_names, lens_of(photos), seed)
+            write_matches(first, photos, image_names, stage)
+            pairs = verify(first, seed, photo_names)
             seconds["matches"] = lap()
-            if against := unfit(names, pairs, looks(first, known)):
-                raise DataError(folder, "", against)
-            other = beside.submit(lambda: (own.result(), solve(second, images, work / "second", seed, known))[1])
-            found = [solve(first, images, work / "first", seed, known)]
+            if reason := why_no_cameras(names, pairs, looks(first, photo_names)):
+                raise DataError(folder, "", reason)
+
+            def solve_second() -> Cameras | None:
+                second_matches.result()
+                return solve(second, images, work / "second", seed, photo_names)
+
+            second_cameras = beside.submit(solve_second)
+            found = [solve(first, images, work / "first", seed, photo_names)]
             seconds["cameras"] = lap()
-            found.append(other.result())
+            found.append(second_cameras.result())
         placed = [cameras for cameras in found if cameras]
-        held = exif_focal(photos) if placed and (faint_focal(placed) or unlike_focals(placed)) else None
+        held = None
+        if placed and (focal_doubt(placed) or focal_difference(placed)):
+            held = exif_focal(photos)
         if held:
             say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
-            found = [solve(matched, images, work / "held", seed, known, held) for matched in (first, second)]
+            found = [solve(matches, images, work / "held", seed, photo_names, held) for matches in (first, second)]
         seconds["second solver"] = lap()
         chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
         level_and_scale(chosen)

@@ -1,27 +1,84 @@
 """Photos as a phone wrote them, made ready: decoded, turned upright, of one size, and what is known of the lens."""
 
 import hashlib
+import math
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs.datasets.images import Intrinsics, read_bytes, read_image, read_size
+from kgs.datasets import image_file
+from kgs.datasets.image_file import ImageFile, turn
+from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 from kgs.io.console import Stage
 
-from .exif import FILM_DIAGONAL, Exif, read_exif, turn
 from .find import CONVERT, listed
-from .heic import can_read_heic, is_heic, open_heic
 
 LONGEST = 1600  # pixels of the longer side, for matching and for what is written
+FILM_DIAGONAL = math.hypot(36, 24)  # mm
+_ORIENTATION, _FOCAL, _FOCAL_35 = 0x0112, 0x920A, 0xA405
+_PIXELS_X, _DENSITY, _DENSITY_UNIT = 0xA002, 0xA20E, 0xA210
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
 _SAME_ZOOM = 1.1  # ratio of focal lengths that one lens may have
 _BLURRED = 0.5  # of the median sharpness
+
+
+class Exif(NamedTuple):
+    """How a photo is turned, and what its file says about the focal length; None where it says nothing.
+
+    Sources: Exif 2.32 (CIPA DC-008, 4.6); CIPA DCG-001 for the length on 35 mm film, which compares diagonals.
+    """
+
+    orientation: int = 1  # 1 (upright) to 8
+    focal_35mm: float | None = None  # in mm
+    focal_over_width: float | None = None  # of the stored image, from the density of its pixels on the sensor
+
+    @classmethod
+    def of(cls, tags: Mapping[int, Any]) -> Self:
+        """That of an image's tags; a damaged one counts as one that is not there."""
+        orientation = int(_number(tags, _ORIENTATION))
+        film, focal, density = (_number(tags, tag) for tag in (_FOCAL_35, _FOCAL, _DENSITY))
+        width, unit = _number(tags, _PIXELS_X), _UNITS.get(int(_number(tags, _DENSITY_UNIT) or 2), 0.0)
+        ratio = focal * density / (unit * width) if unit and width else 0.0
+        return cls(orientation if 1 <= orientation <= 8 else 1, film or None, ratio or None)
+
+    @property
+    def is_lying(self) -> bool:
+        """Whether the stored image has the upright one's width as its height."""
+        return self.orientation > 4
+
+    def focal_ratio(self, width: int, height: int) -> float | None:
+        """The focal length over the longer side of a photo of this shape, or None."""
+        if self.focal_35mm:
+            return self.focal_35mm / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
+        stored = height if self.is_lying else width
+        return self.focal_over_width * stored / max(width, height) if self.focal_over_width else None
+
+
+def _number(tags: Mapping[int, Any], tag: int) -> float:
+    """A tag's number, the first if there are several; 0 where there is none above 0."""
+    value = tags.get(tag)
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]  # None is a TypeError
+    except (TypeError, ValueError, ZeroDivisionError, IndexError, OverflowError):
+        return 0.0
+    return number if 0 < number < math.inf else 0.0
+
+
+class OpenPhoto(NamedTuple):
+    """A photo whose file is read and not decoded yet."""
+
+    path: Path
+    sha256: str
+    exif: Exif
+    size: tuple[int, int]  # width and height of the upright photo
+    image: ImageFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,58 +109,56 @@ class Photo:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def hash_photos(paths: list[Path]) -> dict[str, str]:
-    """SHA-256 of each file by its name; a DataError where two files are one photo."""
-    names: dict[str, str] = {}
-    for path in paths:
-        digest = hashlib.sha256(read_bytes(path)).hexdigest()
-        if digest in names:
-            reason = f"is the same photo as {names[digest]}: remove one of them. A second look needs a second place"
-            raise DataError(path, "", reason)
-        names[digest] = path.name
-    return {name: digest for digest, name in names.items()}
-
-
-def read_photos(paths: list[Path], stage: Stage) -> list[Photo]:
-    """Read photos, turn them as their Exif says, and reduce them to the size of the smallest or to 1600 pixels.
+def open_photos(paths: list[Path]) -> list[OpenPhoto]:
+    """Open photos without decoding them. Their files are not opened again: `read_photos` decodes what is kept here.
 
     Raises:
-        DataError: a photo cannot be read, the photos have several shapes, or were taken at several focal lengths.
+        DataError: a file cannot be read or is no photo, or two files are the same photo.
     """
-    metadata, sizes = [], []
+    photos: dict[str, OpenPhoto] = {}
     for path in paths:
-        exif, size, read = _open(path)
-        metadata.append((exif, read))
-        sizes.append(size)
+        photo = _open(path)
+        if photo.sha256 in photos:
+            other = photos[photo.sha256].path.name
+            reason = f"is the same photo as {other}: remove one of them. A second look needs a second place"
+            raise DataError(path, "", reason)
+        photos[photo.sha256] = photo
+    return list(photos.values())
+
+
+def _open(path: Path) -> OpenPhoto:
+    image = ImageFile(path)
+    data = image.load()
+    if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and image_file.has_heic()):
+        raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
+    exif = Exif.of(image.metadata.tags)
+    width, height = image.size
+    size = (height, width) if exif.is_lying else (width, height)
+    return OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image)
+
+
+def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
+    """Decode photos, turn them as their Exif says, and reduce them to the size of the smallest or to 1600 pixels.
+
+    Raises:
+        DataError: a photo cannot be decoded, the photos have several shapes, or were taken at several focal lengths.
+    """
+    paths = [photo.path for photo in opened]
+    sizes = [photo.size for photo in opened]
     _check_shapes(paths, sizes)
     width, height = min(sizes)
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    _check_lenses(paths, [exif.focal_ratio(*size) for exif, _ in metadata], size)
+    _check_lenses(paths, [photo.exif.focal_ratio(*size) for photo in opened], size)
     photos = []
-    for path, (exif, read) in stage(list(zip(paths, metadata, strict=True)), "photos", "photo"):
-        image, stored = read(), size[::-1] if exif.orientation > 4 else size
-        if image.shape[1::-1] != stored:
-            image = np.asarray(cv2.resize(image, stored, interpolation=cv2.INTER_AREA), np.float32)
-        upright = turn((image.clip(0, 1) * 255).round().astype(np.uint8), exif.orientation)
-        photos.append(Photo(path, exif, np.ascontiguousarray(upright)))
+    for photo in stage(opened, "photos", "photo"):
+        pixels = photo.image.read()
+        stored = size[::-1] if photo.exif.is_lying else size
+        if pixels.shape[1::-1] != stored:
+            pixels = np.asarray(cv2.resize(pixels, stored, interpolation=cv2.INTER_AREA), np.float32)
+        upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
+        photos.append(Photo(photo.path, photo.exif, np.ascontiguousarray(upright)))
     return photos
-
-
-def _open(path: Path) -> tuple[Exif, tuple[int, int], Callable[[], NDArray[np.float32]]]:
-    """What a photo says of its lens, its width and height when it is upright, and what reads its pixels as stored."""
-    data = read_bytes(path)
-    if is_heic(data) and can_read_heic():
-        return open_heic(path, data)
-    if data[4:8] == b"ftyp":
-        raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
-    exif, (width, height) = read_exif(data), read_size(path)
-    return exif, (height, width) if exif.orientation > 4 else (width, height), partial(read_image, path)
-
-
-def upright_size(path: Path) -> tuple[int, int]:
-    """Width and height of a photo when it is upright, not decoded; a DataError where it cannot be read."""
-    return _open(path)[1]
 
 
 def blurred(photos: list[Photo]) -> list[Photo]:

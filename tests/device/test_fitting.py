@@ -84,7 +84,7 @@ def test_a_fit_resumes_bit_for_bit_and_goes_to_the_cpu_and_back(device, scene, p
 
 
 def test_scores_opacity_penalty_and_coarse_steps(device, scene, points, config):
-    done = fitted(scene, points, replace(config, drop_by="far", opacity_l1=0.01, coarse=0.5, growth=0.8))
+    done = fitted(scene, points, replace(config, coarse=0.5, growth=0.8))
     assert all(bool(value.isfinite().all()) for value in bits(done).values())
 
 

@@ -22,7 +22,7 @@ from tiny_scenes import (
 )
 
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
-from kgs.datasets.images import read_image
+from kgs.datasets.image_file import read_image
 from kgs.fit.config import FitConfig, timetable
 from kgs.fit.saved import read_settings
 from kgs.fit.trainer import Trainer

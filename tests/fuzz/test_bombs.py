@@ -19,7 +19,7 @@ from tiny_scenes import write_blender, write_image, write_nerfstudio
 from trials import is_cheap, try_files
 
 from kgs.datasets import Views, load_scene
-from kgs.datasets.images import read_image
+from kgs.datasets.image_file import read_image
 from kgs.errors import DataError
 from kgs.init_points.files import read_points
 

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +16,6 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import CHOICES, PRESETS, FitConfig
-from kgs.fit.overfitting import coadaptation, count_over_threshold
 from kgs.fit.probes import decide
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points, measure
@@ -26,6 +25,9 @@ from kgs.machine import peak_rss_mb, revision
 from kgs.metrics.evaluate import MEASURES
 from kgs.metrics.lpips import Lpips
 from kgs.page.pictures import Picture, encoded
+
+from .overfitting import coadaptation, count_over_threshold
+from .rivals import Rival, RivalTrainer
 
 FULL = "full-model"  # a start that no fit may have: the upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
@@ -39,7 +41,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of first points, or
             "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test views),
             "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given), and the
-            fields of FitConfig that are not as it has them.
+            fields of FitConfig and of Rival that are not as it has them.
         data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
     """
@@ -47,9 +49,10 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     known = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
     scene, points, seconds = _start(data, *known, preset)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
-    config = _config(cell["start"], cell["seed"], cell["fit"])
+    settings, rival = _split(cell["fit"])
+    config = _config(cell["start"], cell["seed"], settings)
     probed = replace(config, drop=PRESETS[preset].drop)  # methods that differ in dropping decide alike
-    trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed)
+    trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed, rival)
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
         result["pictures"] = _pictures(scene, trainer)
     return result | {
@@ -63,23 +66,31 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
 
 
 def fit_and_measure(
-    scene: Scene, config: FitConfig, points: FirstPoints, lpips: Lpips | None = None, probed: FitConfig | None = None
+    scene: Scene,
+    config: FitConfig,
+    points: FirstPoints,
+    lpips: Lpips | None = None,
+    probed: FitConfig | None = None,
+    rival: Rival | None = None,
 ) -> tuple[Trainer, dict[str, Any], dict[str, Any]]:
     """One fit, its metrics, and what every cell stores of it.
 
     "cpu_seconds" are those of probes, training, curve and leaving out, "wall_seconds" those of the training alone.
-    `probed`, or else `config`, is what probes decide for.
+    `probed`, or else `config`, is what probes decide for; `rival` replaces random dropping.
     """
     start = time.process_time()
     decided, needs = decide(scene, probed or config, choose_points)
     config = replace(config, **{name: getattr(decided, name) for name in CHOICES})
     trainer = Trainer(scene, config, points, needs)
+    if rival is not None:
+        trainer = RivalTrainer(scene, config, points, needs, rival=rival)
     trainer.fit()
     prune(trainer)
     stored: dict[str, Any] = {"cpu_seconds": round(time.process_time() - start, 2)}
     metrics = measure(trainer, lpips)
     stored |= {"curve": trainer.curve, "gaussians": len(trainer.shown), "needs": trainer.needs}
-    stored |= {"config": trainer.config.to_dict(), "seen": metrics["seen"]}
+    chosen = trainer.config.to_dict() | ({} if rival is None else asdict(rival))
+    stored |= {"config": chosen, "seen": metrics["seen"]}
     stored |= {"wall_seconds": round(trainer.seconds, 2), "peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
     stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
     return trainer, metrics, stored
@@ -107,6 +118,13 @@ def _start(
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # a start that fell back says so by its kind
         points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
     return scene, points, time.process_time() - begin
+
+
+def _split(fit: dict[str, Any]) -> tuple[dict[str, Any], Rival | None]:
+    """The settings of a cell for `FitConfig`, and those of a rival if it has any."""
+    names = {field.name for field in fields(Rival)}
+    own = {name: value for name, value in fit.items() if name in names}
+    return {name: value for name, value in fit.items() if name not in names}, Rival(**own) if own else None
 
 
 def _config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:

@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 
-from kgs.fit.scores import SelectiveDrop
+from kgs.bench.study.rivals import SelectiveDrop
 
 
 def layer(rate, scores):

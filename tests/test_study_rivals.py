@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from kgs.bench.study.rivals import Rival, RivalTrainer, gaussian_scores
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.scores import gaussian_scores
 from kgs.fit.trainer import Trainer
 
 CONFIG = FitConfig(steps=40, drop=0.4, seed=2, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
@@ -36,7 +36,7 @@ def test_gradients_are_means_of_what_the_densifier_observed(scene, points):
 
 @pytest.mark.parametrize("by", ["high-gradient", "low-gradient", "near", "far"])
 def test_the_trainer_sets_the_scores_of_the_present_camera(scene, points, by):
-    trainer = Trainer(scene, replace(CONFIG, drop_by=by), points)
+    trainer = RivalTrainer(scene, CONFIG, points, rival=Rival(drop_by=by))
     seen, cameras = [], []
 
     def check(module, inputs, output):
@@ -56,33 +56,19 @@ def test_the_trainer_sets_the_scores_of_the_present_camera(scene, points, by):
     assert trainer.renderer.eval().opacity_layer(before) is before
 
 
-def test_random_is_without_scores(scene, points):
-    trainer = Trainer(scene, CONFIG, points)
-    trainer.fit(lambda trainer, _: trainer.step == 2)
-    assert trainer.drop.scores is None
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"drop_by": "high-gradient"}, {"drop_by": "far", "opacity_l1": 0.1}],
-    ids=lambda change: "-".join(map(str, change.values())),
-)
-def test_a_fit_with_scores_resumes_bit_for_bit(scene, points, tmp_path, change):
-    config = replace(CONFIG, **change)
-    whole, first = Trainer(scene, config, points), Trainer(scene, config, points)
-    whole.fit()
-    first.fit(lambda trainer, _: trainer.step == 31)
-    first.save(tmp_path / "checkpoint.safetensors")
-    second = Trainer.resume(scene, config, tmp_path / "checkpoint.safetensors")
-    second.fit()
-    for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
-        assert torch.equal(a, b)
+def test_a_rival_that_is_none_is_the_fit_itself(scene, points):
+    plain, rival = Trainer(scene, CONFIG, points), RivalTrainer(scene, CONFIG, points, rival=Rival())
+    for trainer in (plain, rival):
+        trainer.fit(lambda trainer, _: trainer.step == 12)
+    for one, other in zip(plain.model.parameters(), rival.model.parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize("by", ["gradient", "distance"])
 def test_the_penalty_lowers_opacities_the_more_the_higher_the_score(scene, points, by):
     config = replace(CONFIG, drop=0.0, recipe=Recipe(grad_threshold=1e9, prune_opacity=0.0))
-    without, penalised = (Trainer(scene, replace(config, opacity_l1=w, opacity_l1_by=by), points) for w in (0.0, 1.0))
+    rivals = (Rival(opacity_l1=weight, opacity_l1_by=by) for weight in (0.0, 1.0))
+    without, penalised = (RivalTrainer(scene, config, points, rival=rival) for rival in rivals)
     for trainer in (without, penalised):
         trainer.fit(lambda trainer, _: trainer.step == 15)
     fall = (without.model.opacity_logits.sigmoid() - penalised.model.opacity_logits.sigmoid()).detach()
@@ -93,11 +79,3 @@ def test_the_penalty_lowers_opacities_the_more_the_higher_the_score(scene, point
         ).mean(0)
         order = distances.argsort()
         assert float(fall[order[75:]].mean()) > float(fall[order[:75]].mean())
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("drop_by", "nearest"), ("opacity_l1_by", "far"), ("opacity_l1", -0.1), ("opacity_l1", "1")]
-)
-def test_other_settings_are_refused(name, value):
-    with pytest.raises(ValueError, match=name):
-        FitConfig(**{name: value})

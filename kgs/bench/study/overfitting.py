@@ -8,11 +8,10 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 from kgs.datasets.scene import Views
+from kgs.fit.trainer import Trainer
 from kgs.geometry import camera_centers
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-
-from .trainer import Trainer
 
 BINS = 6
 

@@ -1,0 +1,312 @@
+"""An image on disk: opened once, decoded once. Pillow reads its header and metadata, OpenCV decodes its pixels.
+
+libjpeg-turbo (kornia_rs) decodes JPEG, because OpenCV only prints what is wrong with one and gives wrong colours.
+Pillow decodes HEIC (with pi-heif) and TIFFs with alpha of 8 bits, which OpenCV would multiply the colours by.
+Without Pillow sizes are those of the decoded images, which no bound holds for then, and TIFF is refused.
+"""
+
+import io
+import warnings
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+from kornia_rs import io as kornia_io
+from numpy.typing import NDArray
+
+from kgs.errors import DataError
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile as Opened  # what Pillow gives for a file
+
+Image = NDArray[np.float32]
+_KINDS = {
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"\xff\xd8": "JPEG",
+    b"RIFF": "WebP",
+    b"BM": "BMP",
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+}
+_HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+_LONGEST_SIGNATURE = 12  # bytes
+_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+_BITS, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPLES, _EXIF = 258, 274, 277, 322, 323, 338, 34665
+_MULTIPLIED_ALPHA, _ALPHA = 1, 2  # values of `_EXTRA_SAMPLES`
+
+
+class Metadata(NamedTuple):
+    """What an image's file says beside its pixels."""
+
+    size: tuple[int, int]  # width and height of the stored pixels
+    tags: dict[int, Any]  # of the image and its Exif directory, as Pillow gives them; empty where damaged
+
+
+class ImageFile:
+    """A PNG, JPEG, WebP, BMP, TIFF or HEIC file. The file is opened when something of it is asked for first.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        DataError: by every method: the file cannot be read, is of another kind, damaged, cut short, or claims more
+            pixels than its bytes can hold (a decompression bomb).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._data: bytes | None = None
+        self._metadata: Metadata | None = None
+        self._pixels: Image | None = None
+
+    def load(self) -> bytes:
+        """The file's bytes. They are kept until `read`, so that the file is not opened again."""
+        if self._data is None:
+            self._data = read_bytes(self.path)
+        return self._data
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels as stored: an orientation in the metadata is not applied."""
+        return self.metadata.size
+
+    @property
+    def metadata(self) -> Metadata:
+        """Size and tags, from the header; without Pillow from the decoded image, with no tags."""
+        if self._metadata is None and has_pillow():
+            if self._data is None:
+                self._metadata = _read_header_of_file(self.path)
+            else:
+                self._metadata = _read_header(self.path, io.BytesIO(self._data), len(self._data))
+        elif self._metadata is None:
+            self._pixels = self._decode()
+            height, width = self._pixels.shape[:2]
+            self._metadata = Metadata((width, height), {})
+        return self._metadata
+
+    def read(self) -> Image:
+        """The pixels as stored: RGB `(H, W, 3)`, or RGBA `(H, W, 4)` where the file has an alpha channel.
+
+        Values are in [0, 1] and not multiplied by alpha. The file's bytes and the pixels are not kept.
+        """
+        if self._pixels is None:
+            pixels = self._decode()
+        else:
+            pixels, self._pixels = self._pixels, None
+        self._data = None
+        return pixels
+
+    def _decode(self) -> Image:
+        data = self.load()
+        kind = _kind(self.path, data[:_LONGEST_SIGNATURE])
+        size = self.size if has_pillow() else None  # checked before anything is decoded
+        try:
+            pixels = _decode(kind, data)
+        except ValueError as error:
+            raise DataError(self.path, "", str(error)) from error
+        height, width = pixels.shape[:2]
+        if size is not None and size != (width, height):
+            raise DataError(self.path, "", f"expected {size} pixels as its header says, got {(width, height)}")
+        return pixels
+
+
+def read_image(path: Path) -> Image:
+    """The pixels of an image: see `ImageFile.read`."""
+    return ImageFile(path).read()
+
+
+def read_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image: see `ImageFile.size`."""
+    return ImageFile(path).size
+
+
+def read_bytes(path: Path) -> bytes:
+    """A whole file, or a DataError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+
+
+@cache
+def has_pillow() -> bool:
+    """Whether Pillow is installed."""
+    return find_spec("PIL") is not None
+
+
+@cache
+def has_heic() -> bool:
+    """Whether HEIC can be read: Pillow and pi-heif are installed."""
+    return has_pillow() and find_spec("pi_heif") is not None
+
+
+def is_heic(data: bytes) -> bool:
+    """Whether a file that begins with these bytes is a HEIC image."""
+    return data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS
+
+
+def _kind(path: Path, head: bytes) -> str:
+    """The format of a file that begins with these bytes; a DataError about `path` where it cannot be read."""
+    if is_heic(head) and has_heic():
+        return "HEIC"
+    for signature, kind in _KINDS.items():
+        if head.startswith(signature):
+            return kind
+    raise DataError(path, "", "cannot be decoded: expected a PNG, JPEG, WebP, BMP or TIFF image")
+
+
+def _read_header_of_file(path: Path) -> Metadata:
+    try:
+        with path.open("rb") as file:
+            length = file.seek(0, io.SEEK_END)
+            file.seek(0)
+            return _read_header(path, file, length)
+    except OSError as error:
+        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+
+
+def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
+    """Size and tags of an image file of `length` bytes."""
+    kind = _kind(path, file.read(_LONGEST_SIGNATURE))
+    file.seek(0)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # Pillow warns of damaged metadata
+            image = _open(kind, file)
+            tags = _tags(image)
+        size = (image.width, image.height)
+        tile = (1, 1)
+        if kind == "TIFF":
+            if int(tags.get(_ORIENTATION, 1)) in (5, 6, 7, 8):
+                size = size[::-1]  # Pillow gives that of the upright image
+            tiff = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
+            tile = int(tiff.get(_TILE_WIDTH, 1)), int(tiff.get(_TILE_HEIGHT, 1))
+    except Exception as error:  # damaged bytes raise whatever Pillow's plugins happen to raise
+        raise DataError(path, "", f"cannot be decoded: damaged, cut short, or an unusual {kind} ({error})") from error
+    check_size(path, *size, length)
+    check_size(path, *tile, length)  # tiles are decoded whole
+    return Metadata(size, tags)
+
+
+def _open(kind: str, file: IO[bytes]) -> "Opened":
+    """An image that Pillow has read the header of.
+
+    The classes are called rather than `PIL.Image.open`, whose bound on pixels does not depend on the file's bytes.
+    """
+    from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+
+    if kind == "HEIC":
+        import pi_heif
+
+        opened: Opened = pi_heif.HeifImageFile(file)
+        return opened
+    classes: dict[str, Callable[[IO[bytes]], Opened]] = {
+        "PNG": PngImagePlugin.PngImageFile,
+        "JPEG": JpegImagePlugin.JpegImageFile,
+        "WebP": WebPImagePlugin.WebPImageFile,
+        "BMP": BmpImagePlugin.BmpImageFile,
+        "TIFF": TiffImagePlugin.TiffImageFile,
+    }
+    return classes[kind](file)
+
+
+def _tags(image: "Opened") -> dict[int, Any]:
+    """The tags of an image and of its Exif directory; none where they are damaged."""
+    from PIL.Image import Exif
+
+    try:
+        if "exif" in image.info:
+            exif = Exif()
+            exif.load(image.info["exif"])
+        elif image.format == "TIFF":
+            exif = image.getexif()
+        else:
+            return {}
+        return dict(exif) | exif.get_ifd(_EXIF)
+    except Exception:  # Pillow has no error of its own for damage
+        return {}
+
+
+def check_size(path: Path, width: int, height: int, size: int) -> None:
+    """A DataError about `path`, a file of `size` bytes, where so many pixels should not be decoded."""
+    if width < 1 or height < 1:
+        raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
+    # Photos have fewer than 20 pixels per byte, a plain PNG 1032. Any file may have 2^21 (48 MiB while decoded), plain
+    # images 2^24 (384 MiB); more, up to 2^28, need a byte for every 32.
+    if width * height > min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size)):
+        raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
+
+
+def _decode(kind: str, data: bytes) -> Image:
+    """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
+    if kind == "TIFF" and not has_pillow():
+        raise ValueError('TIFF is read with Pillow, which is not installed: pip install pillow, or the extra "app"')
+    try:
+        if kind == "JPEG":
+            return _to_float(_decode_jpeg(data))
+        if kind == "TIFF":
+            return _decode_tiff(data)
+        if kind == "HEIC":
+            return _to_float(np.array(_open(kind, io.BytesIO(data)).convert("RGB")))
+        if kind == "PNG" and has_pillow():
+            _open(kind, io.BytesIO(data)).verify()  # OpenCV takes memory for chunks that are not in the file
+        return _to_float(_decode_with_opencv(data))
+    except (ValueError, MemoryError):
+        raise
+    except Exception as error:  # neither OpenCV, kornia_rs nor Pillow has one class of errors for damage
+        raise ValueError("the image is damaged, truncated, or has other colours than grey or RGB") from error
+
+
+def _to_float(pixels: NDArray[np.uint8 | np.uint16]) -> Image:
+    """Values in [0, 1] of 8 or 16 bit integers."""
+    return np.asarray(pixels / np.float32(255.0 if pixels.dtype == np.uint8 else 65535.0), dtype=np.float32)
+
+
+def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
+    """RGB or RGBA, as OpenCV turns it."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
+    channels = image.shape[2] if image.ndim == 3 else 1
+    if image.dtype not in (np.uint8, np.uint16) or channels not in _TO_RGB:
+        raise ValueError(f"expected 8 or 16 bit integers in 1, 3 or 4 channels, got {image.dtype} in {channels}")
+    return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]))
+
+
+def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
+    """RGB of a JPEG. What lies behind its end, such as a phone's video, is ignored."""
+    if has_pillow():
+        file = io.BytesIO(data)
+        image = _open("JPEG", file)
+        end = file.tell()  # of the header of the first scan
+        # Only progressive images need its last three bytes. Some phones leave them 0 in others, which decoders warn of.
+        if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
+            data = data[: end - 3] + b"\0\x3f\0" + data[end:]
+    return np.asarray(kornia_io.decode_image_jpegturbo(data, "rgb"))
+
+
+def _decode_tiff(data: bytes) -> Image:
+    """RGB or RGBA in [0, 1] of a TIFF, as stored, its colours not multiplied by alpha."""
+    image = _open("TIFF", io.BytesIO(data))
+    tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
+    orientation, samples = int(tags.get(_ORIENTATION, 1)), int(tags.get(_SAMPLES, 1))
+    alpha = tags.get(_EXTRA_SAMPLES, (0,))[0]
+    if set(tags.get(_BITS, (1,))) == {8} and (samples == 2 or alpha == _ALPHA):
+        with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
+            pixels = _to_float(np.array(image.convert("RGBA")))
+    else:
+        pixels = _to_float(_decode_with_opencv(data))
+    if samples == 4 and alpha == _MULTIPLIED_ALPHA:
+        pixels[..., :3] = np.minimum(pixels[..., :3] / np.maximum(pixels[..., 3:], 1 / 65535), 1)
+    # Both decoders turn the image upright; to turn 6 and 8 back is to turn as the other.
+    return np.ascontiguousarray(turn(pixels, {6: 8, 8: 6}.get(orientation, orientation)))
+
+
+def turn(image: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """An image `(H, W, K)` upright, as Exif's orientation from 1 to 8 says; a view where that is possible."""
+    if orientation in (2, 4, 5, 7):  # mirrored: 2 alone, the others turned as 3, 6 and 8 are
+        image = image[:, ::-1]
+    return np.rot90(image, {3: 2, 4: 2, 5: 1, 6: 3, 7: 3, 8: 1}.get(orientation, 0))

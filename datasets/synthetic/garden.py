@@ -1,0 +1,113 @@
+"""The garden of the synthetic scene: the room's table on a paved lawn under a sky, to be photographed from all around.
+
+A terrace of slabs lies around the table, grass beyond it; the sky is a dome with hills and clouds, which shines by
+itself. The ground is y = 0.
+"""
+
+import numpy as np
+import trimesh
+from trimesh.transformations import euler_matrix
+
+from . import furniture as make
+from .pictures import tone
+from .room import things
+from .textures import Array as Numbers
+from .textures import Texture, field
+from .world import Placed, World, make_world, put
+
+CENTER = np.array([0.0, -0.55, 1.75])  # what the cameras look at
+RADIUS, HEIGHT = 2.3, 0.55  # m: of the circle of the cameras, and of its middle above `CENTER`
+FOCAL = 0.9  # focal length over the longer side of the image
+SUN, SKY = np.array([-0.5, -0.75, -0.45]), np.array([0.0, -1.0, 0.0])  # towards the sun and the middle of the sky
+DOME, LAWN = 9.0, 20.0  # radius of the sky and side of the lawn: it ends behind the sky
+TERRACE, SLAB, JOINT = 1.55, 0.42, 0.012  # radius of the terrace, side of a slab, half of the gap between two
+GRASS, MOSS = (96, 142, 62), (74, 96, 52)
+HORIZON, ZENITH, CLOUD = (222, 234, 242), (86, 146, 214), (255, 255, 255)
+FAR_HILLS, NEAR_HILLS = (132, 162, 150), (84, 128, 78)
+
+
+def make_garden(seed: int) -> World:
+    """The garden of a seed."""
+    rng = np.random.default_rng([seed, 3])
+    sky = put([make.Part(_dome(), _sky(rng))], CENTER[0], CENTER[2])
+    ground = put([make.sheet(LAWN, LAWN, _ground(rng))], CENTER[0], CENTER[2])
+    return make_world(ground, [*things(rng), *_around(rng)], SUN, SKY, unlit=sky)
+
+
+def _around(rng: np.random.Generator) -> list[Placed]:
+    """What stands on the ground around the table: plants and balls, between the table and the cameras' circle."""
+    sectors = [tone(hue, 0.75, 0.85) for hue in (0.02, 0.13, 0.58, 0.35)] * 2
+    items = [
+        (make.plant(rng), 2.1),
+        (make.ball(0.16, sectors), 3.7),
+        (make.plant(rng), 5.3),
+        (make.ball(0.1, [(236, 190, 62), (242, 240, 230)] * 3), 0.6),
+    ]
+    placed = []
+    for parts, angle in items:
+        angle += rng.uniform(-0.2, 0.2)
+        distance = rng.uniform(1.0, 1.2)
+        place = CENTER[0] + distance * np.sin(angle), CENTER[2] - distance * np.cos(angle)
+        placed += put(parts, *place, 0.0, rng.uniform(0.0, 3.0))
+    return placed
+
+
+def _dome() -> trimesh.Trimesh:
+    """The upper half of a ball of few faces, open below the horizon."""
+    ball = trimesh.creation.icosahedron().apply_scale(DOME)
+    ball.apply_transform(euler_matrix(0.3, 0.2, 0.0))
+    above = ball.vertices[ball.faces][..., 2].max(axis=1) > 0
+    return trimesh.Trimesh(ball.vertices, ball.faces[above], process=False)
+
+
+def _sky(rng: np.random.Generator) -> Texture:
+    """Two ranges of hills at the horizon, paler sky above them, clouds; by the direction from the dome's middle."""
+    cloud, detail, wood = field(rng, 0.5, 1.6), field(rng, 0.15, 0.5), field(rng, 0.06, 0.2)
+    phases = rng.uniform(0.0, 2 * np.pi, size=(2, 3))
+    horizon, zenith, white, far, near = (
+        make.albedo(color) for color in (HORIZON, ZENITH, CLOUD, FAR_HILLS, NEAR_HILLS)
+    )
+
+    def ridge(turn: Numbers, base: float, swing: float, shifts: Numbers) -> Numbers:
+        waves = [np.sin(k * turn + shift) / k for k, shift in zip((2, 5, 11), shifts, strict=True)]
+        return np.asarray(base + swing * sum(waves))
+
+    def texture(points: Numbers) -> Numbers:
+        direction = points / np.linalg.norm(points, axis=1, keepdims=True)
+        elevation = np.arcsin(direction[:, 2].clip(-1, 1))
+        turn = np.arctan2(direction[:, 1], direction[:, 0])
+        share = np.sqrt(elevation.clip(0, 1))[:, None]
+        colors = horizon * (1 - share) + zenith * share
+        cover = 0.5 + 0.5 * np.tanh(2.5 * (cloud(direction) + 0.45 * detail(direction) - 0.35))
+        cover = (0.85 * cover * np.tanh(6 * elevation.clip(0, 1)))[:, None]
+        colors = colors * (1 - cover) + white * cover
+        leaves = (1 + 0.12 * wood(direction))[:, None]
+        for base, swing, color, shifts in ((0.13, 0.06, far, phases[0]), (0.06, 0.05, near, phases[1])):
+            below = elevation < ridge(turn, base, swing, shifts)
+            colors = np.where(below[:, None], color * leaves, colors)
+        return np.asarray(colors)
+
+    return texture
+
+
+def _ground(rng: np.random.Generator) -> Texture:
+    """Slabs of stone, each of its own shade, with moss between them; grass beyond the terrace."""
+    patch, blades, grain = field(rng, 0.5, 2.0), field(rng, 0.05, 0.2), field(rng, 0.03, 0.15)
+    shades, tints = rng.normal(size=(64, 64)), rng.normal(size=(64, 64))
+    grass, moss = make.albedo(GRASS), make.albedo(MOSS)
+    stone, warm = make.albedo((178, 170, 158)), make.albedo((192, 158, 128))
+
+    def texture(points: Numbers) -> Numbers:
+        cells = points[:, :2] / SLAB
+        cells[:, 0] += 0.5 * (np.floor(cells[:, 1]) % 2)
+        column, row = np.floor(cells).astype(np.int64).T % 64
+        gap = (0.5 - np.abs(cells % 1 - 0.5)).min(axis=1) * SLAB < JOINT
+        tint = (0.5 + 0.35 * tints[column, row]).clip(0, 1)[:, None]
+        slabs = (stone * (1 - tint) + warm * tint) * (1 + 0.1 * shades[column, row] + 0.06 * grain(points))[:, None]
+        slabs = np.where(gap[:, None], moss * (1 + 0.15 * grain(points))[:, None], slabs)
+        lawn = grass * (1 + 0.14 * patch(points) + 0.16 * blades(points))[:, None]
+        edge = TERRACE + 0.05 * patch(points)
+        outside = np.hypot(points[:, 0], points[:, 1]) > edge
+        return np.asarray(np.where(outside[:, None], lawn, slabs))
+
+    return texture

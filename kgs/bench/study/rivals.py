@@ -1,0 +1,109 @@
+"""What the paper compares random dropping with: dropping selected Gaussians, and an L1 penalty on opacities.
+
+Source: "DropGaussian" (CVPR 2025) names a selection and a penalty "by gradient" and "by distance" and defines none of
+them. These are this project's readings, in both directions.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.datasets.scene import Scene
+from kgs.densify import Densifier
+from kgs.drop import DropGaussian
+from kgs.fit.config import FitConfig
+from kgs.fit.trainer import Start, Trainer
+from kgs.geometry import camera_centers
+from kgs.init_points import FirstPoints
+from kgs.losses import opacity_l1
+from kgs.types import Gaussians
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A rival of random dropping.
+
+    Args:
+        drop_by: which Gaussians are dropped: random ones, those with the highest or lowest mean gradient, those nearest
+            to the camera or farthest from it.
+        opacity_l1: weight of the L1 penalty on opacities; 0 leaves it out.
+        opacity_l1_by: the penalty is heavier on Gaussians with a low mean gradient, or at a great distance.
+    """
+
+    drop_by: Literal["random", "high-gradient", "low-gradient", "near", "far"] = "random"
+    opacity_l1: float = 0.0
+    opacity_l1_by: Literal["gradient", "distance"] = "gradient"
+
+
+class RivalTrainer(Trainer):
+    """A `Trainer` that drops selected Gaussians or penalises opacities, as `rival` says."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: FitConfig,
+        points: FirstPoints | Start,
+        needs: dict[str, Any] | None = None,
+        *,
+        rival: Rival,
+    ) -> None:
+        self.rival = rival
+        super().__init__(scene, config, points, needs)
+
+    def make_drop(self, seed: int) -> DropGaussian | None:
+        """The layer, which drops by scores where it has some."""
+        return SelectiveDrop(self.config.drop, self.config.drop_schedule, seed=seed) if self.config.drop else None
+
+    def before_render(self, camera: PinholeCamera) -> None:
+        """Give the layer the scores of the present camera."""
+        if isinstance(self.drop, SelectiveDrop) and self.rival.drop_by != "random":
+            self.drop.scores = gaussian_scores(self.rival.drop_by, self.densifier, camera)
+
+    def penalty(self, gaussians: Gaussians, camera: PinholeCamera) -> Tensor | None:
+        """The weighted L1 norm of the opacities."""
+        if not self.rival.opacity_l1:
+            return None
+        by = "low-gradient" if self.rival.opacity_l1_by == "gradient" else "far"
+        scores = gaussian_scores(by, self.densifier, camera)
+        return self.rival.opacity_l1 * opacity_l1(gaussians.opacities, scores)
+
+
+class SelectiveDrop(DropGaussian):
+    """`DropGaussian` that drops the Gaussians with the highest `scores` where it has scores, and is random without.
+
+    `scores` is a plain attribute: a tensor of the shape of the opacities that stays until it is replaced, or None. The
+    call drops the share of the rate with the highest scores, of each camera's row in `(C, N)`, equal ones in order,
+    and scales the rest by 1/(1 - rate). Unlike that of a random subset this render is no unbiased estimate.
+    """
+
+    scores: Tensor | None = None
+
+    def forward(self, opacities: Tensor) -> Tensor:
+        """Drop and rescale in `train()`, return `opacities` itself in `eval()`; scores have their shape."""
+        scores, rate = self.scores, self.rate
+        if not self.training or scores is None:
+            return super().forward(opacities)
+        if scores.shape != opacities.shape:
+            raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
+        if rate == 0.0:
+            return opacities
+        per_camera = scores.ndim > 1 and scores.shape[-1] > 1
+        rows = scores.reshape(-1, scores.shape[-1]) if per_camera else scores.reshape(1, -1)
+        dropped = rows.argsort(dim=1, descending=True, stable=True)[:, : round(rate * rows.shape[1])]
+        mask = torch.full_like(rows, 1.0 / (1.0 - rate), dtype=opacities.dtype).scatter_(1, dropped, 0.0)
+        return opacities * mask.reshape(opacities.shape)
+
+
+def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Tensor:
+    """A number for each Gaussian, `(N,)`, the highest for those that `by` is about.
+
+    "high-gradient" or "low-gradient": the mean gradient of the projected centre since the last densification. "far" or
+    "near": the distance from the camera's centre, in world units.
+    """
+    scores, means = densifier.mean_gradients, densifier.model.means.detach()
+    if not by.endswith("gradient"):
+        scores = (means - camera_centers(camera.extrinsics).to(means)).norm(dim=1)
+    return scores if by in ("high-gradient", "far") else -scores
