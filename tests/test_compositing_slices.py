@@ -9,7 +9,7 @@ from factories import random_camera, random_gaussians
 from oracles import near_threshold
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kgs import backends, composite, project
+from kgs import GaussianRenderer, backends, composite, project
 from kgs.raster import compositing
 from kgs.raster.binning import bin_to_tiles
 
@@ -235,6 +235,36 @@ def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu):
     assert few <= 500
     assert launches(100, (160, 224)) <= few
     assert launches(800, (160, 224)) <= few + 300  # lists longer than 32 take a second and a third step
+
+
+class _Waits(TorchDispatchMode):
+    """Counts what a GPU would have to finish all its work for."""
+
+    NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "_unique2", "unique_consecutive", "bincount")
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += func.overloadpacket.__name__ in self.NAMES
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_a_gpu_is_asked_for_few_numbers(sh_degree, as_on_a_gpu, monkeypatch):
+    gaussians, camera = random_gaussians(500, 0, torch.float32, sh_degree), random_camera(80, 120, 0, torch.float32)
+    gaussians.means.requires_grad_()
+    waits, tolist = _Waits(), torch.Tensor.tolist
+
+    def counted(tensor):
+        waits.count += 1
+        return tolist(tensor)
+
+    monkeypatch.setattr(torch.Tensor, "tolist", counted)
+    with waits:
+        GaussianRenderer()(gaussians, camera).image.sum().backward()
+    assert waits.count <= 12
 
 
 @pytest.mark.parametrize("size", [(8, 8), (8, 24), (24, 8), (11, 5)])

@@ -6,19 +6,19 @@ For the layers k = 1, 2, ... of a pixel, nearest first (Kerbl et al. 2023, eq. 3
     C = sum_k w_k c_k + T_end background,   w_k = T_k alpha_k
 
 with alpha below `alpha_threshold` taken as 0, and T below `transmittance_stop` taken as 0 from then on. Both rules act
-on each pixel and layer alone, so the image does not depend on tiles or chunks.
+on each pixel and layer alone, so the image does not depend on tiles or steps.
 
-K consecutive entries of a tile are a chunk; the same chunk of many tiles is a step. In coordinates relative to the
-tile's centre the exponent is a quadratic polynomial of the pixel, so a step is one matrix product of six coefficients
-per entry with six monomials per pixel, an exponential, a scan over K, and one product with the colours. T before each
-step is kept and, where memory allows, the alphas. The backward pass visits the steps from back to front and carries
-V_k, the colour along g that shows from layer k on, as if no light had been lost before it:
+`binning` makes the lists of the tiles: which Gaussian reaches which tile, front to back. `compositing` draws them in
+torch, K layers of many tiles in a step: q_k is the sum of two squares, each linear in x and y; an exponential gives the
+alphas, a scan over the layers T, and a sum the colours. T before each step is kept and, where memory allows, the
+alphas. The backward pass visits the steps from back to front and carries V_k, the colour along g that shows from layer
+k on, as if no light had been lost before it:
 
     V_k = alpha_k (c_k . g) + (1 - alpha_k) V_{k+1},   V_end = g_T,   dL/d ln alpha_k = w_k (c_k . g - V_{k+1})
 
 and V_{k+1} = 0 where layer k ends the light. V is a mean of colours: no sum grows large, nothing is divided by
-1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the pixels, again one matrix
-product; they are shifted to its centre and summed over its tiles.
+1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the pixels, about its centre;
+they are summed over its tiles.
 
 An image that needs more than `max_bytes` is made in row slices. Where lists are long, a row slice is made in depth
 slices, nearest first, with lists for the tiles that still have light alone: what is hidden is not listed or sorted.

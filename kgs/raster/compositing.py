@@ -296,7 +296,8 @@ class DepthSlice:
                 value.mul_((ALPHA_MAX - alpha).sign_())
             found += _moments(value, dx, dy)
         if features:
-            found += [(weights * grad).sum(1) for grad in grads]
+            product = torch.empty_like(weights)
+            found += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
         return found
 
     def _entries_of(self, step: Step) -> tuple[Tensor, Tensor]:
@@ -368,9 +369,13 @@ class DepthSlice:
 
 
 def _moments(slope: Tensor, dx: Tensor, dy: Tensor) -> list[Tensor]:
-    """Sums over the pixels of `slope` `(K, P, n)` times 1, x, y, xx, xy, yy about the Gaussian's centre, `(K, n)`."""
+    """Sums over the pixels of `slope` `(K, P, n)` times 1, x, y, xx, xy, yy about the Gaussian's centre, `(K, n)`.
+
+    `slope` is used up.
+    """
     square = slope.unflatten(1, (dy.shape[1], dx.shape[1]))
-    columns, rows, turning = square.sum(1), square.sum(2), (square * dx[:, None]).sum(2)
+    columns, rows = square.sum(1), square.sum(2)
+    turning = square.mul_(dx[:, None]).sum(2)
     x, y = columns * dx, rows * dy
     return [columns.sum(1), x.sum(1), y.sum(1), (x * dx).sum(1), (turning * dy).sum(1), (y * dy).sum(1)]
 

@@ -103,7 +103,11 @@ CASES: dict[str, tuple[str, str, Callable[[torch.dtype], Iterator[Result]]]] = {
     "not finite, one number at a time": ("NaN times 0 is NaN", "left out before anything is computed", spoilt),
     "at and behind the near plane": ("0 and negative depths", "left out before the division", behind),
     "opacity 0": ("ln 0", "in no list, no gradient", transparent),
-    "under autocast to bfloat16": ("8 bits of pixel coordinates", "switched off inside, both ways", under_autocast),
+    "under autocast to bfloat16": (
+        "8 bits of pixel coordinates",
+        "no product that is rounded, both ways",
+        under_autocast,
+    ),
     "one and two threads, repeated": ("sums in another order", "every sum has a fixed order", on_threads),
     "under a budget of 2 MiB": ("rows are cut into slices", "a pixel does not know its row slice", under_a_budget),
 }
