@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import tyro
 from torch import Tensor
 
+from kgs.bench.output import Row, markdown_table, mean_sd, write_results
+from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.geometry import camera_centers, project_points
 from kgs.init_points import initial_points
-
-from .output import Row, markdown_table, mean_sd, write_results
-from .scenes import check_scenes
 
 ALL_POINTS, RANDOM_POINTS = 10**6, 10_000
 QUICK, SMALL, LARGE = (126, 168), (189, 252), (378, 504)  # height, width
@@ -40,8 +40,8 @@ def starts(*, out: Path, quick: bool = False) -> None:
     """Depth errors, completeness and times of the initial points of a fit.
 
     For example:
-      kgs bench starts -o starts --quick
-      KGS_DATA=SCENES kgs bench starts -o starts
+      python measure.py --out starts --quick
+      KGS_DATA=SCENES python measure.py --out starts
 
     Writes starts.csv, starts.json and starts.md in 20 minutes, with --quick in 10 seconds. The synthetic scene has
     exact depths. Real scenes, all in the folder of the environment variable KGS_DATA, have counts and times.
@@ -162,3 +162,7 @@ def _view_errors(points: Tensor, views: Views, truth: Tensor, view: int) -> Tens
     own = corners.gather(0, weights.argmax(0, keepdim=True))[0]
     smooth = corners.amax(0) <= EDGE * corners.amin(0)
     return torch.where(inside, depths * torch.where(smooth, (weights * corners).sum(0), own) - 1, torch.nan)
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(starts) or 0)

@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+import tyro
 
+from kgs.bench.output import markdown_table
+from kgs.bench.study.grid import Cell, run_grid
+from kgs.bench.study.pairs import grouped
 from kgs.datasets import load_scene
 from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
@@ -17,10 +21,6 @@ from kgs.geometry import camera_centers, degrees_between
 from kgs.io.outputs import write_png
 from kgs.sfm import pose_photos
 from kgs.sfm.map import quiet_pycolmap
-
-from .output import markdown_table
-from .study.grid import Cell, run_grid
-from .study.pairs import grouped
 
 SPACINGS = tuple(round(0.6 * 1.275**i, 2) for i in range(20))  # degrees between neighbours, up to 61
 EASY = 2.0, 20.0  # degrees between neighbours that overlap and differ
@@ -32,8 +32,8 @@ def cameras(*, out: Path, quick: bool = False, processes: int | None = None, sch
     """How often cameras are found, refused, or accepted although they are wrong (half an hour; can go on).
 
     For example:
-      kgs bench cameras -o cameras-quick --quick
-      kgs bench cameras -o cameras --processes 2
+      python measure.py --out cameras-quick --quick
+      python measure.py --out cameras --processes 2
 
     Needs the extra sfm, too. Writes cameras.jsonl and cameras.md.
 
@@ -99,3 +99,7 @@ def write_arcs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     text = markdown_table(title, heads, lines, first="photos")
     (out / "cameras.md").write_text(text, encoding="utf-8")
     return text
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(cameras) or 0)

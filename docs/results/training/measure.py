@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import tyro
 
 from kgs.backends import available
+from kgs.bench.output import markdown_table, mean_sd
+from kgs.bench.scenes import SYNTHETIC, check_scenes
+from kgs.bench.study.cells import fit_and_measure
+from kgs.bench.study.grid import Cell, run_grid
+from kgs.bench.study.pairs import grouped
+from kgs.bench.study.plots import panels
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FAST, FitConfig
 from kgs.fit.run import choose_points
-
-from .output import markdown_table, mean_sd
-from .scenes import SYNTHETIC, check_scenes
-from .study.cells import fit_and_measure
-from .study.grid import Cell, run_grid
-from .study.pairs import grouped
-from .study.plots import panels
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
 KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
@@ -31,8 +31,8 @@ def training(*, out: Path, quick: bool = False, processes: int | None = None, sc
     """Test PSNR against time, one knob of the fit at a time (hours; goes on where it stopped).
 
     For example:
-      kgs bench training -o training-quick --quick
-      KGS_DATA=SCENES kgs bench training -o training --processes 2
+      python measure.py --out training-quick --quick
+      KGS_DATA=SCENES python measure.py --out training --processes 2
 
     Writes training.jsonl, .csv, .md and .png. With KGS_DATA, a folder of scenes, also on fern.
 
@@ -108,3 +108,7 @@ def _knob(scene: str, seed: int, backend: str = "", **turned: Any) -> dict[str, 
     value = "" if value is True else str(value)
     value = f"{knob} {value}".strip() if backend else value
     return {"scene": scene, "seed": seed, "knob": backend or knob, "value": value}
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(training) or 0)
