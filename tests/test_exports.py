@@ -85,7 +85,7 @@ def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> 
 
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_path: Path, background: Any) -> None:
-    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -0.5, 3.9])
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -1.05, 1.25])
     model = kgs.GaussianModel.from_points(points, torch.rand(300, 3), 0)
     with torch.no_grad():
         model.opacity_logits += 1.0
