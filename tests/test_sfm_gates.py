@@ -6,7 +6,7 @@ import pytest
 
 from kgs.errors import DataError
 from kgs.sfm.gates import disagreement, groups_of, judge, objections, table, weakest_link, why_no_cameras
-from kgs.sfm.map import Cameras, Look
+from kgs.sfm.map import Cameras, PairGeometry
 
 NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}
@@ -94,7 +94,7 @@ def test_groups_links_and_the_table():
 
 
 def test_photos_that_can_give_no_cameras():
-    deep, flat, same = Look(30.0, 0.5), Look(30.0, 0.99), Look(0.1, 1.0)
+    deep, flat, same = PairGeometry(30.0, 0.5), PairGeometry(30.0, 0.99), PairGeometry(0.1, 1.0)
     assert why_no_cameras(NAMES, PAIRS, dict.fromkeys(PAIRS, flat) | {("a", "c"): deep}) == ""
     assert "only turned on the spot" in why_no_cameras(NAMES, PAIRS, dict.fromkeys(PAIRS, flat))
     said = why_no_cameras(NAMES, PAIRS, dict.fromkeys(PAIRS, deep) | {("a", "b"): same})

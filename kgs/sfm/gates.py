@@ -14,7 +14,7 @@ import torch
 from kgs.errors import DataError
 from kgs.geometry import degrees_between
 
-from .map import FEWEST_MATCHES, Cameras, Look
+from .map import FEWEST_MATCHES, Cameras, PairGeometry
 
 FOCAL_RANGE = 0.4, 3.0  # of the longer side
 FEWEST_POINTS = 50  # that each photo sees
@@ -22,7 +22,7 @@ MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
 MOST_RATIO = 1.15  # of their focal lengths
 LEAST_RISE = 0.03  # of the squared errors where the focal length is a quarter off
 _SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
-_FLAT = 0.97  # share of matches that one homography explains; of a scene with depth in some pair fewer
+_PLANAR = 0.97  # share of matches that one homography explains; of a scene with depth in some pair fewer
 _WITHOUT = "A fit without some photos: take them out of the folder"
 Pairs = Mapping[tuple[str, str], int]  # verified matches of each pair
 
@@ -62,17 +62,19 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
 
 
 def focal_doubt(found: Sequence[Cameras]) -> str:
-    """Why no solver's photos tell the focal length; "" if those of one do."""
+    """Why the photos of no solver determine the focal length; "" if those of one do."""
     rise = max(0.0, *(cameras.focal_rise for cameras in found))
-    told = rise >= LEAST_RISE
-    return "" if told else f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {LEAST_RISE:.0%}"
+    if rise >= LEAST_RISE:
+        return ""
+    return f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {LEAST_RISE:.0%}"
 
 
 def focal_difference(found: Sequence[Cameras]) -> str:
     """How far the solvers' focal lengths are apart, where that is too far; "" if it is not."""
     ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
-    unlike = ratio > MOST_RATIO
-    return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}" if unlike else ""
+    if ratio <= MOST_RATIO:
+        return ""
+    return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}"
 
 
 def judge(
@@ -135,22 +137,22 @@ def table(names: Sequence[str], pairs: Pairs) -> str:
     return "\n".join(["Matches of each pair:", head, *rows])
 
 
-def why_no_cameras(names: Sequence[str], pairs: Pairs, looks: Mapping[tuple[str, str], Look]) -> str:
+def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
     """What to say of photos whose matches can give no cameras, and what to photograph next; "" of others.
 
     Args:
         names: of all photos.
         pairs: verified matches of each pair.
-        looks: how they lie, of the pairs that overlap.
+        geometries: what the matches of each overlapping pair say about depth.
     """
-    if twins := [pair for pair, look in looks.items() if look.shift < _SAME_PLACE]:
+    if twins := [pair for pair, geometry in geometries.items() if geometry.shift < _SAME_PLACE]:
         one, other = twins[0]
         return (
             f"{one} and {other} match at the same pixels: either they show the same from the same place, so remove one "
             "of them; or they carry the same watermark, caption or frame, so crop it from all photos"
         )
     groups = groups_of(names, pairs)
-    if len(groups) == 1 and min(look.flat for look in looks.values()) < _FLAT:
+    if len(groups) == 1 and min(geometry.planar for geometry in geometries.values()) < _PLANAR:
         return ""
     if len(groups) == 1:
         reason = "in every pair one plane, or a camera that only turned on the spot, explains all matches"

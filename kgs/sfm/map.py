@@ -9,7 +9,7 @@ import math
 import signal
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,33 +19,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
-_PEAKS = 0.25  # of COLMAP's threshold for keypoints
+_PEAK_FACTOR = 0.25  # of COLMAP's contrast threshold for keypoints
 _MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
-_LONGEST = 1000  # pixels; COLMAP's own keypoints are as good in smaller photos, and take a minute less
-_FIRST_PAIR = 2.0, 0.2  # least degrees between the first two; COLMAP's 16 fail on photos that face one way
-_ROUNDS = 5  # of placing photos with the lens held, and of adjusting it
-_STILL = 0.01  # change of the focal length (of it) and of the distortion after which the lens is held for good
-_USUAL = 0.05  # radial distortion that cameras have
-_BENDS = 0.1  # share of the squared errors that a larger one has to explain
-_OFF = 1.25  # by how much a focal length is made wrong to see whether points still fit
+_LONGEST = 1000  # pixels; COLMAP's keypoints of photos reduced to this are as good, and take a minute less
+_FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
+_FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one places no pair
+_ROUNDS = 5  # at most, each of placing photos with the lens held and then adjusting it
+_CONVERGED = 0.01  # relative change of the focal length, and change of the distortion, at which rounds end
+_USUAL_DISTORTION = 0.05  # radial; larger ones have to explain much of the errors
+_DISTORTION_GAIN = 0.1  # share of the squared errors that a larger distortion has to explain
+_WRONG_FOCAL = 1.25  # factor by which the focal length is made wrong to see whether points still fit
 
 
 class Cameras(NamedTuple):
-    """What one solver says. Poses are world-to-camera with OpenCV axes, by the photos' names."""
+    """What one solver found. Poses are world-to-camera with OpenCV axes, by the photos' names."""
 
     focal: float  # pixels
     rotations: dict[str, NDArray[np.float64]]  # (3, 3) each
     centers: dict[str, NDArray[np.float64]]  # (3,) each, in the world
     points: dict[str, int]  # how many points a photo sees
     reconstruction: Any  # pycolmap's
-    focal_rise: float  # share by which squared errors grow with a wrong focal length; infinite where it was given
+    focal_rise: float  # relative growth of the squared errors with a wrong focal length; infinite where it was given
 
 
-class Look(NamedTuple):
-    """How the matches of two photos lie."""
+class PairGeometry(NamedTuple):
+    """What the matches of two photos say about depth."""
 
-    shift: float  # pixels that half of them move
-    flat: float  # share that one homography explains: 1 where the camera only turned, or saw one plane
+    shift: float  # median distance that they move between the photos, pixels
+    planar: float  # share that one homography explains: 1 where the camera only turned, or saw one plane
 
 
 @contextmanager
@@ -65,7 +66,7 @@ def quiet_pycolmap() -> Iterator[Any]:
 
 
 def verify(database: Path, seed: int, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
-    """Find the matches of each pair that one motion of the camera explains.
+    """Verify the matches of each pair: those that one motion of the camera explains.
 
     Args:
         database: with matches.
@@ -78,15 +79,15 @@ def verify(database: Path, seed: int, names: Mapping[str, str]) -> dict[tuple[st
     with quiet_pycolmap() as pycolmap:
         verifier = pycolmap.GeometricVerifierOptions()
         verifier.num_threads = 1
-        pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_views(pycolmap, seed))
+        pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_view_options(pycolmap, seed))
         with pycolmap.Database.open(database) as file:
             images = {image.image_id: names[image.name] for image in file.read_all_images()}
             pairs = list(combinations(sorted(images), 2))
             return {(images[i], images[j]): len(_inliers(file, i, j)) for i, j in pairs}
 
 
-def looks(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], Look]:
-    """How the verified matches of each pair that overlaps lie, by the names of the pair in `names`."""
+def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], PairGeometry]:
+    """That of the verified matches of each pair that overlaps, by the names of the pair in `names`."""
     found = {}
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         images = {image.image_id: names[image.name] for image in file.read_all_images()}
@@ -95,9 +96,9 @@ def looks(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], Loo
             rows = _inliers(file, i, j)
             if len(rows) >= FEWEST_MATCHES:
                 first, second = places[i][rows[:, 0]], places[j][rows[:, 1]]
-                _, flat = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
+                _, planar = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
                 shift = float(np.median(np.linalg.norm(first - second, axis=1)))
-                found[images[i], images[j]] = Look(shift, 0.0 if flat is None else float(np.mean(flat)))
+                found[images[i], images[j]] = PairGeometry(shift, 0.0 if planar is None else float(np.mean(planar)))
     return found
 
 
@@ -117,7 +118,7 @@ def write_own_matches(database: Path, images: Path, names: list[str], lens: Any,
         if lens.has_prior_focal_length:
             reader.camera_params = lens.params_to_string()
         extraction.num_threads, extraction.use_gpu, extraction.max_image_size = 1, False, _LONGEST
-        extraction.sift.peak_threshold *= _PEAKS
+        extraction.sift.peak_threshold *= _PEAK_FACTOR
         matching = pycolmap.FeatureMatchingOptions()
         matching.num_threads, matching.use_gpu = 1, False
         cpu, one = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
@@ -130,7 +131,7 @@ def write_own_matches(database: Path, images: Path, names: list[str], lens: Any,
             extraction_options=extraction,
             device=cpu,
         )
-        rules = {"matching_options": matching, "verification_options": _two_views(pycolmap, seed)}
+        rules = {"matching_options": matching, "verification_options": _two_view_options(pycolmap, seed)}
         pycolmap.match_exhaustive(database, **rules, device=cpu)
 
 
@@ -139,8 +140,8 @@ def solve(
 ) -> Cameras | None:
     """Cameras and points from verified matches, of as many photos as can be placed; None where no pair can be.
 
-    The lens is held while photos are placed, because two of them do not tell it, and adjusted to all of them after
-    that; again, with the lens that came out, until it no longer changes.
+    The lens is held while photos are placed, because two photos do not determine it, and adjusted to all of them after
+    that. This is repeated with the lens that came out until it no longer changes.
 
     Args:
         database: with verified matches, and a first guess of the lens, which is replaced by what comes out.
@@ -150,20 +151,20 @@ def solve(
         names: what each image of the database is called.
         focal: the focal length in pixels, where it is known; adjusted if None.
     """
-    best, least = None, 0.0
+    best, error = None, 0.0
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         lens = file.read_all_cameras()[0]
         lens.focal_length = focal or lens.focal_length
         for _ in range(_ROUNDS):
             file.update_camera(lens)
-            found = _mapped(pycolmap, database, images, work, seed, focal is None)
-            if found is None or (best is not None and _lost(best, found)):
+            found = _map(pycolmap, database, images, work, seed, focal is None)
+            if found is None or (best is not None and _is_worse(found, best)):
                 break
-            best, least = _settled(found, focal)
-            before, lens.params = np.array(lens.params), lens_found(best).params
-            if abs(lens.params[0] / before[0] - 1) < _STILL and abs(lens.params[3] - before[3]) < _STILL:
+            best, error = _adjust(found, focal)
+            before, lens.params = np.array(lens.params), lens_of_scene(best).params
+            if abs(lens.params[0] / before[0] - 1) < _CONVERGED and abs(lens.params[3] - before[3]) < _CONVERGED:
                 break
-    return None if best is None else cameras_of(best, names, _rise(best, least) if focal is None else math.inf)
+    return None if best is None else cameras_of(best, names, _focal_rise(best, error) if focal is None else math.inf)
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
@@ -172,7 +173,7 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     placed = {name: images[image] for image, name in names.items() if image in images}
     poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
     return Cameras(
-        float(lens_found(reconstruction).focal_length),
+        float(lens_of_scene(reconstruction).focal_length),
         {name: pose[:, :3] for name, pose in poses.items()},
         {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
         {name: int(image.num_points3D) for name, image in placed.items()},
@@ -181,10 +182,10 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     )
 
 
-def _mapped(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, free: bool) -> Any:
+def _map(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, free: bool) -> Any:
     """The reconstruction of most photos with the lens of the database; None where no pair can be placed.
 
-    If `free` the focal length is adjusted on the way where else no pair can be placed.
+    If `free`, the second attempt adjusts the focal length on the way.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -199,33 +200,44 @@ def _mapped(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, 
     options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = _MAX_ERROR
     options.mapper.init_max_error, options.mapper.abs_pose_max_error = 2.0, 4.0
     options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
-    for options.mapper.init_min_tri_angle in _FIRST_PAIR:
-        with suppress(RuntimeError, ValueError):  # the mapper gives up
-            found = pycolmap.incremental_mapping(database, images, work, options)
-            if found:
-                return max(found.values(), key=lambda scene: scene.num_reg_images())
+    options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES
+    found = _run_mapper(pycolmap, database, images, work, options)
+    if found is None:
+        options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES_AGAIN
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = free
-    return None
+        found = _run_mapper(pycolmap, database, images, work, options)
+    return found
 
 
-def _lost(best: Any, found: Any) -> bool:
-    """Whether a reconstruction places fewer photos than a former one, or less than half of its points."""
+def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any) -> Any:
+    """The reconstruction that places most photos; None where the mapper finds none."""
+    try:
+        found = pycolmap.incremental_mapping(database, images, work, options)
+    except (RuntimeError, ValueError):  # the mapper gives up
+        return None
+    return max(found.values(), key=lambda scene: scene.num_reg_images()) if found else None
+
+
+def _is_worse(found: Any, best: Any) -> bool:
+    """Whether a reconstruction has fewer photos than a former one, or less than half of its points."""
     return bool(found.num_reg_images() < best.num_reg_images() or 2 * found.num_points3D() < best.num_points3D())
 
 
-def _settled(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
-    """What `_adjusted` gives, with a distortion that cameras have or that explains enough of the errors; else with 0.
+def _adjust(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
+    """Bundle adjustment with a radial distortion that is usual or explains enough of the errors, else without one.
 
-    Photos that hardly tell the focal length trade it against a distortion that no camera has.
+    Photos that hardly determine the focal length trade it against a distortion that no camera has.
     """
-    bent, least = _adjusted(reconstruction, None, focal)
-    if abs(lens_found(bent).params[3]) <= _USUAL:
-        return bent, least
-    straight, most = _adjusted(reconstruction, 0.0, focal)
-    return (bent, least) if most > (1 + _BENDS) * least else (straight, most)
+    distorted, error = _bundle_adjust(reconstruction, None, focal)
+    if abs(lens_of_scene(distorted).params[3]) <= _USUAL_DISTORTION:
+        return distorted, error
+    undistorted, larger_error = _bundle_adjust(reconstruction, 0.0, focal)
+    if larger_error > (1 + _DISTORTION_GAIN) * error:
+        return distorted, error
+    return undistorted, larger_error
 
 
-def _adjusted(reconstruction: Any, distortion: float | None, focal: float | None) -> tuple[Any, float]:
+def _bundle_adjust(reconstruction: Any, distortion: float | None, focal: float | None) -> tuple[Any, float]:
     """A copy, adjusted until nothing improves, and half its sum of squared errors in pixels.
 
     Args:
@@ -238,7 +250,7 @@ def _adjusted(reconstruction: Any, distortion: float | None, focal: float | None
         options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
         options.print_summary, options.ceres.solver_options.num_threads = False, 1
         options.refine_focal_length, options.refine_extra_params = focal is None, distortion is None
-        lens = lens_found(scene)
+        lens = lens_of_scene(scene)
         known = lens.params.copy()
         lens.params = [focal or known[0], *known[1:3], known[3] if distortion is None else distortion]
         for image in scene.reg_image_ids():
@@ -248,23 +260,25 @@ def _adjusted(reconstruction: Any, distortion: float | None, focal: float | None
     return scene, float(done.ceres_summary.final_cost) if done.num_residuals else 0.0
 
 
-def _rise(reconstruction: Any, least: float) -> float:
-    """By what share the sum of squared errors grows with a focal length 1.25 times too long or too short: the lesser.
+def _focal_rise(reconstruction: Any, error: float) -> float:
+    """The relative growth of the sum of squared errors with a focal length 1.25 times too long or too short.
 
-    All else but the distortion is adjusted to that. Near 0 the photos do not tell the focal length: the scene is
-    stretched instead.
+    The smaller of the two counts; all else but the distortion is adjusted to the wrong focal length. Near 0 the photos
+    do not determine the focal length: the scene is stretched instead.
     """
-    focal, _, _, distortion = lens_found(reconstruction).params
-    wrong = min(_adjusted(reconstruction, distortion, focal * factor)[1] for factor in (_OFF, 1 / _OFF))
-    return wrong / max(least, np.finfo(np.float64).tiny) - 1
+    focal, _, _, distortion = lens_of_scene(reconstruction).params
+    wrong = min(
+        _bundle_adjust(reconstruction, distortion, focal * factor)[1] for factor in (_WRONG_FOCAL, 1 / _WRONG_FOCAL)
+    )
+    return wrong / max(error, np.finfo(np.float64).tiny) - 1
 
 
-def lens_found(reconstruction: Any) -> Any:
+def lens_of_scene(reconstruction: Any) -> Any:
     """The one camera, with params focal length, centre (x, y) and radial distortion."""
     return next(iter(reconstruction.cameras.values()))
 
 
-def _two_views(pycolmap: Any, seed: int) -> Any:
+def _two_view_options(pycolmap: Any, seed: int) -> Any:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.detect_watermark = seed, False
     return options

@@ -33,7 +33,7 @@ from .gates import (
     judge,
     why_no_cameras,
 )
-from .map import Cameras, lens_found, looks, quiet_pycolmap, solve, verify, write_own_matches
+from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verify, write_own_matches
 from .match import exif_focal, lens_of, write_matches
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .write import (
@@ -155,7 +155,7 @@ def find_cameras(
             write_matches(first, photos, image_names, stage)
             pairs = verify(first, seed, photo_names)
             seconds["matches"] = lap()
-            if reason := why_no_cameras(names, pairs, looks(first, photo_names)):
+            if reason := why_no_cameras(names, pairs, pair_geometries(first, photo_names)):
                 raise DataError(folder, "", reason)
 
             def solve_second() -> Cameras | None:
@@ -220,7 +220,7 @@ def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
         "focal_px": cameras.focal,
         "focal_35mm": film,
         "exif_focal_px": exif_focal(photos),
-        "radial_distortion": float(lens_found(cameras.reconstruction).params[3]),
+        "radial_distortion": float(lens_of_scene(cameras.reconstruction).params[3]),
     }
 
 
