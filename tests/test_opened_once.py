@@ -130,7 +130,7 @@ def test_unposed_photos(
     monkeypatch.setattr(pose, "write_matches", stop)
     opened.clear()
     with pytest.raises(DataError, match="stopped"):
-        pose_photos(folder, tmp_path / "out", say=print)
+        pose_photos(folder, tmp_path / "out")
     jpegs = {Path(name).name: count for name, count in opened.items() if name.endswith(".jpg")}
     assert jpegs == {"IMG_1.jpg": 1, "IMG_2.jpg": 1, "IMG_3.jpg": 1}
     assert len(decoded) == 3
