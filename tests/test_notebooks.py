@@ -1,10 +1,8 @@
-"""The notebooks run from top to bottom in a fresh kernel and show what they say; small here, in full with -m slow."""
+"""The notebooks run from top to bottom and show what they say: small in this process, in full in a kernel (slow)."""
 
 import os
 import re
 import shutil
-import subprocess
-import sys
 import textwrap
 import time
 from pathlib import Path
@@ -12,13 +10,11 @@ from pathlib import Path
 import pytest
 
 nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
-pytest.importorskip("ipykernel")
-pytest.importorskip("matplotlib")
+plt = pytest.importorskip("matplotlib.pyplot")
+backend_inline = pytest.importorskip("matplotlib_inline.backend_inline")
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-LIMIT_QUICK = 60  # seconds; meant to be under 15
-LIMIT_FULL = 300
+LIMIT = 300  # seconds for a full run
 
 # What must be true in the kernel after the last cell: of any run, and of a full one.
 CLAIMS = {
@@ -122,52 +118,56 @@ SMALLER = {
 }
 
 
-@pytest.fixture(scope="session")
-def installed(tmp_path_factory):
-    """Kernels do not see the checkout as pytest does, so kgs has to be installed."""
-    probe = subprocess.run(
-        [sys.executable, "-c", "import kgs.losses, kgs.datasets"],
-        cwd=tmp_path_factory.mktemp("elsewhere"),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if probe.returncode:
-        pytest.skip(f"kgs is not installed for {sys.executable}: {probe.stderr.strip().splitlines()[-1]}")
+@pytest.fixture
+def workplace(tmp_path):
+    """A folder to run in, beside the measured figures as in the repository."""
+    shutil.copytree(NOTEBOOKS[0].parents[1] / "docs" / "results", tmp_path / "docs" / "results")
+    (tmp_path / "notebooks").mkdir()
+    return tmp_path / "notebooks"
 
 
-def execute(path, folder, quick):
-    """Run a notebook and its claims in a kernel of this very Python, whatever kernels the user has.
+def run_here(path):
+    """Run a small notebook's code and its claims in this process; return how many figures its cells showed.
 
-    It runs in a folder of its own, beside the measured figures as in the repository.
+    As a notebook does, each cell draws the figures that it has opened when it ends.
     """
+    sizes, names, figures = SMALLER.get(path.stem, {}), {"__name__": "notebook"}, 0
+    cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    for size, smaller in sizes.items():
+        assert cells[0].count(size) == 1
+        cells[0] = cells[0].replace(size, smaller)
+    for number, source in enumerate([*cells, textwrap.dedent(CLAIMS[path.stem][0])], 1):
+        exec(compile(source, f"{path.name}, code cell {number}", "exec"), names)
+        for figure in map(plt.figure, plt.get_fignums()):
+            figure.canvas.draw()
+            figures += 1
+        plt.close("all")
+    return figures
+
+
+def run_in_a_kernel(path, folder):
+    """Run a whole notebook and its claims in a kernel of this very Python, whatever kernels the user has."""
+    nbclient = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
     from jupyter_client.kernelspec import KernelSpecManager
     from jupyter_client.manager import AsyncKernelManager
 
     notebook = nbformat.read(path, as_version=4)
-    for claims in CLAIMS[path.stem][: 1 if quick else 2]:
+    for claims in CLAIMS[path.stem]:
         notebook.cells.append(nbformat.v4.new_code_cell(textwrap.dedent(claims).strip()))
     environment = {key: value for key, value in os.environ.items() if key not in ("KGS_QUICK", "MPLBACKEND")}
-    environment["IPYTHONDIR"] = str(folder / "ipython")
-    shutil.copytree(path.parents[1] / "docs" / "results", folder / "docs" / "results")
-    (folder / "notebooks").mkdir()
+    environment["IPYTHONDIR"] = str(folder.parent / "ipython")
     # the tensors are small: on a busy machine a second thread costs far more than it brings
     environment.setdefault("OMP_NUM_THREADS", "1")
-    if quick:
-        environment["KGS_QUICK"] = "1"
-        for size, smaller in SMALLER.get(path.stem, {}).items():
-            assert notebook.cells[1].source.count(size) == 1
-            notebook.cells[1].source = notebook.cells[1].source.replace(size, smaller)
-    end = time.monotonic() + (LIMIT_QUICK if quick else LIMIT_FULL)
+    end = time.monotonic() + LIMIT
     client = nbclient.NotebookClient(
         notebook,
         km=AsyncKernelManager(kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[])),
-        resources={"metadata": {"path": str(folder / "notebooks")}},
+        resources={"metadata": {"path": str(folder)}},
         timeout_func=lambda cell: max(1, end - time.monotonic()),
         shutdown_kernel="immediate",
     )
     client.execute(env=environment, cleanup_kc=True)  # else the kernel lives, with its memory, as long as the tests
-    return notebook
 
 
 def pictures(notebook):
@@ -179,19 +179,21 @@ def test_each_notebook_has_claims():
     assert [path.stem for path in NOTEBOOKS] == sorted(CLAIMS)
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_runs_quickly(path, tmp_path):
-    notebook = execute(path, tmp_path, quick=True)
-    assert pictures(notebook) == pictures(nbformat.read(path, as_version=4))
-    assert not list((tmp_path / "notebooks").iterdir()), "a notebook leaves files behind"
+def test_it_runs_quickly(path, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    monkeypatch.setenv("KGS_QUICK", "1")
+    monkeypatch.setattr(backend_inline, "set_matplotlib_formats", lambda *args, **kwargs: None)
+    with plt.rc_context({"backend": "agg"}):
+        assert run_here(path) == pictures(nbformat.read(path, as_version=4))
+    assert not list(workplace.iterdir()), "a notebook leaves files behind"
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_runs_in_full(path, tmp_path):
-    execute(path, tmp_path, quick=False)
+def test_it_runs_in_full(path, workplace):
+    run_in_a_kernel(path, workplace)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
