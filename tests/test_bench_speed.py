@@ -113,6 +113,7 @@ def test_the_files_are_written(tmp_path, monkeypatch):
     assert "| forward + backward, torch, wall beside two busy processes over that |" in page
 
 
+@pytest.mark.slow
 def test_memory_is_measured_in_a_process_of_its_own():
     assert 5 < speed._memory_of_its_own(300, "torch") < 500
 

@@ -69,6 +69,7 @@ PACKED = rf"\tv?{FLOATS}ps\b.*[yz]mm|\tf(?:mla|mls|mul|add|sub)(?:\.4s|\tv\d+\.4
 SCALAR = rf"\tv?{FLOATS}ss\b|\tf(?:n?m(?:add|sub)|mul|add|sub)\ts\d"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [kernels.composite_forward, kernels.composite_backward], ids=["forward", "backward"])
 def test_pixels_are_the_lanes(kernel):
     """LLVM leaves a loop scalar without a word: see the rules in `kgs.backends.cpu`."""
@@ -95,6 +96,7 @@ IMAGE, MAPS = nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]
 TAPS, SUMS = nb.types.UniTuple(nb.float32, 6), nb.float64[:, ::1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "arguments", "operations"),  # of the loops over columns, in the source
     [

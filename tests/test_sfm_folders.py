@@ -153,6 +153,7 @@ def test_a_camera_that_only_turned(folder, refused):
     refused(folder, "a camera that only turned on the spot, explains all matches", "step to the side", "Matches of")
 
 
+@pytest.mark.slow
 def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
     message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
     refused(write_photos(tmp_path / "photos", close(0.5)), *message)

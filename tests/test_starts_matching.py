@@ -62,6 +62,7 @@ def test_bits_do_not_depend_on_threads():
     assert all(torch.equal(a, b) for some in found for a, b in zip(some, found[0], strict=True))
 
 
+@pytest.mark.slow
 def test_inner_loops_are_vector_code():
     rows, numbers, floats = nb.float32[:, ::1], nb.int64[:, ::1], nb.float32[::1]
     arguments = (rows, rows, rows, rows, nb.float32, floats, floats, nb.int64[::1], rows, rows, numbers)

@@ -65,6 +65,7 @@ def test_bits_depend_neither_on_threads_nor_on_repetition():
     assert all(torch.equal(a, b) for some in found for a, b in zip(some, found[0], strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "arguments", "pattern", "operations"),  # of the loops over columns or planes, in the source
     [

@@ -4,7 +4,6 @@ import base64
 import csv
 import math
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -32,26 +31,6 @@ def lines(markdown, title, *names):
     table = markdown.split(f"{title}")[1].split("\n\n")[1]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
     return [row for row in rows if set(names) <= set(row)]
-
-
-class Balanced(HTMLParser):
-    """Fails where a tag is closed that is not open."""
-
-    VOID = ("meta", "img", "br", "link")
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.images, self.rows = [], [], 0
-
-    def handle_starttag(self, tag, attributes):
-        self.rows += tag == "tr"
-        if tag not in self.VOID:
-            self.open.append(tag)
-        if tag == "img":
-            self.images.append(dict(attributes)["src"])
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
 
 FULL = full()
@@ -103,16 +82,13 @@ def test_every_part_of_the_study_gives_sound_files(case, reports):
         found = list(csv.DictReader(file))
     assert [row["method"] for row in found] == [row["cell"]["method"] for row in rows]
     assert all(None not in row and None not in row.values() for row in found)
-    page = Balanced()
-    page.feed((out / "index.html").read_text())
-    assert not page.open
-    drawn = sorted(path.name for path in out.glob("*.png"))
-    assert len(page.images) == len(drawn)
-    pictures = {(out / name).read_bytes() for name in drawn}
-    assert pictures == {base64.b64decode(image.removeprefix("data:image/png;base64,")) for image in page.images}
-    assert not re.search(r"<script|<link|@import|src=\"(?!data:)", (out / "index.html").read_text())
+    page = (out / "index.html").read_text()
+    images = re.findall(r'<img[^>]*src="data:image/png;base64,([^"]*)"', page)
+    drawn = {path.read_bytes() for path in out.glob("*.png")}
+    assert {base64.b64decode(image) for image in images} == drawn
+    assert not re.search(r"<script|<link|@import|src=\"(?!data:)", page)
     tables = [line for line in text.splitlines() if line.startswith("|")]
-    assert page.rows == len(tables) - sum(line.startswith("| ---") for line in tables)
+    assert page.count("<tr>") == len(tables) - sum(line.startswith("| ---") for line in tables)
 
 
 def test_methods_are_told_apart():
@@ -240,9 +216,7 @@ def test_the_built_in_scene_is_shown_but_counts_in_no_mean(tmp_path):
     assert not lines(text, "Test views", "synthetic, 3 views, dense")
     assert (tmp_path / "sparse.csv").read_text().count("synthetic,") == 2
     html = (tmp_path / "index.html").read_text()
-    page = Balanced()
-    page.feed(html)
-    assert page.images[-3:] == uris
+    assert re.findall(r'<img[^>]*src="([^"]*)"', html)[-3:] == uris
     psnr = rows[2]["result"]["test"]["psnr"]
     assert f"off:\nPSNR {psnr:.2f} dB, SSIM {psnr / 31:.3f}, LPIPS {psnr / 110:.3f}" in html
 

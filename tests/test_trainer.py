@@ -16,8 +16,6 @@ from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.trainer import Trainer
 from kgs.renderer import GaussianRenderer
 
-pytestmark = pytest.mark.usefixtures("each_backend")
-
 CONFIG = FitConfig(steps=30, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
 
 
@@ -164,6 +162,7 @@ def test_the_number_may_grow_evenly(scene, points):
     assert len(at_once.model) >= len(trainer.model)
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
 def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(scene, points, name):
     trainer = Trainer(scene, CONFIG, points)
@@ -176,6 +175,7 @@ def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(scene, points,
     assert all(torch.equal(value, before[key]) for key, value in parameters(trainer).items())
 
 
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_it_stops_at_a_parameter_that_is_not_finite(scene, points, tmp_path, name, value):

@@ -1,27 +1,22 @@
-"""Runs many cells of an experiment on the workers of Dask, each once: finished ones are kept in a file."""
+"""Runs the cells of an experiment on Dask, each once: a finished cell is a line of a file, and is not done again."""
 
-import asyncio
 import json
 import logging
 import os
-import time
-from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, KilledWorker, LocalCluster, Security, wait
-from distributed.core import rpc
+from distributed import Client, LocalCluster, as_completed
 
 from kgs.io.results_folder import held
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
 _key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
-PATIENCE = 10  # seconds for a scheduler to answer
-_LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
+_TIMEOUT = 10  # seconds for a scheduler to answer
 
 
 def run_grid(
@@ -33,46 +28,112 @@ def run_grid(
     scheduler: str | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
-    """Do the cells that the file does not have yet; return the lines of those that are there, in the cells' order.
+    """Do the cells that the file does not have yet; return the lines of those that it has then, in the cells' order.
+
+    A run that is killed goes on where it stopped when it is started again. Dask repeats a cell whose worker dies, three
+    times at most; a cell that fails is reported and does not stop the others.
 
     Args:
-        cells: dicts of plain values, each different. One whose worker dies is tried once more.
-        work: a function of a module (other processes import it); takes a cell, returns its result in plain values.
-        path: JSONL, a line `{"cell": ..., "result": ...}` as soon as a cell is done; one that was cut short is dropped.
-        processes: how many processes of this machine, None for one per core; they share the cores.
-        scheduler: address of a Dask scheduler whose workers, with the same packages and data, take their place.
-        say: where lines for the user go, errors of cells among them.
+        cells: dicts of plain values, each different.
+        work: a function of a module (other processes import it): takes a cell, returns its result in plain values.
+        path: JSONL file; gets a line `{"cell": ..., "result": ...}` as soon as a cell is done.
+        processes: how many processes of this machine do the cells, None for one per core; they share the cores.
+        scheduler: address of a Dask scheduler, whose workers do the cells instead; they need the same packages and
+            data.
+        say: takes a line of text for the user.
 
     Raises:
-        ValueError: equal cells, `processes` below 1, a file that another run has, no scheduler, or one that was lost.
+        ValueError: two cells are equal, `processes` is below 1, another run writes the file, or the scheduler does not
+            answer or was lost.
     """
     if processes is not None and processes < 1:
         raise ValueError(f"processes: expected at least 1, got {processes}")
     if len({_key(cell) for cell in cells}) < len(cells):
         raise ValueError("cells: expected each one once, got two that are equal")
-    failed = 0
     with _alone(path):
         done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
         missing = [cell for cell in cells if _key(cell) not in done]
         say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
-        with _workers(processes, scheduler) if missing else nullcontext() as client:
-            for count, (cell, outcome) in enumerate(_outcomes(client, work, missing), 1):
-                if isinstance(outcome, BaseException):
-                    failed += 1
-                    say(f"failed: {_key(cell)}: {type(outcome).__name__}: {outcome}")
-                    continue
-                with path.open("a", encoding="utf-8") as file:
-                    file.write(_key({"cell": cell, "result": outcome}) + "\n")
-                    file.flush()
-                    os.fsync(file.fileno())
-                say(f"{count} of {len(missing)}: {_key(cell)}")
-    if failed:
-        say(f"{failed} of {len(missing)} cells failed; run again to try them once more")
+        if missing:
+            with _client(processes, scheduler) as client:
+                _do(client, work, missing, path, say)
     return finished_rows(cells, path)
 
 
+def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Callable[[str], None]) -> None:
+    """Do the cells on the client's workers and append each to the file when it is done."""
+    waiting, cell_of, failed = iter(cells), {}, 0
+    futures = as_completed()
+
+    def submit_to_free_workers() -> None:
+        free = sum(client.nthreads().values()) - len(cell_of)  # a queued cell would be lost with its worker
+        for cell in islice(waiting, max(0, free)):
+            future = client.submit(work, cell, pure=False)
+            cell_of[future] = cell
+            futures.add(future)
+
+    client.wait_for_workers(1)
+    submit_to_free_workers()
+    for count, future in enumerate(futures, 1):
+        cell = cell_of.pop(future)
+        if future.cancelled():
+            raise ValueError("scheduler: lost the connection to it; run again to go on")
+        if error := future.exception():
+            failed += 1
+            say(f"failed: {_key(cell)}: {type(error).__name__}: {error}")
+        else:
+            _append(path, {"cell": cell, "result": future.result()})
+            say(f"{count} of {len(cells)}: {_key(cell)}")
+        submit_to_free_workers()
+    if failed:
+        say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(_key(row) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
+    """A client of the scheduler at this address, or of processes of this machine."""
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=_TIMEOUT)
+        except (OSError, ValueError, TypeError) as error:  # what Dask raises for no answer, no port, and a worker
+            expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+            raise ValueError(f"scheduler: {expected}, got {scheduler!r} ({error})") from error
+        with client:
+            yield client
+        return
+    cores = os.cpu_count() or 1
+    count = processes or cores
+    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // count))
+    cluster = LocalCluster(
+        count,
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=None,  # a cell may need any share of the memory; Dask would kill its process
+        env={"OMP_NUM_THREADS": threads},
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
+    with cluster, Client(cluster) as client:
+        yield client
+
+
 def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
-    """The lines of a JSONL file, none without one; not a last one that is cut short, which `repair` takes out."""
+    """The lines of a JSONL file, none if there is no file. A last line that was cut short is left out.
+
+    Args:
+        path: the file.
+        repair: also remove a last line that was cut short from the file.
+
+    Raises:
+        ValueError: another line is not JSON.
+    """
     lines = path.read_bytes().splitlines() if path.exists() else []
     rows = []
     for number, line in enumerate(lines, 1):
@@ -80,7 +141,7 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
             rows.append(json.loads(line))
         except ValueError as error:
             if number < len(lines):
-                raise ValueError(f"{path}: line {number} is no JSON ({error})") from error
+                raise ValueError(f"{path}: line {number} is not JSON ({error})") from error
     if repair and lines:
         with path.open("r+b") as file:
             file.seek(max(0, sum(len(line) + 1 for line in lines[: len(rows)]) - 1))
@@ -90,72 +151,14 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
 
 
 def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
-    """The lines of those of the cells that the file has, in the cells' order; of two lines of one cell the last."""
+    """The lines of the cells that the file has, in the cells' order; where a cell has two lines, the last."""
     done = {_key(row["cell"]): row for row in read_rows(path)}
     return [done[key] for key in map(_key, cells) if key in done]
 
 
 @contextmanager
-def _workers(processes: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A client of the scheduler at this address, or of one of our own; all that waits or runs there goes with it."""
-    cores = os.cpu_count() or 1
-    local: dict[str, Any] = {"n_workers": processes or cores, "threads_per_worker": 1, "processes": True}
-    local |= {"memory_limit": None}  # a cell may need any share of the memory; Dask would kill its process
-    local |= {"env": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS") or str(cores // (processes or cores) or 1)}}
-    local |= {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
-    before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
-    try:
-        if scheduler is not None:
-            with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
-                found = thread.submit(asyncio.run, _identify(scheduler))
-            if (kind := found.exception() or found.result()) != "Scheduler":
-                expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
-                raise ValueError(f"scheduler: {expected}, got {scheduler!r} ({kind!r})")
-        with nullcontext(scheduler) if scheduler else LocalCluster(**local) as place, Client(place) as client:
-            yield client
-    finally:
-        for name in set(os.environ) - before:
-            del os.environ[name]
-
-
-async def _identify(address: str) -> str:
-    """What answers there. A Client would wait for ever for a port that is open and says nothing."""
-    async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
-        return str((await asyncio.wait_for(server.identity(), PATIENCE))["type"])
-
-
-def _outcomes(client: Any, work: Work, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Any]]:
-    """Every cell with its result or error, as they come; one whose worker died is tried once more."""
-    # Each is tied to a free worker: Dask's queues would let it die with another's, and repeat what a lost one finished.
-    waiting, running, again = deque(cells), dict[Any, tuple[Cell, str]](), list[Cell]()
-    while waiting or running:
-        try:
-            workers = client.nthreads()
-            busy = Counter(address for _, address in running.values())
-            for address, threads in workers.items():
-                for cell in [waiting.popleft() for _ in range(min(len(waiting), threads - busy[address]))]:
-                    running[client.submit(work, cell, workers=[address], pure=False)] = cell, address
-            with suppress(TimeoutError):
-                wait(list(running), timeout=1, return_when="FIRST_COMPLETED") if running else time.sleep(0.1)
-        except OSError:
-            raise ValueError(_LOST) from None
-        for future in [future for future in running if future.done() or running[future][1] not in workers]:
-            cell, _ = running.pop(future)
-            if future.status in ("cancelled", "lost"):
-                raise ValueError(_LOST)
-            error = future.exception() if future.done() else None
-            if future.done() and not isinstance(error, KilledWorker):
-                yield cell, error or future.result()
-            elif cell in again:
-                yield cell, RuntimeError("the worker died, and another one before it")
-            else:
-                again.append(cell)
-                waiting.append(cell)
-
-
-@contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Holds the file, made if it is not there, against other runs."""
+    """Keep other runs from writing the file, which is created if it is not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with held(path) as ours:
         if not ours:
