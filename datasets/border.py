@@ -45,8 +45,8 @@ def _from_top(bright: Tensor) -> Tensor:
     outer, inside, farther = rows[:, 0], rows[:, most], rows[:, 2 * most - 1]
     if bool(((inside < SEEN) | (outer > DARK * inside) | (inside < DARK * farther)).any()):  # in any photo
         return bright.new_zeros(0, width)
-    reach = int(ALONG * width) // 2
-    sums = avg_pool1d(bright[:, : 2 * most].sum(dim=0), 2 * reach + 1, 1, reach, count_include_pad=False)
+    half = int(ALONG * width) // 2
+    sums = avg_pool1d(bright[:, : 2 * most].sum(dim=0), 2 * half + 1, 1, half, count_include_pad=False)
     shares = (sums[:most] / sums[most:].mean(dim=0).clamp(min=1e-6)).clamp(max=1.0)
     end = int((shares.mean(dim=1) < CLEAR).cumprod(dim=0).sum())
     return torch.where(shares[:end] < CLEAR, shares[:end], 1.0)

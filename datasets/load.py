@@ -64,7 +64,7 @@ def load_scene(
             (they are on torch's "meta" device), `masks` and `finer` are None.
 
     Raises:
-        DataError: the folder is no scene, or its files are missing, damaged or contradict each other.
+        DataError: the folder is not a scene, or its files are missing, damaged or contradict each other.
         ValueError: train_views, downscale, hold_out, background or points is out of range.
 
     Examples:
@@ -167,7 +167,7 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
     lens = frame.intrinsics
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
-        raise DataError(frame.path, "", f"has {width}x{height} pixels, which is no scaled version of {described}")
+        raise DataError(frame.path, "", f"has {width}x{height} pixels, which is not a scaled version of {described}")
     for scale in scales:
         if _reduced(width, height, scale.factor) != scale.size:
             expected = f"expected {scale.first} pixels as the other images"

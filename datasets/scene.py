@@ -37,7 +37,7 @@ class Views:
             It is below 1 in the dark border that removing a lens's distortion can leave.
 
     Raises:
-        TypeError: the images are no tensor of floating point numbers.
+        TypeError: the images are not a tensor of floating point numbers.
         ValueError: counts, shapes or sizes do not fit, or two names are equal.
 
     Examples:
@@ -97,7 +97,7 @@ class Views:
     def camera(self, index: SupportsIndex | Sequence[SupportsIndex] | Tensor) -> PinholeCamera:
         """The cameras at the given positions, one or several (Kornia's class cannot be indexed).
 
-        Positions that are no integers are a TypeError, views that are not there an IndexError.
+        TypeError for positions that are not integers, IndexError for views that do not exist.
         """
         rows = torch.as_tensor(index, device=self.cameras.extrinsics.device)
         if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):

@@ -26,7 +26,7 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
     """Choose positions evenly among `count`, the first and the last included.
 
     The increasing positions are linspace(0, count - 1, train_views), rounded half to even: other roundings give other
-    views. None takes all; what is no whole number in [1, count] is a ValueError.
+    views. None takes all; ValueError for anything but an integer in [1, count].
     """
     if train_views is None:
         return list(range(count))

@@ -1,4 +1,4 @@
-"""Everything about camera models: Kornia's cameras one by one, the pixel of a point and its derivative.
+"""Camera models: each of Kornia's cameras as a projection of points to pixels, and its derivative.
 
 The derivative is closed form for pinhole and orthographic cameras and two reverse passes through Kornia's `project`
 for distorted ones. Far outside the field of view the first-order footprint is meaningless and grows without bound;
@@ -37,19 +37,19 @@ Pixels = Callable[[Tensor], Tensor]
 class PosedCamera:
     """One of Kornia's camera models together with its poses: for lenses that `PinholeCamera` cannot describe.
 
-    Its tensors are kept as they are, not cloned: a parameter that an optimiser has changed is used by the next render.
+    Its tensors are not cloned: the next render uses a parameter that an optimiser has changed.
 
     Convention:
         OpenCV axes (x right, y down, z forward), pixels with integer centres.
 
     Args:
-        model: a `kornia.sensors.camera.CameraModel` of any of its four types, from points of the camera frame to
+        model: a `kornia.sensors.camera.CameraModel` of any of its four types, from points in the camera frame to
             pixels; its `params` are `(P,)`, shared by all poses, or `(C, P)`, one row per pose.
         extrinsics: world-to-camera, `(C, 4, 4)`.
 
     Raises:
-        TypeError: `model` is no Kornia camera model or `extrinsics` no tensor.
-        ValueError: shapes do not fit.
+        TypeError: `model` is not a Kornia camera model or `extrinsics` not a tensor.
+        ValueError: shapes do not match.
     """
 
     model: CameraModel
@@ -87,10 +87,10 @@ def pinhole_cameras(
 ) -> PinholeCamera:
     """Kornia's pinhole cameras from matrices and plain sizes; differentiable.
 
-    A `PinholeCamera` clones what it is made of. Where poses or intrinsics are optimised, make a new one in each step.
+    A `PinholeCamera` clones its arguments. Where poses or intrinsics are optimised, make a new one in each step.
 
     Convention:
-        World-to-camera matrices, OpenCV axes. In the result pixels have integer centres, whatever `Ks` have.
+        World-to-camera matrices, OpenCV axes. The result has integer pixel centres, whatever those of `Ks`.
 
     Args:
         viewmats: world-to-camera matrices, OpenCV axes, `(C, 4, 4)`, or `(4, 4)` for one.
@@ -101,8 +101,8 @@ def pinhole_cameras(
             and OpenCV, "half" at (0.5, 0.5) as in COLMAP and gsplat.
 
     Raises:
-        TypeError: no tensors, or of different dtypes or devices.
-        ValueError: shapes or sizes do not fit.
+        TypeError: an argument is not a tensor, or dtypes or devices differ.
+        ValueError: shapes or sizes do not match.
 
     Examples:
         >>> import torch, kgs
@@ -160,8 +160,8 @@ def intrinsics(cameras: Cameras) -> Tensor:
 def times(matrix: Tensor, vectors: Tensor) -> Tensor:
     """The product of a matrix `(I, J)` with each of some vectors, `(*, J)` to `(*, I)`.
 
-    As a sum of products of numbers: unlike products of matrices, torch never rounds these to bfloat16 or TF32, as
-    `torch.autocast` and `torch.set_float32_matmul_precision` ask for. Of a pixel coordinate 8 bits would be left.
+    Computed elementwise: torch rounds matrix products to bfloat16 or TF32 under `torch.autocast` or
+    `torch.set_float32_matmul_precision`, which would leave 8 bits of a pixel coordinate.
     """
     return (vectors[..., None, :] * matrix).sum(-1)
 
@@ -175,7 +175,7 @@ def lenses(cameras: Cameras, size: tuple[int, int] | None = None) -> list[Lens]:
 
 
 def _pinhole(cameras: PinholeCamera, c: int, size: tuple[int, int]) -> Lens:
-    with torch.inference_mode(False):  # autograd takes a clone of what was made in inference mode
+    with torch.inference_mode(False):  # autograd refuses tensors made in inference mode; clones are fine
         both = [x.clone() if x.is_inference() else x for x in (cameras.intrinsics, cameras.extrinsics)]
     matrix, pose = (x[c] for x in both)
     limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], *size)
@@ -192,7 +192,7 @@ def _pinhole(cameras: PinholeCamera, c: int, size: tuple[int, int]) -> Lens:
 
 def _modelled(cameras: PosedCamera, c: int) -> Lens:
     model = cameras.model
-    with torch.inference_mode(False):  # autograd takes a clone of what was made in inference mode
+    with torch.inference_mode(False):  # autograd refuses tensors made in inference mode; clones are fine
         params, poses = (x.clone() if x.is_inference() else x for x in (model.params, cameras.extrinsics))
     if params.ndim == 2:
         params = params[c if params.shape[0] > 1 else 0]
@@ -214,7 +214,7 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
             return _perspective_jacobian(k, points, limits)
         if brown_conrady:
             z = points[:, 2]
-            points = torch.stack([*(_held(points[:, i] / z, *limits[i]) * z for i in (0, 1)), z], 1)
+            points = torch.stack([*(_clamp_keeping_gradient(points[:, i] / z, *limits[i]) * z for i in (0, 1)), z], 1)
         return _reverse_jacobian(pixels, points)
 
     sees = None if plain else _before_fold(params.tolist(), brown_conrady)
@@ -245,7 +245,7 @@ def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor],
 
 
 def tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Tensor:
-    """Limits of x/z and y/z in rows (lower, upper), `(2, 2)`, no gradient; also where a focal length is negative."""
+    """Limits of x/z and y/z as rows (lower, upper), `(2, 2)`, without gradient; focal lengths may be negative."""
     focal, centre, size = focal.detach(), centre.detach(), focal.new_tensor([width, height])
     first, last = -(centre + 0.5 + MARGIN * size) / focal, (size - 0.5 - centre + MARGIN * size) / focal
     return torch.stack([torch.minimum(first, last), torch.maximum(first, last)], 1)
@@ -254,12 +254,12 @@ def tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Te
 def _perspective_jacobian(k: Tensor, points: Tensor, limits: Tensor) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
     inverse = 1.0 / points[:, 2]
-    tangents = [_held(points[:, i] * inverse, low, high) for i, (low, high) in enumerate(limits)]
+    tangents = [_clamp_keeping_gradient(points[:, i] * inverse, low, high) for i, (low, high) in enumerate(limits)]
     last = -inverse[:, None] * times(k, torch.stack(tangents, 1))
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
 
-def _held(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def _clamp_keeping_gradient(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """`x.clamp(low, high)` with the gradient of `x` at the limits too, as before torch 2.14."""
     return x.masked_fill(x < low, low).masked_fill(x > high, high)
 

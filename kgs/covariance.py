@@ -31,7 +31,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     """The factors M = (J W) R S `(M, 2, 3)` in pixels; `rows` are J W, from the world point to the pixel, `(M, 2, 3)`.
 
-    Differentiable once, in closed form over columns of numbers: products of as many tiny matrices are ten times slower.
+    Differentiable once, in closed form on columns of numbers: batched products of tiny matrices are ten times slower.
     """
     factors: Tensor = _FootprintFactors.apply(rows, quats, scales)
     return factors
@@ -74,7 +74,7 @@ class _FootprintFactors(torch.autograd.Function):
 
 
 def columns(rows: Tensor) -> Tensor:
-    """`(M, ...)` as one contiguous column per number, `(numbers, M)`, in memory of its own."""
+    """`(M, ...)` as one contiguous column per number, `(numbers, M)`; always a copy."""
     return rows.flatten(1).t().clone(memory_format=torch.contiguous_format)
 
 
@@ -139,7 +139,7 @@ def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: 
 
 
 def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:
-    """From moments s of dL/d ln alpha, `(n, 6)`, to gradients of means2d, factors and opacities.
+    """From the spatial moments s of dL/d ln alpha, `(n, 6)`, to gradients of means2d, factors and opacities.
 
     With the conic Q: dL/d mean = Q s_1 and, for Sigma' = M M^T + e I, dL/dM = Q S_2 (Q M). With the
     rows a, b of M and w = a x b the rows of det Q M are e a + b x w and e b + w x a, without the cancellation of a
@@ -155,7 +155,7 @@ def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: fl
     w = torch.linalg.cross(a, b, dim=0)
     turned = torch.stack([torch.linalg.cross(b, w, dim=0), torch.linalg.cross(w, a, dim=0)])
     x, y = turned.add_(m, alpha=eps2d).div_(det)  # Q M
-    flat = ~(det < torch.inf)  # wider than numbers reach: it does not change over the image
+    flat = ~(det < torch.inf)  # the footprint overflows: constant over the image
     d_means = conic(sx, sy).masked_fill_(flat, 0.0)
     d_factors = conic(sxx * x + sxy * y, sxy * x + syy * y).masked_fill_(flat, 0.0)
     return d_means.t(), d_factors.permute(2, 0, 1), s0 / opacities

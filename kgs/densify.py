@@ -1,7 +1,7 @@
 """Adaptive density control: clone, split and prune Gaussians while they are being fitted, and reset opacities.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023, section 5.2, with the numbers of the DropGaussian
-recipe (threshold 5e-4, pruning by opacity alone). Only here does the number of Gaussians change in a fit.
+recipe (threshold 5e-4, pruning by opacity alone). The number of Gaussians in a fit changes only here.
 """
 
 import math
@@ -26,9 +26,9 @@ class DensifyReport:
     Args:
         cloned: how many were copied.
         split: how many were replaced by two smaller ones.
-        pruned: how many were removed because they are transparent.
+        pruned: how many were removed because their opacity is too low.
         total: how many there are now: those before + cloned + split - pruned.
-        capped: how many over the threshold were left alone because of `max_gaussians`.
+        capped: how many above the threshold stayed unchanged because of `max_gaussians`.
     """
 
     cloned: int
@@ -39,7 +39,7 @@ class DensifyReport:
 
 
 class Densifier:
-    """Adds Gaussians where the image wants them and removes transparent ones, together with their Adam state.
+    """Adds Gaussians where the loss gradient is large and removes transparent ones, together with their Adam state.
 
     The statistic is the norm of the loss gradient by the projected centre in normalised device coordinates (pixels over
     half the width and height), averaged over the times a Gaussian was seen since the last `step`. One that
@@ -51,19 +51,20 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: holds each of the model's parameters, and others that are left alone. Its state for a parameter is
-            made of scalars and tensors of its shape that begin at 0: Adam, SGD, RMSprop; not LBFGS or Adafactor.
+        optimizer: holds each of the model's parameters; others that it holds are not touched. Its state for a parameter
+            consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD, RMSprop; not
+            LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
         prune_opacity: Gaussians below this opacity are removed, in [0, 1].
-        max_gaussians: no densification goes beyond this count; the largest gradients come first. None: no limit.
-        generator: the stream for the children's places; None makes one of its own, seeded with 0.
+        max_gaussians: upper bound for the count; Gaussians with the largest gradients come first. None: no limit.
+        generator: draws the positions of split Gaussians; None makes a generator seeded with 0.
 
     Raises:
-        TypeError: `model` is no GaussianModel.
-        ValueError: a number is out of range, or the optimizer does not hold the model's parameters or keeps another
-            state (from `step` and `reset_opacity` too, which then change nothing).
+        TypeError: `model` is not a GaussianModel.
+        ValueError: a number is out of range, or the optimizer does not hold the model's parameters or holds state of
+            another shape (also raised by `step` and `reset_opacity`, which then change nothing).
 
     Examples:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
@@ -101,21 +102,21 @@ class Densifier:
         self.grad_threshold, self.percent_dense, self.prune_opacity = grad_threshold, percent_dense, prune_opacity
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
-        self._observe_anew(torch.zeros_like(self.model.means[:, 0]))
+        self._restart_statistics(torch.zeros_like(self.model.means[:, 0]))
         self._check()
 
     @property
     def mean_gradients(self) -> Tensor:
-        """The statistic since the last `step`, `(N,)`; its value then, or a parent's, counts as one observation."""
+        """The statistic since the last `step`, `(N,)`; the value before, or the parent's, counts as one observation."""
         sums, counts, last = self._statistics.values()
         return (last + sums) / (1 + counts)
 
     @torch.no_grad()
     def observe(self, projected: ProjectedGaussians) -> None:
-        """Take the gradients of one render into account, of which every listed pair counts as seen.
+        """Add the gradients of one render to the statistics; each listed pair (camera, Gaussian) counts as seen.
 
         Raises:
-            ValueError: `projected.means2d` has no gradient yet, or the number of Gaussians is another.
+            ValueError: `projected.means2d` has no gradient yet, or the number of Gaussians differs from the model's.
         """
         self._check()
         count, expected = projected.num_gaussians, len(self.model)
@@ -136,30 +137,30 @@ class Densifier:
 
     @torch.no_grad()
     def step(self) -> DensifyReport:
-        """Clone, split and prune by what was observed since the last step, and start observing again.
+        """Clone, split and prune by the statistics since the last step, and restart them.
 
-        New Gaussians have zero Adam moments, the others keep theirs bit for bit. The parameters become new objects in
-        the model and the optimizer alike, without `.grad`: call it between `optimizer.step` and the next render.
+        New Gaussians have zero Adam moments, the others keep theirs bit for bit. The parameters become new objects,
+        without `.grad`, in the model and the optimizer: call it between `optimizer.step` and the next render.
         """
         self._check()
         model, before = self.model, len(self.model)
         average = self._statistics["gradient_sums"] / self._statistics["counts"].clamp(min=1)
-        opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # NaN stays, for the trainer to find
-        hot = (average >= self.grad_threshold) & opaque
-        wanted = int(hot.sum())
+        opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # keeps NaN, which the trainer reports
+        over = (average >= self.grad_threshold) & opaque
+        wanted = int(over.sum())
         room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - int(opaque.sum()))
-        if wanted > room:  # each adds one; those of the largest gradients
-            order = torch.where(hot, average, -1.0).argsort(descending=True, stable=True)
-            hot = torch.zeros_like(hot).index_fill(0, order[:room], True)
+        if wanted > room:  # clone and split add one each; take the largest gradients
+            order = torch.where(over, average, -1.0).argsort(descending=True, stable=True)
+            over = torch.zeros_like(over).index_fill(0, order[:room], True)
         large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
-        cloned, split, kept = (x.nonzero().squeeze(1) for x in (hot & ~large, hot & large, opaque & ~(hot & large)))
-        born = torch.cat([cloned, split.repeat(CHILDREN)])
-        new = {name: parameter.index_select(0, born) for name, parameter in model.named_parameters()}
+        cloned, split, kept = (x.nonzero().squeeze(1) for x in (over & ~large, over & large, opaque & ~(over & large)))
+        added = torch.cat([cloned, split.repeat(CHILDREN)])
+        new = {name: parameter.index_select(0, added) for name, parameter in model.named_parameters()}
         new["means"][len(cloned) :] += self._sample_offsets(split.repeat(CHILDREN))
         new["log_scales"][len(cloned) :] -= math.log(SHRINK)
         for name, parameter in list(model.named_parameters()):
             self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
-        self._observe_anew(self.mean_gradients[torch.cat([kept, born])])
+        self._restart_statistics(self.mean_gradients[torch.cat([kept, added])])
         pruned, capped = before - len(kept) - len(split), max(0, wanted - room)
         return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
 
@@ -185,20 +186,20 @@ class Densifier:
         return {name: x.clone() for name, x in self._statistics.items()} | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state_dict` returned; a ValueError unless it is whole and of as many Gaussians."""
+        """Restore what `state_dict` returned; ValueError if entries are missing or the number of Gaussians differs."""
         shape, missing = (len(self.model),), {*self._statistics, "generator"} - state.keys()
         if missing:
             raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
         for name in self._statistics:
             if state[name].shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {tuple(state[name].shape)}")
-        self._observe_anew(self.model.means.new_zeros(shape))
+        self._restart_statistics(self.model.means.new_zeros(shape))
         for name, value in self._statistics.items():
             value.copy_(state[name])
         self.generator.set_state(state["generator"].cpu())
 
     def _check(self) -> None:
-        """Raise where the model, its statistics and the optimizer's state do not belong together."""
+        """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
         count, expected = len(self.model), len(self._statistics["counts"])
         if count != expected:
             raise ValueError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
@@ -213,19 +214,19 @@ class Densifier:
                     raise ValueError(f"optimizer: expected the state {key} of {name} to have shape {shape}, got {got}")
 
     def _sample_offsets(self, ids: Tensor) -> Tensor:
-        """Draw, for each id, a place relative to the centre from that Gaussian's own distribution."""
+        """Draw an offset from the centre for each id, from that Gaussian's own distribution."""
         means = self.model.means
         noise = torch.randn((len(ids), 3), generator=self.generator, device=self.generator.device, dtype=means.dtype)
-        # a scale may overflow where its logarithm does not; the place has to stay finite
+        # a scale may overflow where its logarithm does not; the offset has to stay finite
         scales = self.model.log_scales.index_select(0, ids).exp().clamp(max=math.sqrt(torch.finfo(means.dtype).max))
         rotations = rotation_matrices(self.model.quats.index_select(0, ids))
         return torch.einsum("nij,nj->ni", rotations, scales * noise.to(means.device))
 
     def _replace(self, name: str, value: Tensor, kept: Tensor) -> None:
-        """Put `value` in the place of a parameter, in the model, the param group and the optimizer's state.
+        """Replace a parameter by `value` in the model, the param group and the optimizer's state.
 
-        State that has the parameter's shape (Adam's moments) begins with the old rows `kept` and goes on with zeros. A
-        new Parameter rather than new data in the old one, which a graph that is alive would hold to its old shape.
+        State that has the parameter's shape (Adam's moments) starts with the old rows `kept`, followed by zeros. The
+        parameter is a new object: a live autograd graph would hold the old one to its shape.
         """
         old = self.model.get_parameter(name)
         new = nn.Parameter(value, requires_grad=old.requires_grad)
@@ -240,7 +241,7 @@ class Densifier:
             self.optimizer.state[new] = state
         setattr(self.model, name, new)
 
-    def _observe_anew(self, last_gradients: Tensor) -> None:
+    def _restart_statistics(self, last_gradients: Tensor) -> None:
         last = last_gradients.detach()
         counts = torch.zeros_like(last, dtype=torch.int64)
         self._statistics = {"gradient_sums": torch.zeros_like(last), "counts": counts, "last_gradients": last}

@@ -1,9 +1,9 @@
-"""DropGaussian: switch Gaussians off at random in training and scale up the rest.
+"""DropGaussian: drop Gaussians at random in training and scale up the opacities of the rest.
 
 Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting",
 CVPR 2025: o_i <- M_i o_i with M_i = 1/(1 - r) for kept and 0 for dropped Gaussians, r_t = gamma t / T.
 
-The layer needs nothing but torch and fits any splatting pipeline: put it between the activated opacities and the
+The layer needs only torch and fits any splatting pipeline: put it between the activated opacities and the
 rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render.
 """
 
@@ -28,18 +28,18 @@ def drop_gaussian(
     The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
 
     Args:
-        opacities: of any shape and floating point dtype; each element is drawn on its own. `(N,)` gives one mask for
+        opacities: of any shape and floating point dtype; elements are drawn independently. `(N,)` gives one mask for
             all cameras, `(C, N)` one per camera.
         p: the drop rate, in [0, 1).
         training: if False, nothing is dropped.
         generator: draws the mask on its own device, whatever that of `opacities`; None takes torch's default one.
 
     Returns:
-        A tensor like `opacities`; the same object where nothing is to be dropped (p = 0 or not training).
+        A tensor like `opacities`; the same object if nothing is dropped (p = 0 or not training).
 
     Raises:
-        TypeError: `opacities` is no floating point tensor.
-        ValueError: p is outside [0, 1). The rate 1 is refused, other than in `nn.Dropout`: it would leave no image.
+        TypeError: `opacities` is not a floating point tensor.
+        ValueError: p is outside [0, 1). Unlike `nn.Dropout`, p = 1 is refused: it would leave an empty image.
 
     Examples:
         >>> drop_gaussian(torch.full((100,), 0.8), p=0.2).unique()
@@ -60,8 +60,8 @@ class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
     The rate of a call is `p * schedule(progress)`. The training loop sets `progress`, in [0, 1]; a layer whose progress
-    is never set is plain dropout at p, and warns once. So does one that gets opacities outside [0, 1] on the CPU,
-    probably logits. The `state_dict` is empty, whatever is assigned to the layer.
+    is never set is plain dropout at p, and warns once. It also warns once if it gets opacities outside [0, 1] on the
+    CPU, which are probably logits. The `state_dict` is empty, whatever is assigned to the layer.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
@@ -95,13 +95,13 @@ class DropGaussian(nn.Module):
         self.schedule = schedule
         self.seed = seed
         self._progress: float | None = None
-        # objects, not values: shallow copies such as the replicas of nn.DataParallel share and advance them
+        # mutable objects, which shallow copies such as the replicas of nn.DataParallel share and advance
         self._warned: set[str] = set()
         self._stream = None if seed is None else torch.Generator("cpu").manual_seed(int(seed))
 
     @property
     def progress(self) -> float:
-        """How much of the training is done, in [0, 1]; 1.0 until it is set."""
+        """The fraction of the training that is done, in [0, 1]; 1.0 until it is set."""
         return 1.0 if self._progress is None else self._progress
 
     @progress.setter
@@ -124,7 +124,7 @@ class DropGaussian(nn.Module):
             self._warn_once("progress", f"progress was never set, so the rate is {self.rate:g} throughout; {wanted}")
         dropped = drop_gaussian(opacities, self.rate, True, self._stream)
         if opacities.device.type == "cpu" and not torch.compiler.is_compiling():
-            with contextlib.suppress(RuntimeError, IndexError):  # none, or inside vmap: no values to look at
+            with contextlib.suppress(RuntimeError, IndexError):  # an empty tensor, or inside vmap
                 low, high = opacities.detach().aminmax()
                 if low < 0 or high > 1:
                     wanted = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits"
@@ -136,7 +136,7 @@ class DropGaussian(nn.Module):
         return self._own_stream().get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
-        """Continue the stream that `get_rng_state` saw, on whatever device the opacities are now."""
+        """Restore a state that `get_rng_state` returned; the opacities may be on any device."""
         self._own_stream().set_state(state.cpu())
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""The parameters of a splat: what the optimiser sees, and the activations that make Gaussians of them.
+"""The parameters of a splat, as the optimiser sees them, and the activations that turn them into Gaussians.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023, section 5:
 exponential for scales, sigmoid for opacities, isotropic start with the mean distance to the three nearest points.
@@ -22,11 +22,11 @@ PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_res
 
 
 class GaussianModel(nn.Module):
-    """N Gaussians as parameters without bounds; the harmonics are two of them, with two learning rates.
+    """N Gaussians as unbounded parameters; the harmonics are split in two, for two learning rates.
 
-    `state_dict()` holds the six parameters and the active degree: `GaussianModel(**state_dict)` makes the same model
-    again, and `load_state_dict` takes over the number of Gaussians and both degrees. An optimiser goes on holding the
-    parameters; load its state after them.
+    `state_dict()` holds the six parameters and the active degree: `GaussianModel(**state_dict)` builds the same model,
+    and `load_state_dict` adopts the number of Gaussians and both degrees. It keeps the parameter objects, so an
+    optimiser still holds them; load its state afterwards.
 
     Args:
         means: centres in world units, `(N, 3)`, float32 or float64.
@@ -75,7 +75,7 @@ class GaussianModel(nn.Module):
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Self:
-        """Start from a coloured point cloud: one round Gaussian of opacity 0.1 per point, its colour without direction.
+        """Start from a coloured point cloud: one round Gaussian of opacity 0.1 per point, of its colour.
 
         The standard deviation is the root of the mean squared distance to the three nearest points, at least a
         thousandth of the cloud's median one (points may coincide).
@@ -86,8 +86,9 @@ class GaussianModel(nn.Module):
             sh_degree: the degree of the harmonics, 0 to 3; the active degree starts there too.
 
         Raises:
-            TypeError: `points` is no tensor of float32 or float64, or `colors` is not floating point.
-            ValueError: shapes do not fit, points are fewer than 4, not finite or all one, or `sh_degree` is no degree.
+            TypeError: `points` is not a tensor of float32 or float64, or `colors` is not floating point.
+            ValueError: shapes do not match, there are fewer than 4 points, points are not finite or all equal, or
+                `sh_degree` is out of range.
         """
         check_tensor("points", points)
         check_tensor("colors", colors)
@@ -110,7 +111,7 @@ class GaussianModel(nn.Module):
         return cls(points, quats, log_scales, logits, sh_dc, points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3))
 
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
-        """A model of the Gaussians at `rows`, bool `(N,)` or integers, with harmonics up to a degree, None: as here."""
+        """A model of the Gaussians at `rows`, bool `(N,)` or integers; `sh_degree` None keeps all harmonics."""
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
         values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
@@ -118,7 +119,7 @@ class GaussianModel(nn.Module):
 
     @property
     def max_sh_degree(self) -> int:
-        """The degree the harmonics have room for."""
+        """The highest degree that the parameters can hold."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
 
     @property
@@ -133,9 +134,9 @@ class GaussianModel(nn.Module):
     def forward(self) -> Gaussians:
         """The Gaussians with activated values and the active bands only."""
         colors: Tensor = self.sh_dc
-        if self.sh_degree > 0:  # else sh_rest has no gradient at all, and an optimiser leaves it alone
+        if self.sh_degree > 0:  # else sh_rest gets no gradient, and an optimiser skips it
             colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
-        # where exp is infinite (that Gaussian is not drawn) its gradient would be 0 times infinity
+        # where exp overflows the Gaussian is not drawn, and its gradient would be 0 times infinity
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
         return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)
@@ -151,11 +152,11 @@ class GaussianModel(nn.Module):
         return torch.tensor(self.sh_degree, device="cpu")
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Take the active degree over."""
+        """Set the active degree."""
         self.sh_degree = int(state)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Make room for the values to come, of whatever size they are."""
+        """Resize the parameters to the values that will be loaded."""
         values = [state_dict[prefix + name] for name in PARAMETERS if prefix + name in state_dict]
         if len(values) == len(PARAMETERS):
             most = _check_shapes(values)
@@ -197,7 +198,7 @@ def _check_degree(value: int, most: int) -> int:
 
 
 def _check_shapes(values: Sequence[Tensor]) -> int:
-    """The degree of the harmonics of values that fit together."""
+    """The degree of the harmonics; ValueError if the shapes do not match."""
     n, sh_rest = values[0].shape[0] if values[0].ndim else 0, values[-1]
     k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
     if k not in SH_SIZES:

@@ -24,8 +24,8 @@ def project_torch(
 ) -> ProjectedGaussians:
     """`kgs.project` in torch, for every camera, device and dtype; trusts its arguments."""
     device, views, finite = gaussians.means.device, lenses(cameras, size), finite_gaussians(gaussians)
-    reach = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
-    touches, near = partial(_touches_image, size, options.eps2d, reach), options.near_plane
+    cutoff = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
+    touches, near = partial(_touches_image, size, options.eps2d, cutoff), options.near_plane
     parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]
     counts = torch.tensor([part[0].shape[0] for part in parts], device=device)
     camera_ids = torch.repeat_interleave(torch.arange(len(parts), device=device), counts)
@@ -106,14 +106,19 @@ def seen_within(opacities: Tensor, alpha_threshold: float) -> Tensor:
 
 
 def _touches_image(
-    size: tuple[int, int], eps2d: float, reach: Tensor, means2d: Tensor, factors: Tensor
+    size: tuple[int, int], eps2d: float, cutoff: Tensor, means2d: Tensor, factors: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which footprints, `reach` standard deviations wide, touch the image; their radii; which are not finite."""
+    """Which footprints, `cutoff` standard deviations wide, touch the image; their radii; which are not finite."""
     xx, xy, yy, det = variances(factors, eps2d)
     largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
     (x, y), (height, width) = means2d.unbind(1), size
-    reach_x, reach_y = reach * xx.sqrt(), reach * yy.sqrt()
-    seen = (x + reach_x > -0.5) & (x - reach_x < width - 0.5) & (y + reach_y > -0.5) & (y - reach_y < height - 0.5)
+    half_width, half_height = cutoff * xx.sqrt(), cutoff * yy.sqrt()
+    seen = (
+        (x + half_width > -0.5)
+        & (x - half_width < width - 0.5)
+        & (y + half_height > -0.5)
+        & (y - half_height < height - 0.5)
+    )
     return seen & (det > 0), torch.ceil(3.0 * largest.sqrt()), ~torch.isfinite(det + largest + x + y)
 
 

@@ -1,4 +1,4 @@
-"""The oracle: a dense float64 renderer of Gaussians, made to be easy to check, not to be fast.
+"""The reference: a dense float64 renderer of Gaussians, written to be easy to check, not to be fast.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023; M. Zwicker et al., "EWA
 Volume Splatting", 2001. Every Gaussian meets every pixel, derivatives are autograd's, and no stage of the package is
@@ -25,7 +25,7 @@ class Layers:
 
     Args:
         weights: share of each layer in each pixel, `(L, H, W)`.
-        transmittance: what is left for the background, `(H, W)`.
+        transmittance: transmittance behind the last layer, `(H, W)`.
         colors: `(L, 3)`.
         depths: z in the camera frame, `(L,)`.
         order: which Gaussian each layer is, `(L,)` int64.
@@ -59,7 +59,7 @@ def render(
         camera: one camera.
         background: None (black), `(3,)`, `(1, 3)` or `(1, 3, H, W)`.
         alpha_threshold: smaller alphas are skipped; 0 skips none.
-        transmittance_stop: once less light than this remains, none does; the layer that crosses it still counts.
+        transmittance_stop: transmittance below this counts as 0; the layer that crosses it still counts.
         near_plane: only centres with z > near_plane are drawn; world units.
         eps2d: variance in px^2 added to each footprint; with 0 no footprint may be flat.
 
@@ -68,7 +68,7 @@ def render(
         0 the exact sum.
 
     Raises:
-        TypeError: `gaussians` or `camera` is of another kind.
+        TypeError: `gaussians` or `camera` is of another type.
         ValueError: more than one camera or row of opacities, or a background of another shape.
         torch.linalg.LinAlgError: `eps2d` is 0 and a footprint is flat.
     """
@@ -91,7 +91,7 @@ def layers(
     near_plane: float = RasterOptions.near_plane,
     eps2d: float = RasterOptions.eps2d,
 ) -> Layers:
-    """The layers that :func:`render` adds up; see there for arguments and errors."""
+    """The layers that :func:`render` sums; it documents the arguments and errors."""
     check_kind("gaussians", gaussians, Gaussians)
     check_kind("camera", camera, PinholeCamera)
     if camera.batch_size != 1 or gaussians.opacities.numel() != len(gaussians):
@@ -119,15 +119,15 @@ def layers(
 
     alphas = responses.masked_fill(responses > 0.99, 0.99)
     alphas = torch.where(alphas >= alpha_threshold, alphas, 0.0)
-    light = torch.cat([torch.ones(1, height, width).to(alphas), torch.cumprod(1 - alphas, 0)])
-    light = torch.where(light >= transmittance_stop, light, 0.0)
+    transmittance = torch.cat([torch.ones(1, height, width).to(alphas), torch.cumprod(1 - alphas, 0)])
+    transmittance = torch.where(transmittance >= transmittance_stop, transmittance, 0.0)
     if colors.ndim == 3:
         turned = torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), rtol=0, atol=1e-3)
         inverse = rotation.T if turned else torch.linalg.inv(rotation)
         directions = torch.nn.functional.normalize(means + inverse @ translation, dim=1)
         colors = torch.einsum("lk,lkc->lc", _harmonics(directions, colors.shape[1]), colors) + 0.5
         colors = colors.masked_fill(colors < 0, 0.0)
-    return Layers(alphas * light[:-1], light[-1], colors, points[:, 2], order, responses)
+    return Layers(alphas * transmittance[:-1], transmittance[-1], colors, points[:, 2], order, responses)
 
 
 def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
@@ -141,7 +141,7 @@ def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> T
 
 
 def _covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """R S S R^T with R = ((w^2 - |v|^2) I + 2 v v^T + 2 w [v]_x) / |q|^2; the zero quaternion turns nothing."""
+    """R S S R^T with R = ((w^2 - |v|^2) I + 2 v v^T + 2 w [v]_x) / |q|^2; the zero quaternion gives the identity."""
     eye = torch.eye(3).to(quats)
     quats = torch.where((quats == 0).all(1, keepdim=True), torch.eye(4).to(quats)[0], quats)
     w, v = quats[:, :1, None], quats[:, None, 1:]

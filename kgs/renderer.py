@@ -37,7 +37,7 @@ class GaussianRenderer(nn.Module):
 
     Raises:
         TypeError: both `options` and fields of them are given, or a field does not exist.
-        ValueError: an option is out of range, or there is no such backend.
+        ValueError: an option is out of range, or the backend does not exist.
         ModuleNotFoundError: the backend is numba, and it is not installed.
 
     Examples:
@@ -136,7 +136,7 @@ class GaussianRenderer(nn.Module):
 
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name: str = "background") -> Tensor:
-    """The image `(C, D, H, W)` before a background that the rest of the light `(C, 1, H, W)` comes from."""
+    """The image `(C, D, H, W)` over a background, seen through the transmittance `(C, 1, H, W)`."""
     if background is None:
         return image
     check_tensor(name, background, image, " as the image")
@@ -145,5 +145,5 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
         raise ValueError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
-    # an infinite background does not show where no light is left
+    # an infinite background does not show through opaque pixels
     return image + transmittance * torch.where(background.isinf() & (transmittance == 0), 0.0, background)

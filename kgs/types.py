@@ -1,7 +1,7 @@
 """The values that flow through kgs: Gaussians -> `project` -> ProjectedGaussians -> `composite` -> Rendering.
 
-Shapes, dtypes and devices are checked where a value is made by the user; values never are, because that would wait
-for the device. Two of them are equal where they are the same object.
+Shapes, dtypes and devices are checked when the user creates an object; numbers are not, because reading them would
+synchronise with the device. Two objects are equal only if they are the same object.
 """
 
 import math
@@ -27,11 +27,11 @@ class RasterOptions:
         near_plane: Gaussians with z <= near_plane are left out; in world units, >= 0. Below 1e-7 perspective cameras
             are not exact (Kornia does not divide by less than 1e-8).
         eps2d: variance in px^2 added to the diagonal of each footprint, >= 0: the low-pass filter of 3DGS.
-        alpha_threshold: alphas below it are skipped, in [0, 1). The option that trades accuracy for time: 0 is exact;
-            the error is at most the number of layers times it.
-        transmittance_stop: light below it counts as 0, in [0, 1); the error is at most it.
-        max_bytes: bound for the working memory of one call in bytes, beside what is kept for each Gaussian and each
-            pixel; an image that needs more is made in row slices, and the backward pass makes each again.
+        alpha_threshold: alphas below it are skipped, in [0, 1). It trades accuracy for time: 0 is exact, and the
+            error is at most the number of layers times this value.
+        transmittance_stop: transmittance below it counts as 0, in [0, 1); the error is at most this value.
+        max_bytes: bound for the working memory of one call in bytes, without what is kept per Gaussian and per pixel.
+            An image that needs more is rendered in row slices, which the backward pass computes again.
 
     Raises:
         ValueError: an option is out of range.
@@ -104,7 +104,7 @@ class Gaussians:
             drawn as they are, RGB for D = 3.
 
     Raises:
-        TypeError: a field is no tensor, is not float32 or float64, or differs in dtype or device from `means`.
+        TypeError: a field is not a tensor, is not float32 or float64, or differs in dtype or device from `means`.
         ValueError: a field has another shape.
     """
 
@@ -151,9 +151,9 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedGaussians:
-    """The M pairs (camera, Gaussian) that a camera can see: in front of the near plane and over the image.
+    """The M pairs (camera, Gaussian) where the Gaussian is in front of the near plane and touches the image.
 
-    A Gaussian is listed whatever its opacity, also where `DropGaussian` switched it off (it is not composited then).
+    A Gaussian is listed whatever its opacity, even if `DropGaussian` set it to 0 (it is then not composited).
     The list is ordered by camera, then by Gaussian.
 
     Convention:
@@ -168,7 +168,7 @@ class ProjectedGaussians:
         depths: z in the camera frame, `(M,)`.
         radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.
         opacities: `(M,)`.
-        colors: `(M, 3)`, or features `(M, D)`, or `(M, 0)` where no image was asked for.
+        colors: `(M, 3)`, or features `(M, D)`, or `(M, 0)` if no image was requested.
         image_size: (height, width) in pixels.
         num_cameras: C.
         num_gaussians: N.
@@ -211,13 +211,13 @@ class Composited:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What a render call returns; a field that was not asked for is None and was not computed.
+    """What a render call returns; a field that was not requested is None and was not computed.
 
     Args:
         image: `(C, 3, H, W)`, or `(C, D, H, W)` of features, not clamped.
         alpha: `(C, 1, H, W)`, 1 - transmittance.
         depth: `(C, 1, H, W)`, the mean depth weighted by contribution; 0 where alpha < 1e-6.
-        median_depth: `(C, 1, H, W)`, depth of the first layer behind which less than half the light remains;
+        median_depth: `(C, 1, H, W)`, depth of the first layer behind which the transmittance is below one half;
             0 where there is none. No gradient.
         projected: the Gaussians that were seen.
         normal: `(C, 3, H, W)`, the sum of contribution times normal: the shortest axis of each Gaussian, of length 1,
@@ -233,7 +233,7 @@ class Rendering:
 
 
 def check_tensor(name: str, value: Any, like: Tensor | None = None, whose: str = "") -> None:
-    """Raise a TypeError where the argument is no tensor, or not of the dtype and on the device of `like`."""
+    """Raise a TypeError where the argument is not a tensor, or not of the dtype and on the device of `like`."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
     if like is not None and (value.dtype, value.device) != (like.dtype, like.device):
@@ -241,6 +241,6 @@ def check_tensor(name: str, value: Any, like: Tensor | None = None, whose: str =
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:
-    """Raise a TypeError where the argument is of another kind: a model in the place of its Gaussians, for instance."""
+    """Raise a TypeError where the argument is of another type, for instance a model instead of its Gaussians."""
     if not isinstance(value, kind):
         raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")

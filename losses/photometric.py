@@ -32,7 +32,7 @@ C1, C2, EPS = 0.01**2, 0.03**2, 1e-12
 
 @dataclass(frozen=True)
 class TargetMoments:
-    """What the SSIM needs to know of a target, made by `target_moments`; images and channels share one axis.
+    """Local mean and variance of a target, as the SSIM needs them; images and channels share one axis.
 
     Args:
         padded: the target with its reflected border, `(1, B C, H + 10, W + 10)`.
@@ -65,19 +65,20 @@ def photometric_loss(
         target: like `image`, or `target_moments` of such an image.
         dssim_weight: weight of 1 - SSIM, >= 0; at 0 no SSIM is computed.
         mask: the pixels that count, bool or 0 and 1, `(H, W)`, `(1, H, W)` or, one per image, `(B, 1, H, W)`: the
-            first term is their mean, the second that of the windows (11 x 11, less at the border) that lie in the mask
-            whole, 0 without such a window. What is outside has no gradient and may be NaN.
-        fast: False keeps to Kornia's own operations, as second derivatives need.
-        moments: `target_moments(target)` of this very target, to save that work. Used by the fast path only.
-        backend: "auto", "torch" or "numba". On kernels: the fast path without a mask; torch does the rest.
+            first term is their mean, the second the mean over windows (11 x 11, smaller at the border) that lie wholly
+            in the mask, 0 if there is none. Pixels outside get no gradient and may be NaN.
+        fast: False uses Kornia's own operations, which have second derivatives.
+        moments: `target_moments(target)` of this same target, to save that work. Only the fast path uses it.
+        backend: "auto", "torch" or "numba". Kernels run the fast path without a mask; torch does the rest.
 
     Returns:
         The loss, 0-d.
 
     Raises:
-        TypeError: an image is no float32 or float64 tensor, the two differ in dtype or device, or `moments` are none.
-        ValueError: shapes or the weight do not fit, the mask is empty or has other values than 0 and 1, or the backend
-            is not there or does not cover the call.
+        TypeError: an image is not a float32 or float64 tensor, the two differ in dtype or device, or `moments` is not a
+            TargetMoments.
+        ValueError: shapes do not match, the weight is out of range, the mask is empty or has values other than 0
+            and 1, or the backend does not exist or does not cover the call.
         ModuleNotFoundError: the backend is numba, and it is not installed.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
@@ -114,7 +115,7 @@ def photometric_loss(
 @torch.inference_mode(False)  # else a training step could not save what is made in inference mode
 @torch.no_grad()
 def target_moments(target: Tensor) -> TargetMoments:
-    """The part of the SSIM that depends on the target alone, for :func:`photometric_loss`; no gradient flows to it.
+    """The part of the SSIM that depends only on the target, for :func:`photometric_loss`; it carries no gradient.
 
     Args:
         target: `(B, C, H, W)`, H, W >= 6 (else a ValueError), float32 or float64 (else a TypeError).
@@ -128,7 +129,7 @@ def target_moments(target: Tensor) -> TargetMoments:
 
 
 def _belong_to(moments: TargetMoments, image: Tensor) -> bool:
-    """Whether all tensors of the moments have the size, dtype and device that those of such an image have."""
+    """Whether the moments have the size, dtype and device of those of an image like this."""
     batch, channels, height, width = image.shape
     shape = (1, batch * channels, height, width)
     padded = (1, batch * channels, height + 2 * RADIUS, width + 2 * RADIUS)
@@ -145,13 +146,13 @@ def _torch_loss(
     outside: Tensor | None,
     fast: bool,
 ) -> Tensor:
-    """`photometric_loss` in torch, for every call; trusts its arguments."""
+    """`photometric_loss` in torch, for every call; arguments are already checked."""
     if outside is not None:
         image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
     loss = _mean((image - target).abs(), outside)
     if dssim_weight == 0.0:
         return loss
-    if outside is not None:  # from here on, of windows: those that touch a pixel outside
+    if outside is not None:  # from here on a mask of windows: those that touch a pixel outside
         padded = F.pad(outside.float(), BORDER, mode="reflect")
         outside = F.max_pool2d(F.max_pool2d(padded, (WINDOW, 1), 1), (1, WINDOW), 1) > 0
         if bool(outside.all()):
@@ -166,7 +167,7 @@ def _torch_loss(
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """The loss of an image and a target given with its moments, by a backend that makes the gradient in one go."""
+    """The loss by a backend that computes value and gradient in one pass."""
 
     @staticmethod
     def forward(
@@ -184,7 +185,7 @@ class _PhotometricLoss(torch.autograd.Function):
 
 
 def _refuse_second_derivative() -> None:
-    """Raise a RuntimeError in a backward pass that is to be differentiated."""
+    """Raise a RuntimeError in a backward pass with `create_graph`."""
     if torch.is_grad_enabled():  # once_differentiable is silent where the incoming gradient is a constant
         raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
 
@@ -253,7 +254,7 @@ def _outside(mask: Tensor, image: Tensor) -> Tensor:
 
 
 def _fold(grad: Tensor) -> Tensor:
-    """Adjoint of the reflected border, that of `F.pad` but for CUDA, where it sums in no fixed order."""
+    """Adjoint of the reflected border. That of `F.pad` sums in no fixed order on CUDA."""
     for dim in (-1, -2):
         size = grad.shape[dim] - 2 * RADIUS
         before, inner, after = grad.split([RADIUS, size, RADIUS], dim)

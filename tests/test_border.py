@@ -97,6 +97,7 @@ def test_a_border_has_no_part_in_a_fit(scene):
     assert bool((render.grad[0, :, light == 1] != 0).any())
 
 
+@pytest.mark.slow
 def test_a_fit_renders_the_scene_without_the_border(scene):
     """A fit that knows of the border is as bright at the edge as one of photos without; else it is dark there."""
     views, _ = garden_from_above((144, 192))
@@ -104,7 +105,7 @@ def test_a_fit_renders_the_scene_without_the_border(scene):
     light, points = behind(left=3.0, top=0.0, right=0.0), choose_points(scene, FitConfig(init="sift"))
     edges = []
     for views in (scene, with_border(scene, light), ignored(with_border(scene, light))):
-        trainer = Trainer(views, FitConfig(steps=100, evaluations=1, training_background="scene"), points)
+        trainer = Trainer(views, FitConfig(steps=200, evaluations=1, training_background="scene"), points)
         trainer.fit()
         edges.append(float(trainer.render(scene.train.camera(0))[..., :2].mean()))
     assert edges[1] == pytest.approx(edges[0], abs=0.1)

@@ -17,7 +17,7 @@ nb = pytest.importorskip("numba")
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.arrays import arrays  # noqa: E402  # needs numba
-from kgs.backends.cpu.binning import Reach  # noqa: E402  # needs numba
+from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 
 # -- lists ---------------------------------------------------------------------------------------------------------
 
@@ -26,7 +26,7 @@ def reach_of(projected, threshold=TH, max_spans=2**40):
     inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
     fields = arrays(*inputs, projected.depths, projected.camera_ids)
     rules = np.float32(projected.eps2d), np.float32(threshold)
-    return Reach(fields, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
+    return TileCoverage(fields, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
 
 
 @pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])
@@ -39,14 +39,14 @@ def test_lists_are_those_of_torch(cameras, threshold, rows):
         depths[::7] = -0.0
         opacities = projected.opacities.masked_fill(off, 0.0)
         projected = dataclasses.replace(projected, depths=depths, opacities=opacities)
-        bins, reach = bin_to_tiles(projected, 8, threshold), reach_of(projected, threshold)
-        begin, end = rows or (0, reach.total_rows)
+        bins, coverage = bin_to_tiles(projected, 8, threshold), reach_of(projected, threshold)
+        begin, end = rows or (0, coverage.total_rows)
         expected = torch.tensor_split(bins.ids[bins.entries.long()], bins.offsets[1:-1])
-        part, tile = reach.row_slice(begin, end), begin * bins.grid[1]
+        part, tile = coverage.row_slice(begin, end), begin * bins.grid[1]
         for b in range(len(part.bounds) - 1):
-            band = reach.band(part, b)
+            band = coverage.band(part, b)
             assert band.first_tile == tile
-            ids = reach.ids[part.members[band.members][band.entries]]
+            ids = coverage.ids[part.members[band.members][band.entries]]
             assert not off[torch.from_numpy(ids)].any()
             for got in np.split(ids, band.offsets[1:-1]):
                 assert got.tolist() == expected[tile].tolist()
@@ -57,9 +57,9 @@ def test_lists_are_those_of_torch(cameras, threshold, rows):
 @pytest.mark.parametrize("max_spans", [2**40, 200, 1])
 def test_rows_hold_what_was_counted(max_spans):
     projected = scene(0, cameras=2)
-    reach, bins = reach_of(projected, max_spans=max_spans), bin_to_tiles(projected)
-    assert torch.equal(torch.from_numpy(reach.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
-    assert reach.spans_per_row.tolist() == [len(reach.row_slice(row, row + 1).spans) for row in range(12)]
+    coverage, bins = reach_of(projected, max_spans=max_spans), bin_to_tiles(projected)
+    assert torch.equal(torch.from_numpy(coverage.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
+    assert coverage.spans_per_row.tolist() == [len(coverage.row_slice(row, row + 1).spans) for row in range(12)]
 
 
 # -- vector code ---------------------------------------------------------------------------------------------------

@@ -183,6 +183,7 @@ def test_a_render_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     assert not is_own(tmp_path / "film.webm")
 
 
+@pytest.mark.slow
 def test_a_browser_plays_it(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(film, "FRAMES", 15)
     (tmp_path / "page.html").write_text('<video id="v" src="film.webm" preload="auto" muted></video>')

@@ -231,6 +231,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, i
     return {name: (used, values, (folder / name).stat().st_size) for name, used, values in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is measured on Linux")
 @pytest.mark.parametrize("name", IMAGES)
 def test_reading_an_image_takes_the_memory_that_is_foretold(

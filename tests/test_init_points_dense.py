@@ -89,7 +89,7 @@ def test_planes_out_of_range(views: Views) -> None:
             sweep_depths(views, near, far)
 
 
-@pytest.mark.parametrize("count", [2, 10])
+@pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_two_views_and_many(count: int) -> None:
     scene = synthetic_scene(train_views=count, test_views=1, size=(42, 56), seed=0)
     depths = synthetic_depths(scene.train.cameras, seed=0)
@@ -220,7 +220,7 @@ def test_few_points_are_enough_where_many_agree(draw: str) -> None:
     assert 450 <= len(found.points) <= 500
 
 
-@pytest.mark.parametrize("count", [50, 400])
+@pytest.mark.parametrize("count", [50, pytest.param(400, marks=pytest.mark.slow)])
 def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
     spread, *_ = dense_points(views, *span, count, generator(), draw="spread")
     uniform, *_ = dense_points(views, *span, count, generator(), draw="uniform")

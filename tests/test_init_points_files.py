@@ -83,6 +83,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str
     return {path.removeprefix(str(folder / "cloud")): (memory, said) for path, memory, said in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_packed_file_is_refused_before_it_is_unpacked(ending: str, packed: dict[str, tuple[int, str]]) -> None:
     """A few hundred kilobytes can hold gigabytes; whatever the file is called, its memory is bounded."""

@@ -207,7 +207,7 @@ def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path)
     assert clips == ["inset(0px 0px 0px 100%)", "inset(0px 0px 0px 70%)"]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: str) -> None:
     browser.size(400, 800, scheme)
     browser.open(page, READY)

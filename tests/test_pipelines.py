@@ -131,6 +131,7 @@ def test_a_foreign_trainer_needs_one_line(seed):
         assert torch.equal(network(), network())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [pytest.param(None, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
 def test_a_compiled_step_is_the_step(seed, dtype):

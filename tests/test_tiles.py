@@ -6,7 +6,7 @@ from factories import footprints, random_camera, random_gaussians
 from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, scene
 
 from kgs import Gaussians, project
-from kgs.raster.binning import Reach, bin_to_tiles
+from kgs.raster.binning import TileCoverage, bin_to_tiles
 
 
 def needles(seed, ratio, size=(45, 67)):
@@ -203,4 +203,4 @@ def test_nothing_to_draw_gives_empty_lists_for_every_tile(projected):
     bins = bin_to_tiles(projected)
     assert bins.offsets.tolist() == [0] * (6 * 9 + 1)
     assert len(bins.entries) == len(bins.by_gaussian) == 0
-    assert Reach(projected, 8, THRESHOLD).row_slices(1, 1, 1) == [(0, 6)]
+    assert TileCoverage(projected, 8, THRESHOLD).row_slices(1, 1, 1) == [(0, 6)]

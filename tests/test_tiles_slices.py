@@ -5,7 +5,7 @@ import torch
 from factories import footprints
 from tile_checks import THRESHOLD, check_structure, dots, listed, scene, tiles_of_entries
 
-from kgs.raster.binning import Reach, bin_to_tiles
+from kgs.raster.binning import TileCoverage, bin_to_tiles
 
 # -- many tiles ----------------------------------------------------------------------------------------------------
 
@@ -60,18 +60,20 @@ def test_a_batch_of_cameras_is_its_cameras_one_by_one():
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.1, 0.0])
 def test_row_slices_cover_all_rows_within_the_budget_and_together_are_the_whole(share, max_spans):
     projected = scene(0, cameras=3)
-    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    needs = [5 * spans + 7 * entries for spans, entries in zip(reach.spans_per_row, reach.entries_per_row, strict=True)]
+    coverage, whole = TileCoverage(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    needs = [
+        5 * spans + 7 * entries for spans, entries in zip(coverage.spans_per_row, coverage.entries_per_row, strict=True)
+    ]
     budget = max(int(share * sum(needs)), max(needs))
-    slices = reach.row_slices(budget, 5, 7)
+    slices = coverage.row_slices(budget, 5, 7)
     assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
     assert slices[-1][1] == 3 * whole.grid[0]
     assert all(begin < end for begin, end in slices)
     assert len(slices) == 1 if share == 1 else len(slices) > 1
     parts = []
     for begin, end in slices:
-        spans = reach.spans(begin, end)
-        part = reach.lists(spans, begin, end)
+        spans = coverage.spans(begin, end)
+        part = coverage.lists(spans, begin, end)
         check_structure(projected, part)
         assert 5 * len(spans.ranks) + 7 * len(part.entries) <= budget
         assert (part.first_tile, part.num_tiles) == (begin * whole.grid[1], (end - begin) * whole.grid[1])
@@ -86,13 +88,13 @@ def test_row_slices_cover_all_rows_within_the_budget_and_together_are_the_whole(
 @pytest.mark.parametrize("layers", [1, 3, 10, 1000])
 def test_depth_slices_cover_all_ranks_in_about_equal_parts(layers, max_spans):
     projected = scene(0, cameras=2)
-    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    slices, rows = reach.depth_slices(layers), (0, 2 * whole.grid[0])
-    assert slices == Reach(projected, 8, THRESHOLD).depth_slices(layers)
+    coverage, whole = TileCoverage(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    slices, rows = coverage.depth_slices(layers), (0, 2 * whole.grid[0])
+    assert slices == TileCoverage(projected, 8, THRESHOLD).depth_slices(layers)
     assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
     assert slices[-1][1] == len(whole.ids)
     assert all(begin < end for begin, end in slices)
-    entries = [len(reach.lists(reach.spans(*rows), *rows, ranks).entries) for ranks in slices]
+    entries = [len(coverage.lists(coverage.spans(*rows), *rows, ranks).entries) for ranks in slices]
     assert sum(entries) == len(whole.entries)
     largest = int(torch.bincount(whole.entries).max())  # a slice ends between two Gaussians
     assert max(entries) <= max(len(whole.entries) / len(slices), layers * whole.num_tiles) * 1.5 + 2 * largest
@@ -103,11 +105,11 @@ def test_depth_slices_cover_all_ranks_in_about_equal_parts(layers, max_spans):
 @pytest.mark.parametrize("share", [None, 0.0, 0.4, 1.0])
 def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, ranks, share):
     projected = scene(0, cameras=2)
-    reach = Reach(projected, 8, THRESHOLD)
-    spans = reach.spans(*rows)
-    whole, low, high = reach.lists(spans, *rows), *(ranks or (0, len(reach.ids)))
+    coverage = TileCoverage(projected, 8, THRESHOLD)
+    spans = coverage.spans(*rows)
+    whole, low, high = coverage.lists(spans, *rows), *(ranks or (0, len(coverage.ids)))
     live = None if share is None else torch.rand(whole.num_tiles) < share
-    part = reach.lists(spans, *rows, ranks, live)
+    part = coverage.lists(spans, *rows, ranks, live)
     check_structure(projected, part)
     assert torch.equal(part.ids, whole.ids[low:high])
     for t in range(whole.num_tiles):
@@ -121,14 +123,14 @@ def test_lists_of_some_depths_and_some_tiles_are_parts_of_the_whole_ones(rows, r
 @pytest.mark.parametrize("max_spans", [2**40, 200, 1])
 def test_spans_and_entries_per_row_are_what_the_rows_hold(max_spans):
     projected = scene(0, cameras=2)
-    reach, whole = Reach(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
-    assert reach.entries_per_row == whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1).tolist()
-    assert reach.num_entries == len(whole.entries)
-    assert reach.spans_per_row == [len(reach.spans(row, row + 1).ranks) for row in range(12)]
+    coverage, whole = TileCoverage(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    assert coverage.entries_per_row == whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1).tolist()
+    assert coverage.num_entries == len(whole.entries)
+    assert coverage.spans_per_row == [len(coverage.spans(row, row + 1).ranks) for row in range(12)]
 
 
 def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
-    reach = Reach(scene(0), 8, THRESHOLD)
-    most = max(reach.entries_per_row)
+    coverage = TileCoverage(scene(0), 8, THRESHOLD)
+    most = max(coverage.entries_per_row)
     with pytest.raises(ValueError, match=rf"max_bytes: one row of tiles needs {most} bytes, .* got {most - 1}"):
-        reach.row_slices(most - 1, 0, 1)
+        coverage.row_slices(most - 1, 0, 1)

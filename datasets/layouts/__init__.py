@@ -25,7 +25,7 @@ _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
 def find_layout(root: Path) -> FrameSet:
-    """What the files of a scene's folder say; where it is no scene, a DataError says what it is and what to do."""
+    """What the files of a scene's folder say; DataError where it is not a scene: what it is instead, and what to do."""
     if not root.is_dir():
         raise DataError(root, "", _about_file(root))
     for is_there, load in _LAYOUTS:
@@ -59,17 +59,17 @@ def _about_file(path: Path) -> str:
 
 
 def _about_folder(root: Path) -> str:
-    """Why a folder is no scene: what it holds instead, and what to do."""
+    """Why a folder is not a scene: what it holds instead, and what to do."""
     if folder := nearest_scene(root):
-        return f"is no scene, but {folder} is one: give that folder"
+        return f"is not a scene, but {folder} is one: give that folder"
     photos = image_folder(root) or root
     if count := len(list_images(photos)):
         return f"has {count} photos but no camera poses: {_NO_POSES}"
     endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
     for suffixes, advice in ((UNREADABLE_SUFFIXES, _TO_CONVERT), (VIDEO_SUFFIXES, f"videos: {_NO_PHOTOS}")):
         if found := [ending[1:].upper() for ending in endings if ending in suffixes]:
-            return f"is no scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
+            return f"is not a scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
     return (
-        "is no scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
+        "is not a scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
         "transforms.json (nerfstudio)"
     )

@@ -42,7 +42,7 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy parses the header as Python source: damaged bytes raise whatever that raises
-        raise DataError(path, "", f"is no array that numpy can read ({error})") from error
+        raise DataError(path, "", f"is not an array that numpy can read ({error})") from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
         got = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else type(rows).__name__
         raise DataError(path, "", f"expected floating point numbers of shape (N, 17), got {got}")

@@ -148,7 +148,7 @@ def _lens(source: Path, said: Said, size: tuple[int, ...]) -> Intrinsics:
     of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else said
     for key in _COEFFICIENTS:
         if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
-            kind = "a fisheye lens" if fisheye else "a lens that is no fisheye, where tools disagree on its meaning"
+            kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
             raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
     distortion = tuple(_number(source, key, said, 0.0) for key in used)
     cx, cy = _number(source, "cx", said, width / 2), _number(source, "cy", said, height / 2)

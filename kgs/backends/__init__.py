@@ -40,7 +40,7 @@ def resolve(name: str, device: torch.device) -> str:
     """The name of what "auto" takes for float32 on a device; another name as it is.
 
     Raises:
-        ValueError: there is no such backend, or it does not run on the device.
+        ValueError: the backend does not exist, or it does not run on the device.
         ModuleNotFoundError: it is named and not installed.
     """
     check_backend(name)
@@ -60,7 +60,7 @@ def choose(name: str, stage: str, covers: Callable[[Backend], bool]) -> Backend:
         covers: whether a backend can do the call.
 
     Raises:
-        ValueError: there is no such backend, or it is named and does not cover the call.
+        ValueError: the backend does not exist, or it is named and does not cover the call.
         ModuleNotFoundError: it is named and not installed.
     """
     check_backend(name)
@@ -74,7 +74,7 @@ def takes_kernels(name: str, stage: str, like: Tensor) -> bool:
     """Whether a stage outside the renderer runs on numba kernels, for those that have nothing but these and torch.
 
     Raises:
-        ValueError: there is no such backend, or numba is named and does not cover such a tensor.
+        ValueError: the backend does not exist, or numba is named and does not cover such a tensor.
         ModuleNotFoundError: numba is named and not installed.
     """
     check_backend(name)

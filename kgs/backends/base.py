@@ -31,7 +31,7 @@ class Compositor(Protocol):
     ) -> tuple[Tensor | None, ...]:
         """The gradients of the inputs, None for those that are not needed.
 
-        `kept` is what `forward` kept, or None in a second backward pass: then it is made again.
+        `kept` is what `forward` kept, or None in a second backward pass: then it is computed again.
         """
 
 

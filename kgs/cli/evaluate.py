@@ -26,7 +26,7 @@ def evaluate(
     from kgs.fit.saved import load_fit
     from kgs.io.json_files import read_json, write_json
     from kgs.machine import check_tools
-    from kgs.metrics.evaluate import in_words, measure_again
+    from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import PAGE, refresh_page
 
@@ -38,6 +38,6 @@ def evaluate(
     metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
     write_json(path, metrics)
     refresh_page(out, saved, scene, metrics)
-    say(in_words(metrics))
+    say(as_text(metrics))
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")

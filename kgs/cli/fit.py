@@ -71,7 +71,7 @@ def fit(
     from kgs.io.ownership import is_own
     from kgs.io.results_folder import fit_staging, is_finished, replaced_files
     from kgs.machine import check_tools
-    from kgs.metrics.evaluate import in_words
+    from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import write_own_page
 
@@ -96,7 +96,7 @@ def fit(
     kept = bool(stopped_by) and is_finished(out)  # the former fit
     if unposed and not kept:
         settle(out)
-    say(in_words(metrics))
+    say(as_text(metrics))
     posed = out if unposed else scene
     splat = (fit_staging(out).unfinished if kept else out) / "splat.ply"
     renders, by = out / "renders", request["downscale"]

@@ -101,7 +101,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except KeyError as error:
         raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint of kgs, got none") from error
     except (safetensors.SafetensorError, TypeError, ValueError) as error:
-        raise DataError(path, "", f"is no whole checkpoint of kgs ({error})") from error
+        raise DataError(path, "", f"is not a whole checkpoint of kgs ({error})") from error
     if not isinstance(state, dict):
         raise DataError(path, "state", f"expected a dict, got a {type(state).__name__}")
     return state

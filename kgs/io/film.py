@@ -210,9 +210,9 @@ def _closed_spline(stops: Array, times: Array, frames: int) -> Array:
     tangents = _tangents(slopes[:-1], slopes[1:], steps[:-1], steps[1:])
 
     ends = np.cumsum(times)
-    moments = ends[-1] * np.arange(frames) / frames
-    i = np.searchsorted(ends, moments, side="right").clip(max=n - 1)  # which stop comes before
-    u = ((moments - ends[i]) / times[i] + 1)[:, None]  # 0 at this stop, 1 at the next one
+    instants = ends[-1] * np.arange(frames) / frames
+    i = np.searchsorted(ends, instants, side="right").clip(max=n - 1)  # which stop comes before
+    u = ((instants - ends[i]) / times[i] + 1)[:, None]  # 0 at this stop, 1 at the next one
     position = (1 + 2 * u) * (1 - u) ** 2 * values[i + 1] + u * u * (3 - 2 * u) * values[i + 2]
     rows: Array = position + times[i, None] * (u * (1 - u) ** 2 * tangents[i] - u * u * (1 - u) * tangents[i + 1])
     return rows

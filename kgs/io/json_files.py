@@ -23,7 +23,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise DataError(path, "", f"cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise DataError(path, "", f"is no JSON that can be read ({error})") from error
+        raise DataError(path, "", f"is not readable JSON ({error})") from error
     if not isinstance(value, dict):
         raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
     return value
@@ -61,7 +61,7 @@ def parse_json(text: bytes) -> Any:
     """The value of UTF-8 text, which may begin with a byte order mark.
 
     Raises:
-        ValueError: it is no JSON (NaN and Infinity are none), nested too deep, or holds a number beyond float64.
+        ValueError: it is not JSON (NaN and Infinity are not), nested too deep, or holds a number beyond float64.
     """
     try:
         return json.loads(text.decode("utf-8-sig"), parse_constant=_finite, parse_float=_finite)

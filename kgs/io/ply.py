@@ -48,7 +48,7 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
 
     Raises:
-        TypeError: `model` is no GaussianModel.
+        TypeError: `model` is not a GaussianModel.
         ValueError: `offset` has another shape, or a value is not finite in float32.
     """
     check_kind("model", model, GaussianModel)

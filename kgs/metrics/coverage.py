@@ -1,6 +1,6 @@
-"""How good the renders of held-out views are where two training views show the scene, and elsewhere.
+"""PSNR of held-out views apart: where at least two training views show the scene, and elsewhere.
 
-What only one training view shows has no measured depth, and what none shows is invented: a mean over both says little.
+One training view gives no measured depth, and what none shows is guessed: a mean over both says little.
 """
 
 import math
@@ -17,17 +17,17 @@ from kgs.geometry import nearest_pixels, project_points, unproject
 
 Draw = Callable[[PinholeCamera], Tensor]
 
-LEAST = 2  # training views that show a place
-BEHIND = 1.05  # times the depth that a training view has there: what is farther is hidden from it
+MIN_VIEWS = 2  # training views that show a point
+OCCLUDED = 1.05  # a point farther than this times a training view's depth is hidden from that view
 
 
 @torch.no_grad()
 def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str, float | None] | None:
-    """PSNR of the test views apart, where at least `LEAST` training views show what the fit has there and elsewhere.
+    """PSNR of the test views, apart for pixels that at least `MIN_VIEWS` training views show and for the rest.
 
     Convention:
-        A pixel's place is where the median depth of the fit puts it. A training view shows it if it lies in the
-        image and no farther than `BEHIND` times the median depth of the fit there. Pixels without depth count as
+        The median depth of the fit gives the point of a pixel. A training view shows it if it projects into that
+        image and is no farther than `OCCLUDED` times the fit's median depth there. Pixels without depth count as
         not shown.
 
     Args:
@@ -59,7 +59,7 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
 
 
 def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: PinholeCamera) -> Tensor:
-    """Where at least `LEAST` of the cameras, with these depths, show what one camera has at these, bool `(H, W)`."""
+    """Pixels of one camera that at least `MIN_VIEWS` of the others show, bool `(H, W)`, given the depths of all."""
     height, width = depth.shape
     pixels = torch.ones_like(depth).nonzero().flip(1)  # (x, y), row by row
     values = depth.reshape(-1).double()
@@ -69,5 +69,5 @@ def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: 
     for view, there in enumerate(depths):
         distance = distances[:, view]
         x, y, inside = nearest_pixels(places[:, view], distance, *there.mT.shape)
-        count += (values > 0) & inside & (distance <= BEHIND * there[y, x])
-    return (count >= LEAST).reshape(height, width)
+        count += (values > 0) & inside & (distance <= OCCLUDED * there[y, x])
+    return (count >= MIN_VIEWS).reshape(height, width)

@@ -1,7 +1,7 @@
 """Measures of held-out views: PSNR, SSIM with both borders, LPIPS.
 
 Float renders clamped to [0, 1] are compared, never 8-bit files, over all pixels and channels (masks are not used);
-a render is seen behind the dark border that the photos have, if any.
+the photos' dark border, if any, is applied to the renders first.
 
 Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
 Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.
@@ -25,7 +25,7 @@ from kgs.errors import DataError
 from .lpips import Lpips
 
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
-BEST = 200.0  # decibels that stand for an infinite PSNR where numbers are compared
+BEST = 200.0  # decibels in place of an infinite PSNR where numbers are compared
 _WINDOW = 11
 
 
@@ -34,13 +34,13 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
     Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a "vgg16" network on the device of the renders. A ValueError
-    where it is another, or a render has another shape than its photo or holds NaN or infinity.
+    for another network, or a render that differs in shape from its photo or holds NaN or infinity.
 
     Returns:
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
         published tables), "lpips_vgg" (images in [-1, 1], as the network is meant) and "lpips_vgg_unscaled" (in [0, 1],
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
-        what was not measured, and for an infinite PSNR: of an image that equals its photo in every value, or a mean.
+        what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one).
     """
     if lpips is not None and lpips.net != "vgg16":
         raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
@@ -58,7 +58,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 
 
 def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float | None:
-    """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
+    """Mean PSNR over some views in dB, of clamped renders; None without views, or if one PSNR is infinite."""
     renders = (views.as_photo(render(views.camera(i))[0].cpu()) for i in range(len(views)))
     values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
     mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
@@ -68,16 +68,16 @@ def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float 
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
-    """What the metrics.json at `path` holds, measured again, but LPIPS without `lpips`; DataError for other views."""
+    """The metrics of a metrics.json, measured again; without `lpips` the old LPIPS stays. DataError for other views."""
     fresh: dict[str, Any] = {}
     for part, views in (("test", scene.test), ("train", scene.train)):
         old = metrics.get(part) or {"views": []}
         try:
             known = {row["name"]: row for row in old["views"]}
         except (KeyError, TypeError) as error:
-            raise DataError(path, part, "expected the measures of a fit, got others") from error
+            raise DataError(path, part, "expected the metrics of a fit, got something else") from error
         if set(known) != set(views.names):
-            raise DataError(path, part, f"is about other views than the {len(views)} of {scene.root}: fit again")
+            raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
         fresh[part] = new = evaluate(render, views, lpips) if known else None
         if new is not None and lpips is None:
             for row, before in [(new, old), *((row, known[row["name"]]) for row in new["views"])]:
@@ -87,7 +87,7 @@ def measure_again(
 
 def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
     level = psnr(image, target, 1.0).item()
-    # Kornia's "valid" map of images inside a border of zeros is the whole map with zero padding.
+    # Kornia's "valid" map of zero-padded images is the whole map with zero padding.
     padded, padded_target = (F.pad(each, [_WINDOW // 2] * 4) for each in (image, target))
     values = (
         level if math.isfinite(level) else None,
@@ -98,8 +98,8 @@ def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, fl
     return dict(zip(MEASURES, values, strict=True))
 
 
-def in_words(metrics: dict[str, Any]) -> str:
-    """What metrics.json says of a fit, in lines."""
+def as_text(metrics: dict[str, Any]) -> str:
+    """The metrics of a fit as lines of text."""
     lines = list[str]()
     names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
     for part in ("test", "train"):

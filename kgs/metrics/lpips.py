@@ -37,14 +37,14 @@ LAYERS = {
 # Positions among the layers of the ReLUs whose outputs are compared; and the smallest image they take.
 TAPS = {"alexnet": (1, 4, 7, 9, 11), "vgg16": (3, 8, 15, 22, 29)}
 MIN_SIZE = {"alexnet": 31, "vgg16": 16}
-MOST_HEADER = 10_000  # bytes of an array's
+MAX_HEADER = 10_000  # bytes of an array's
 
 
 class Lpips(nn.Module):
     """Perceptual distance of two images; `net` is "vgg16" or "alexnet".
 
     The state dict has the names of the weight files: torchvision's `features.0.weight`, ... and `lin0` to `lin4`. A
-    module made without `load` has random features and heads of ones; it is a distance, but not LPIPS.
+    module made without `load` has random features and heads of ones: a distance, but not LPIPS.
     """
 
     def __init__(self, net: str = "vgg16") -> None:
@@ -72,7 +72,7 @@ class Lpips(nn.Module):
         The folder holds `<net>_features.npz` with the convolutions under torchvision's names (`features.0.weight`,
         OIHW) and `lpips_lin_<net>.npz` with the heads `lin0` to `lin4`. Published tables have `net` "vgg16".
 
-        A DataError where the folder, a file or an array is missing or wrong, a ValueError for an unknown `net`.
+        DataError where the folder, a file or an array is missing or wrong, ValueError for an unknown `net`.
         """
         with torch.device("meta"):
             module = cls(net)
@@ -88,9 +88,9 @@ class Lpips(nn.Module):
     def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:
         """Distances >= 0, `(B,)`, of images to their targets, both `(B, 3, H, W)` in [0, 1]; differentiable in both.
 
-        H and W are at least 16 for "vgg16" and 31 for "alexnet". `rescale` brings the images to [-1, 1], which the
-        network is meant for. False feeds them in [0, 1], as the published tables of Gaussian splatting do; the two
-        values cannot be compared. Other shapes are a ValueError.
+        H and W are at least 16 for "vgg16" and 31 for "alexnet". `rescale` scales the images to [-1, 1], the range of
+        the network's training. False feeds them in [0, 1], as the published tables of Gaussian splatting do; the two
+        values cannot be compared. ValueError for other shapes.
         """
         smallest, taps = MIN_SIZE[self.net], TAPS[self.net]
         if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < smallest:
@@ -114,7 +114,7 @@ def _unit(features: Tensor) -> Tensor:
 
 
 def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """The named arrays of an npz file as float32 tensors, each measured before its numbers are unpacked."""
+    """The named arrays of an npz file as float32 tensors, each size checked before it is unpacked."""
     if not zipfile.is_zipfile(path):
         got = "another format or a part of one" if path.is_file() else "none"
         raise DataError(path, "", f"expected an npz file of LPIPS weights, got {got}")
@@ -125,14 +125,16 @@ def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
                 if f"{field}.npy" not in archive.namelist():
                     raise DataError(path, field, f"expected an array of shape {shape}, got none")
                 with archive.open(f"{field}.npy") as file:
-                    content = BytesIO(file.read(MOST_HEADER + 8 * math.prod(shape)))
-                array = np.lib.format.read_array(content, allow_pickle=False, max_header_size=MOST_HEADER)
+                    content = BytesIO(file.read(MAX_HEADER + 8 * math.prod(shape)))
+                array = np.lib.format.read_array(content, allow_pickle=False, max_header_size=MAX_HEADER)
                 if array.shape != shape or array.dtype.kind != "f" or content.read(1):
                     raise DataError(path, field, f"expected floats of shape {shape}, got {array.dtype} {array.shape}")
                 with np.errstate(over="ignore"):
                     weights[field] = torch.from_numpy(np.array(array, np.float32, order="C"))
                 if not weights[field].isfinite().all():
-                    raise DataError(path, field, "expected finite numbers in the range of float32, got others")
+                    raise DataError(
+                        path, field, "expected finite numbers in the range of float32, got NaN, infinity or larger ones"
+                    )
     except DataError:
         raise
     except Exception as error:  # damaged bytes raise whatever zipfile, its codecs and numpy's parser of headers raise

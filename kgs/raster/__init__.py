@@ -12,14 +12,14 @@ on each pixel and layer alone, so the image does not depend on tiles or steps.
 torch, K layers of many tiles in a step: q_k is the sum of two squares, each linear in x and y; an exponential gives the
 alphas, a scan over the layers T, and a sum the colours. T before each step is kept and, where memory allows, the
 alphas. The backward pass visits the steps from back to front and carries V_k, the colour along g that shows from layer
-k on, as if no light had been lost before it:
+k on, as if the transmittance before it were 1:
 
     V_k = alpha_k (c_k . g) + (1 - alpha_k) V_{k+1},   V_end = g_T,   dL/d ln alpha_k = w_k (c_k . g - V_{k+1})
 
-and V_{k+1} = 0 where layer k ends the light. V is a mean of colours: no sum grows large, nothing is divided by
-1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the pixels, about its centre;
-they are summed over its tiles.
+and V_{k+1} = 0 where the transmittance falls below the stop at layer k. V is a mean of colours: no sum grows large,
+nothing is divided by 1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the
+pixels, about its centre; they are summed over its tiles.
 
 An image that needs more than `max_bytes` is made in row slices. Where lists are long, a row slice is made in depth
-slices, nearest first, with lists for the tiles that still have light alone: what is hidden is not listed or sorted.
+slices, nearest first, with lists only for tiles that are not yet opaque: hidden Gaussians are not listed or sorted.
 """

@@ -55,7 +55,7 @@ class TileLists:
 class Spans:
     """For each Gaussian and each row of tiles that it reaches the first tile and how many; int32, `(S,)`."""
 
-    ranks: Tensor  # position of the Gaussian in `Reach.ids`, ascending
+    ranks: Tensor  # position of the Gaussian in `TileCoverage.ids`, ascending
     rows: Tensor  # row of tiles
     first: Tensor  # first column
     counts: Tensor  # columns, may be 0
@@ -65,7 +65,7 @@ class Spans:
         return replace(self, **{name: value[where] for name, value in vars(self).items()})
 
 
-class Reach:
+class TileCoverage:
     """The rows of tiles that each Gaussian reaches; lists are made from it, a row slice and a depth slice at a time.
 
     Memory is proportional to the Gaussians and, at any time, to at most `max_spans` spans.
@@ -86,16 +86,16 @@ class Reach:
         self.total_rows = projected.num_cameras * self.grid[0]
         xx, xy, yy, det = variances(projected.factors, projected.eps2d)
         cut = torch.where(xx + yy < torch.inf, cut_squared(projected.opacities, alpha_threshold), -torch.inf)
-        reach = (cut.clamp_min(0.0) * yy).sqrt()
+        half_height = (cut.clamp_min(0.0) * yy).sqrt()
         x, y = projected.means2d.unbind(1)
-        top, bottom = torch.ceil(y - reach).clamp(0, height), torch.floor(y + reach).clamp(-1, height - 1)
+        top, bottom = torch.ceil(y - half_height).clamp(0, height), torch.floor(y + half_height).clamp(-1, height - 1)
         ids = ((cut > 0) & (bottom >= top)).nonzero()[:, 0]
         self.ids = ids = ids.index_select(0, projected.depths.index_select(0, ids).argsort(stable=True))
         self._camera_row = projected.camera_ids.index_select(0, ids).int().mul_(self.grid[0])
         self._first_row = (top.index_select(0, ids) / tile_size).floor().int()
         self._num_rows = (bottom.index_select(0, ids) / tile_size).floor().int() - self._first_row + 1
         # a column of numbers per Gaussian, gathered once for each row of tiles that it reaches
-        columns = [x, y, reach, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()]
+        columns = [x, y, half_height, cut, xy / yy, det / yy, yy.reciprocal(), xy * (cut / xx).sqrt()]
         table = torch.stack(columns).index_select(1, ids)
         self._table = torch.nan_to_num(table, nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
         self._count(max_spans)
@@ -147,10 +147,10 @@ class Reach:
         start = torch.cumsum(num_rows, 0, dtype=torch.int32) - num_rows
         rows = _arange(ranks) + (first_row - start).index_select(0, ranks)
         columns = (column[low:high].index_select(0, ranks) for column in self._table)
-        x, y, reach, cut, slope, across, inverse_yy, rightmost = columns
+        x, y, half_height, cut, slope, across, inverse_yy, rightmost = columns
         top = rows * float(self.tile_size) - y
-        bottom = torch.minimum(top + (self.tile_size - 1), reach)
-        top = torch.maximum(top, -reach)
+        bottom = torch.minimum(top + (self.tile_size - 1), half_height)
+        top = torch.maximum(top, -half_height)
         everywhere = torch.isinf(cut)
 
         def edge(sign: int) -> Tensor:
@@ -215,9 +215,9 @@ def bin_to_tiles(
     tile_size: int = 8,
     alpha_threshold: float = RasterOptions.alpha_threshold,
 ) -> TileLists:
-    """The lists of all tiles of all cameras at once, see `Reach`."""
-    reach = Reach(projected, tile_size, alpha_threshold)
-    return reach.lists(reach.spans(0, reach.total_rows), 0, reach.total_rows)
+    """The lists of all tiles of all cameras at once, see `TileCoverage`."""
+    coverage = TileCoverage(projected, tile_size, alpha_threshold)
+    return coverage.lists(coverage.spans(0, coverage.total_rows), 0, coverage.total_rows)
 
 
 def _arange(like: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from torch import Tensor
 from kgs.covariance import footprint_table, moment_gradients
 from kgs.types import ProjectedGaussians, RasterOptions
 
-from .binning import Reach, TileLists
+from .binning import TileCoverage, TileLists
 
 ALPHA_MAX = 0.99
 
@@ -32,7 +32,7 @@ class DeviceSettings:
     """How work is cut for a kind of device."""
 
     pairs: int  # of a Gaussian and a pixel in a step, at most
-    layers: int  # entries per tile in a depth slice: few pixels see more before their light is gone
+    layers: int  # entries per tile in a depth slice: few pixels need more before they are opaque
     by_layer: bool  # scans are made layer by layer: least memory is passed, and many operators are called
     may_ask: bool  # whether a question for a number is cheap; a GPU would have to finish all work before
 
@@ -57,12 +57,14 @@ class TorchCompositing:
         tile_size, number = options.tile_size or 8, features.element_size()
         step_bytes = min(self._settings.pairs * _ARRAYS * number, options.max_bytes // 4)
         budget = options.max_bytes - step_bytes
-        # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved light
+        # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved T
         per_span, per_entry = 32 + 16 * number, 80 + (8 + 2 * features.shape[1] + tile_size**2 // 8) * number
-        self._reach = Reach(projected, tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span)))
-        self._row_slices = self._reach.row_slices(budget, per_span, per_entry)
-        self._depth_slices = self._reach.depth_slices(self._settings.layers)
-        lists_bytes = per_entry * self._reach.num_entries + per_span * self._reach.num_spans // 4
+        self._coverage = TileCoverage(
+            projected, tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span))
+        )
+        self._row_slices = self._coverage.row_slices(budget, per_span, per_entry)
+        self._depth_slices = self._coverage.depth_slices(self._settings.layers)
+        lists_bytes = per_entry * self._coverage.num_entries + per_span * self._coverage.num_spans // 4
         self._spare = budget - lists_bytes if len(self._row_slices) == 1 else 0  # to keep alphas
         self._image_size, self._eps2d = projected.image_size, projected.eps2d
         self._depths = projected.depths.detach() if median_depth else None
@@ -70,12 +72,12 @@ class TorchCompositing:
         self._thresholds = Thresholds.of(options, features.dtype)
 
     def forward(self, inputs: tuple[Tensor, ...], keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
-        """See `Compositor`: one row slice is kept, several are made again."""
+        """See `Compositor`: one row slice is kept, several are computed again."""
         keep = keep and len(self._row_slices) == 1
         canvases, kept = zip(*(self._draw(inputs, rows, keep) for rows in self._row_slices), strict=True)
-        light, median, features = (torch.cat(x, 2) for x in zip(*canvases, strict=True))
-        grid, size = self._reach.grid, self._image_size
-        images = (to_images(features, grid, size), to_images(light, grid, size), to_images(median, grid, size))
+        transmittance, median, features = (torch.cat(x, 2) for x in zip(*canvases, strict=True))
+        grid, size = self._coverage.grid, self._image_size
+        images = (to_images(features, grid, size), to_images(transmittance, grid, size), to_images(median, grid, size))
         return images, kept[0] if keep else None
 
     def backward(
@@ -87,39 +89,39 @@ class TorchCompositing:
         needs: tuple[bool, ...],
     ) -> tuple[Tensor | None, ...]:
         """See `Compositor`."""
-        reach = self._reach
-        grads, behind = (to_tiles(x, reach.grid, reach.tile_size) for x in (grad_features, grad_transmittance))
-        moments, width = any(needs[:3]), grads.shape[0] if needs[3] else 0
-        total = grads.new_zeros(reach.ids.shape[0], 6 * moments + width)  # of each Gaussian
+        coverage = self._coverage
+        grads, behind = (to_tiles(x, coverage.grid, coverage.tile_size) for x in (grad_features, grad_transmittance))
+        needs_moments, width = any(needs[:3]), grads.shape[0] if needs[3] else 0
+        total = grads.new_zeros(coverage.ids.shape[0], 6 * needs_moments + width)  # of each Gaussian
         for begin, end in self._row_slices:
-            light, slices = self._draw(inputs, (begin, end), keep=True)[1] if kept is None else kept
+            transmittance, slices = self._draw(inputs, (begin, end), keep=True)[1] if kept is None else kept
             kept = None
-            tiles = slice(begin * reach.grid[1], end * reach.grid[1])
-            later = torch.where(light[0] > 0, behind[0, :, tiles], 0.0)
+            tiles = slice(begin * coverage.grid[1], end * coverage.grid[1])
+            later = torch.where(transmittance[0] > 0, behind[0, :, tiles], 0.0)
             while slices:
                 (low, high), part = slices.pop()
-                total[low:high] += part.differentiate(grads[:, :, tiles], later, moments, width > 0)
+                total[low:high] += part.differentiate(grads[:, :, tiles], later, needs_moments, width > 0)
         found: tuple[Tensor | None, ...] = (None, None, None, total[:, total.shape[1] - width :])
-        if moments:
-            factors, opacities = (x.index_select(0, reach.ids) for x in inputs[1:3])
+        if needs_moments:
+            factors, opacities = (x.index_select(0, coverage.ids) for x in inputs[1:3])
             found = (*moment_gradients(total[:, :6], factors, opacities, self._eps2d), found[3])
 
         def of_all(value: Tensor) -> Tensor:
-            return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, reach.ids, value)
+            return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
 
         return tuple(of_all(x) if needed and x is not None else None for x, needed in zip(found, needs, strict=True))
 
     def _draw(self, inputs: tuple[Tensor, ...], rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
-        """A row slice, one depth slice after the other while light is left; and what `backward` wants."""
-        reach, spare, live = self._reach, self._spare, None
-        tiles, pixels = (rows[1] - rows[0]) * reach.grid[1], reach.tile_size**2
+        """A row slice, one depth slice after the other until all pixels are opaque, and what `backward` needs."""
+        coverage, spare, live = self._coverage, self._spare, None
+        tiles, pixels = (rows[1] - rows[0]) * coverage.grid[1], coverage.tile_size**2
         widths = (0 if self._depths is None else 1, inputs[3].shape[1])
         median, features = (inputs[0].new_zeros(width, pixels, tiles) for width in widths)
         canvas = (inputs[0].new_ones(1, pixels, tiles), median, features)
-        spans = reach.spans(*rows)
+        spans = coverage.spans(*rows)
         slices: list[tuple[tuple[int, int], DepthSlice]] = []
         for ranks in self._depth_slices:
-            lists = reach.lists(spans, *rows, ranks, live)
+            lists = coverage.lists(spans, *rows, ranks, live)
             part = DepthSlice(lists, self._gaussians(inputs, lists.ids), self._thresholds, self._settings, self._cut)
             keep_alphas = keep and part.alpha_bytes <= spare
             spare -= part.alpha_bytes * keep_alphas
@@ -159,7 +161,7 @@ class Thresholds:
 
     floor: float  # of the exponent: exp is slow where its result is denormal
     alpha: float  # smaller alphas, and what the floor lets through, are 0
-    transmittance: float  # so much light is no light
+    transmittance: float  # transmittance below this counts as 0
 
     @classmethod
     def of(cls, options: RasterOptions, dtype: torch.dtype) -> "Thresholds":
@@ -179,7 +181,7 @@ class Step:
     layers: int  # K
     before: Tensor | None = field(default=None, repr=False)  # transmittance before the first layer, (P, n)
     alpha: Tensor | None = field(default=None, repr=False)  # (K, P, n), where there is memory to keep it
-    ended: bool = False  # whether the light of a pixel may have ended
+    ended: bool = False  # whether a pixel's transmittance may have fallen below the stop
 
 
 @dataclass(frozen=True)
@@ -235,67 +237,67 @@ class DepthSlice:
         """Add the layers to the tiles of a canvas, front to back."""
         state = [x.index_select(2, self._tiles) for x in canvas]
         for step in self._steps:
-            light, median, features = (x[:, :, step.tiles] for x in state)
+            transmittance, median, features = (x[:, :, step.tiles] for x in state)
             _, ids = self._entries_of(step)
             alpha = self._alphas(*self._offsets(step, ids))
-            layers = self._light(alpha, light[0])
+            layers = self._transmittances(alpha, transmittance[0])
             ended = self._may(layers[-1] <= self._thresholds.transmittance)
             if ended:  # T never grows, so cutting afterwards is cutting at each layer
                 F.threshold(layers, self._thresholds.transmittance, 0.0, inplace=True)
             if keep:
-                step.before, step.alpha, step.ended = light[0].clone(), alpha if keep_alphas else None, ended
+                step.before, step.alpha, step.ended = transmittance[0].clone(), alpha if keep_alphas else None, ended
             if self._gaussians.depths is not None:
                 crossing = (layers[:-1] >= 0.5) & (layers[1:] < 0.5)
                 depths = self._gaussians.depths.index_select(0, ids.view(-1)).view_as(ids)
                 median += (crossing * depths[:, None]).sum(0)
             self._add(features, ids, alpha * layers[:-1])
-            light[0] = layers[-1]
+            transmittance[0] = layers[-1]
         for whole, part in zip(canvas, state, strict=True):
             whole.index_copy_(2, self._tiles, part)
 
-    def differentiate(self, grads: Tensor, behind: Tensor, moments: bool, features: bool) -> Tensor:
+    def differentiate(self, grads: Tensor, behind: Tensor, needs_moments: bool, needs_features: bool) -> Tensor:
         """What each Gaussian gets: six moments of dL/d ln alpha about its centre, and dL/d features, `(n, 6 + F)`.
 
         `grads` are dL/d features of the pixels, `(F, P, T)`. `behind` is V behind the last layer, `(P, T)`, and becomes
-        V before the first. Where `moments` or `features` are not wanted, their columns are left out.
+        V before the first. Columns of moments or features that are not needed are left out.
         """
-        lists, width = self.lists, 6 * moments + grads.shape[0] * features
+        lists, width = self.lists, 6 * needs_moments + grads.shape[0] * needs_features
         own_grads, own_behind = grads.index_select(2, self._tiles), behind.index_select(1, self._tiles)
         rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
         while self._steps:
             step = self._steps.pop()  # whose memory is free afterwards
             positions, ids = self._entries_of(step)
             pixels = own_grads[:, :, step.tiles]
-            found = self._step_gradients(step, ids, pixels, own_behind[:, step.tiles], moments, features)
+            found = self._step_gradients(step, ids, pixels, own_behind[:, step.tiles], needs_moments, needs_features)
             rows.index_copy_(0, positions.view(-1), torch.stack(found, -1).view(-1, width))
         behind.index_copy_(1, self._tiles, own_behind)
         # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
         return F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
     def _step_gradients(
-        self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, moments: bool, features: bool
+        self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, needs_moments: bool, needs_features: bool
     ) -> list[Tensor]:
         """Six moments and dL/d features of the entries of a step, each `(K, n)`; `behind` moves before the step."""
         table, dx, dy = self._offsets(step, ids)
         alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
         assert step.before is not None
-        light = self._light(alpha, step.before)
-        if step.ended:  # nothing is seen behind the end of the light
-            F.threshold(light, self._thresholds.transmittance, 0.0, inplace=True)
-            alpha.mul_(light[:-1].sign())
-        weights = alpha * light[:-1]
+        transmittance = self._transmittances(alpha, step.before)
+        if step.ended:  # nothing is seen behind the stop
+            F.threshold(transmittance, self._thresholds.transmittance, 0.0, inplace=True)
+            alpha.mul_(transmittance[:-1].sign())
+        weights = alpha * transmittance[:-1]
         found = []
-        if moments:
+        if needs_moments:
             value = torch.zeros_like(alpha)  # c . g
             for color, grad in zip(self._features(ids), grads, strict=True):
                 value.addcmul_(color[:, None], grad)
-            later = self._later(alpha, light, weights, value, behind)
+            later = self._later(alpha, transmittance, weights, value, behind)
             behind.copy_(later[0])
             value.sub_(later[1:]).mul_(weights)
             if self._clamps:  # no derivative where alpha is held at its maximum
                 value.mul_((ALPHA_MAX - alpha).sign_())
             found += _moments(value, dx, dy)
-        if features:
+        if needs_features:
             product = torch.empty_like(weights)
             found += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
         return found
@@ -329,16 +331,16 @@ class DepthSlice:
             alpha.clamp_(max=ALPHA_MAX)
         return F.threshold(alpha, self._thresholds.alpha, 0.0, inplace=True).flatten(1, 2)
 
-    def _light(self, alpha: Tensor, before: Tensor) -> Tensor:
+    def _transmittances(self, alpha: Tensor, before: Tensor) -> Tensor:
         """The transmittance before each layer and after the last, `(K + 1, P, n)`, without the stop."""
         if not self._by_layer:
             return torch.cat([before[None], 1 - alpha]).cumprod_(0)
-        light = alpha.new_empty(alpha.shape[0] + 1, *alpha.shape[1:])
-        layers = light.unbind(0)
+        transmittance = alpha.new_empty(alpha.shape[0] + 1, *alpha.shape[1:])
+        layers = transmittance.unbind(0)
         layers[0].copy_(before)
         for k, layer in enumerate(alpha.unbind(0)):
             torch.addcmul(layers[k], layers[k], layer, value=-1, out=layers[k + 1])
-        return light
+        return transmittance
 
     def _add(self, features: Tensor, ids: Tensor, weights: Tensor) -> None:
         """Add the layers `(K, P, n)` to the sums `(F, P, n)`."""
@@ -350,13 +352,13 @@ class DepthSlice:
             for total, color in zip(features, colors, strict=True):
                 total += (weights * color[:, None]).sum(0)
 
-    def _later(self, alpha: Tensor, light: Tensor, weights: Tensor, value: Tensor, behind: Tensor) -> Tensor:
+    def _later(self, alpha: Tensor, transmittance: Tensor, weights: Tensor, value: Tensor, behind: Tensor) -> Tensor:
         """V of each layer and behind the last, `(K + 1, P, n)`."""
         if not self._by_layer:
-            # the light that comes from behind a layer over the light that gets there; both are 0 behind the end
-            seen = torch.cat([weights * value, (light[-1] * behind)[None]])
-            return seen.flip(0).cumsum_(0).flip(0).div_(light.clamp_(min=torch.finfo(light.dtype).tiny))
-        later = torch.empty_like(light)
+            # what comes from behind a layer over the transmittance there; both are 0 behind the stop
+            seen = torch.cat([weights * value, (transmittance[-1] * behind)[None]])
+            return seen.flip(0).cumsum_(0).flip(0).div_(transmittance.clamp_(min=torch.finfo(transmittance.dtype).tiny))
+        later = torch.empty_like(transmittance)
         layers = later.unbind(0)
         layers[-1].copy_(behind)
         for k in reversed(range(alpha.shape[0])):

@@ -21,7 +21,7 @@ def find_photos(folder: Path) -> list[Path]:
     """The photos of a folder, sorted by name.
 
     Raises:
-        DataError: there is no such folder, it holds fewer than 3 photos, or photos of a kind that cannot be read.
+        DataError: the folder does not exist, it holds fewer than 3 photos, or photos of a kind that cannot be read.
     """
     if folder.is_file() and folder.suffix.lower() in VIDEO_SUFFIXES:
         raise DataError(folder, "", _from_video(folder))

@@ -113,7 +113,7 @@ def open_photos(paths: list[Path]) -> list[OpenPhoto]:
     """Open photos without decoding them. Their files are not opened again: `read_photos` decodes what is kept here.
 
     Raises:
-        DataError: a file cannot be read or is no photo, or two files are the same photo.
+        DataError: a file cannot be read or is not a photo, or two files are the same photo.
     """
     photos: dict[str, OpenPhoto] = {}
     for path in paths:

@@ -57,7 +57,7 @@ class RowSlice:
     entry_offsets: NDArray[np.int64]  # (B + 1,); of the bands
 
 
-class Reach:
+class TileCoverage:
     """The rows of tiles that each Gaussian reaches; lists are made from it, a row slice and a band at a time.
 
     Attributes:

@@ -3,7 +3,7 @@
 In depth order, for each of the n Gaussians that reach a row of tiles:
 
     heads     (n, 2) first row of tiles, numbered through all cameras, and how many
-    geometry  (n, 8) what its spans follow from: x, y, vertical reach, squared radius, xy/yy, det/yy, 1/yy, rightmost
+    geometry  (n, 8) what its spans follow from: x, y, half height, squared radius, xy/yy, det/yy, 1/yy, rightmost
     table     (n, 7 + F) what compositing reads: log2 o, x, y, two whitening vectors, features, maybe its depth
 """
 
@@ -42,8 +42,8 @@ def find_rows(begin, end, means2d, factors, opacities, eps2d, threshold, height,
         xx, _, yy, _ = variances(f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], eps2d)
         if not is_finite(xx + yy):
             continue
-        reach = math.sqrt(cut * yy)
-        top, bottom = np.ceil(means2d[g, 1] - reach), np.floor(means2d[g, 1] + reach)
+        half_height = math.sqrt(cut * yy)
+        top, bottom = np.ceil(means2d[g, 1] - half_height), np.floor(means2d[g, 1] + half_height)
         if bottom >= ZERO and top <= f32(height - 1) and bottom >= top:  # nothing that is not a number
             first = int(max(top, ZERO)) // SIZE
             rows[g, 0] = first
@@ -146,7 +146,7 @@ def begin_spans(heads, begin, end, starts):
 def find_spans(begin, end, first_row, last_row, image_rows, width, heads, geometry, starts, spans):
     """For each row of tiles of a Gaussian the columns that its ellipse touches: the first + 2^16 times how many."""
     for i in range(begin, end):
-        x, y, reach, cut = geometry[i, 0], geometry[i, 1], geometry[i, 2], geometry[i, 3]
+        x, y, half_height, cut = geometry[i, 0], geometry[i, 1], geometry[i, 2], geometry[i, 3]
         slope, across, inverse, rightmost = geometry[i, 4], geometry[i, 5], geometry[i, 6], geometry[i, 7]
         top = max(heads[i, 0], first_row)
         at = starts[i]
@@ -154,8 +154,8 @@ def find_spans(begin, end, first_row, last_row, image_rows, width, heads, geomet
             left, right = ZERO, f32(width - 1)
             if cut < _INFINITY:
                 low = f32(row % image_rows * SIZE) - y
-                high = min(low + f32(SIZE - 1), reach)
-                low = max(low, -reach)
+                high = min(low + f32(SIZE - 1), half_height)
+                low = max(low, -half_height)
                 dy = min(max(-rightmost, low), high)
                 left = np.ceil(x + slope * dy - math.sqrt(max(cut - dy * dy * inverse, ZERO) * across))
                 dy = min(max(rightmost, low), high)

@@ -14,7 +14,7 @@ from kgs.types import ProjectedGaussians, RasterOptions
 
 from . import compositing_kernels as kernels
 from .arrays import arrays
-from .binning import Band, Reach, RowSlice
+from .binning import Band, RowSlice, TileCoverage
 from .threads import over
 
 _NUMBER = 4  # bytes
@@ -49,60 +49,64 @@ class CpuCompositing:
         rules = self._eps2d, np.float32(options.alpha_threshold)
         most = max(2**12, options.max_bytes // (2 * per_span))
         threads = torch.get_num_threads()
-        self._reach = Reach(fields, self._size, self._cameras, rules, channels, median_depth, most, threads)
-        needs = self._reach.spans_per_row * per_span + self._reach.entries_per_row * per_entry
+        self._coverage = TileCoverage(fields, self._size, self._cameras, rules, channels, median_depth, most, threads)
+        needs = self._coverage.spans_per_row * per_span + self._coverage.entries_per_row * per_entry
         self._row_slices = row_slices(needs.tolist(), options.max_bytes)
         self._threshold, self._stop = (
             np.float32(max(x, kernels.TINY)) for x in (options.alpha_threshold, options.transmittance_stop)
         )
 
     def forward(self, inputs: Inputs, keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
-        """See `Compositor`: one row slice is kept, several are made again."""
+        """See `Compositor`: one row slice is kept, several are computed again."""
         features = inputs[3]
         widths = (1, 1 if self._median_depth else 0, features.shape[1])
-        light, median, sums = (features.new_empty(self._cameras, width, *self._size) for width in widths)
-        outputs = (light[:, 0].numpy(), median[:, 0].numpy() if self._median_depth else _nothing(3), sums.numpy())
+        transmittance, median, sums = (features.new_empty(self._cameras, width, *self._size) for width in widths)
+        outputs = (
+            transmittance[:, 0].numpy(),
+            median[:, 0].numpy() if self._median_depth else _nothing(3),
+            sums.numpy(),
+        )
         keep_slice = keep and len(self._row_slices) == 1
         done = [self._forward(rows, outputs, keep_slice) for rows in self._row_slices]
-        return (sums, light, median), done[0] if keep_slice else None
+        return (sums, transmittance, median), done[0] if keep_slice else None
 
     def backward(
         self, inputs: Inputs, kept: Any, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
     ) -> tuple[Tensor | None, ...]:
         """See `Compositor`."""
-        moments, colors = any(needs[:3]), needs[3]
+        needs_moments, needs_features = any(needs[:3]), needs[3]
         grads, behind = arrays(grad_features, grad_transmittance[:, 0])
-        columns = self._reach.table.shape[1] - 1 - self._median_depth
-        totals = np.zeros((len(self._reach.ids), columns), np.float32)
+        columns = self._coverage.table.shape[1] - 1 - self._median_depth
+        totals = np.zeros((len(self._coverage.ids), columns), np.float32)
         blank = (np.empty_like(behind), _nothing(3), _nothing(4))
         for rows in self._row_slices:
             part, done = self._forward(rows, blank, True) if kept is None else kept
             kept = None
-            self._backward(part, done, grads, behind, totals, (moments, colors))
+            self._backward(part, done, grads, behind, totals, (needs_moments, needs_features))
             del part, done  # before the next is made
-        wanted = (*[moments] * 3, colors)
+        wanted = (*[needs_moments] * 3, needs_features)
         found = [x.new_empty(x.shape if need else (0, *x.shape[1:])) for x, need in zip(inputs, wanted, strict=True)]
         own = arrays(*inputs[1:3])
-        rest = (self._reach.ranks, totals, *own, self._eps2d, *arrays(*found))
+        rest = (self._coverage.ranks, totals, *own, self._eps2d, *arrays(*found))
         over(torch.get_num_threads(), len(inputs[0]), kernels.fill_gradients, *rest)
         return tuple(x if need else None for x, need in zip(found, needs, strict=True))
 
     def _forward(self, rows: tuple[int, int], outputs: tuple[Floats, ...], keep: bool) -> tuple[RowSlice, list[_Done]]:
-        """Fill light, median depth and sums; without sums only what `backward` wants is made again."""
-        part, (light, median, sums) = self._reach.row_slice(*rows), outputs
+        """Fill transmittance, median depth and sums; without sums only compute what `backward` needs again."""
+        part, (transmittance, median, sums) = self._coverage.row_slice(*rows), outputs
         count = len(part.bounds) - 1
         done: list[_Done] = [None] * count  # type: ignore[list-item]
         rules = (self._threshold, self._stop)
 
         def work(begin: int, end: int) -> None:
             for b in range(begin, end):
-                band = self._reach.band(part, b)
+                band = self._coverage.band(part, b)
                 tiles = len(band.offsets) - 1
                 chunks = len(band.entries) // kernels.K + tiles if keep else 0
                 starts, reached = np.empty((chunks, kernels.P), np.float32), np.empty(tiles, np.int64)
-                lists = (band.first_tile, self._reach.grid, band.offsets, band.entries, band.table, *rules)
+                lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table, *rules)
                 for first, width in self._blocks if len(sums) else self._blocks[:1]:
-                    rest = (starts, reached, light, median, sums)
+                    rest = (starts, reached, transmittance, median, sums)
                     kernels.composite_forward(*lists, first, (0,) * width, *rest)
                 if keep:
                     done[b] = _Done(band, starts, reached)
@@ -111,7 +115,7 @@ class CpuCompositing:
         return part, done
 
     def _backward(
-        self, part: RowSlice, done: list[_Done], grads: Floats, grad_light: Floats, totals: Floats, wanted: Any
+        self, part: RowSlice, done: list[_Done], grads: Floats, grad_transmittance: Floats, totals: Floats, wanted: Any
     ) -> None:
         """Add to `totals` what each Gaussian gets: six moments and dL/d features, `(n, 6 + F)`."""
         sums = np.zeros((len(part.members), totals.shape[1]), np.float32)
@@ -119,9 +123,9 @@ class CpuCompositing:
         def work(begin: int, end: int) -> None:
             for own in done[begin:end]:
                 band = own.band
-                lists = (band.first_tile, self._reach.grid, band.offsets, band.entries, band.table)
+                lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
                 for first, width in self._blocks:
-                    rest = (own.starts, own.done, grads, grad_light, *wanted, sums[band.members])
+                    rest = (own.starts, own.done, grads, grad_transmittance, *wanted, sums[band.members])
                     kernels.composite_backward(*lists, self._threshold, self._stop, first, (0,) * width, *rest)
 
         threads = torch.get_num_threads()

@@ -1,9 +1,9 @@
 """Front-to-back compositing of the lists of a band, and its gradient; formulas as in `kgs.raster`.
 
 A tile is P pixels, the lanes. T is kept at the beginning of every chunk of K entries; the backward pass goes from chunk
-to chunk, back to front, and makes alphas and T of each again, with the same bits. Features come in blocks that a kernel
-is compiled for: V is linear in the features and in the gradient of the light, so blocks are differentiated one after
-the other, and their moments added.
+to chunk, back to front, and computes alphas and T of each again, with the same bits. Features come in blocks that a
+kernel is compiled for: V is linear in the features and in dL/dT, so blocks are differentiated one after the other, and
+their moments are added.
 """
 
 import numpy as np
@@ -51,9 +51,10 @@ def alpha_of(o, ax, ay, bx, by, dx, dy, threshold):
 
 @jit
 def composite_forward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, light, depths, sums
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, transmittance, depths,
+    sums,
 ):  # fmt: skip
-    """A block of features: sums over layers, the light behind them and the median depth, straight into the images.
+    """A block of features: sums over layers, transmittance and median depth, straight into the images.
 
     Args:
         first_tile: of the band.
@@ -62,16 +63,16 @@ def composite_forward(
         entries: see there.
         table: see there.
         threshold: smaller alphas are 0.
-        stop: less light is 0.
+        stop: transmittance below this is 0.
         feature: where the block begins.
         channels: any tuple of as many numbers as the block has features.
         starts: out, T at the beginning of each chunk, `(chunks, P)`; or empty.
         done: out, how many entries of each tile were reached.
-        light: out, `(C, H, W)`.
+        transmittance: out, `(C, H, W)`.
         depths: out, the median depth, `(C, H, W)`; or empty.
         sums: out, `(C, F, H, W)`.
     """
-    height, width = light.shape[1], light.shape[2]
+    height, width = transmittance.shape[1], transmittance.shape[2]
     F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
     place_pixels(pixels)
@@ -83,7 +84,7 @@ def composite_forward(
         camera, tile = (first_tile + t) // (grid[0] * grid[1]), (first_tile + t) % (grid[0] * grid[1])
         y0, x0 = tile // grid[1] * SIZE, tile % grid[1] * SIZE
         cx, cy = f32(x0) + _CENTRE, f32(y0) + _CENTRE
-        for p in range(P):  # pixels beyond the image have no light
+        for p in range(P):  # pixels beyond the image are opaque
             s[p] = ONE if (x0 + p % SIZE < width and y0 + p // SIZE < height) else ZERO
         for p in range((F + 1) * P):
             s[2 * P + p] = ZERO
@@ -124,7 +125,7 @@ def composite_forward(
         done[t] = e - first
         for y in range(min(SIZE, height - y0)):
             for x in range(min(SIZE, width - x0)):
-                left = light[camera, y0 + y, x0 + x] = s[y * SIZE + x]
+                left = transmittance[camera, y0 + y, x0 + x] = s[y * SIZE + x]
                 if median:
                     depths[camera, y0 + y, x0 + x] = s[(2 + F) * P + y * SIZE + x] if left < HALF else ZERO
                 for f in range(min(F, sums.shape[1] - feature)):
@@ -133,8 +134,9 @@ def composite_forward(
 
 @jit
 def composite_backward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, grads, grad_light,
-    moments, colors, sums,
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, grads,
+    grad_transmittance,
+    needs_moments, needs_features, sums,
 ):  # fmt: skip
     """For each member the six moments of dL/d ln alpha about its centre, and dL/d features.
 
@@ -151,12 +153,12 @@ def composite_backward(
         starts: see there.
         done: see there.
         grads: dL/d sums, `(C, F, H, W)`.
-        grad_light: dL/d light, `(C, H, W)`; used with the first block.
-        moments: whether these are wanted.
-        colors: whether dL/d features is wanted.
+        grad_transmittance: dL/d transmittance, `(C, H, W)`; used with the first block.
+        needs_moments: whether the moments are needed.
+        needs_features: whether dL/d features is needed.
         sums: added to, `(members, 6 + F)`.
     """
-    height, width = grad_light.shape[1], grad_light.shape[2]
+    height, width = grad_transmittance.shape[1], grad_transmittance.shape[2]
     F = len(channels)
     pixels = scratch(2 * P)
     place_pixels(pixels)
@@ -177,7 +179,7 @@ def composite_backward(
         for y in range(min(SIZE, height - y0)):
             for x in range(min(SIZE, width - x0)):
                 if feature == 0:
-                    s[3 * P + y * SIZE + x] = grad_light[camera, y0 + y, x0 + x]
+                    s[3 * P + y * SIZE + x] = grad_transmittance[camera, y0 + y, x0 + x]
                 for f in range(min(F, grads.shape[1] - feature)):
                     g[f * P + y * SIZE + x] = grads[camera, feature + f, y0 + y, x0 + x]
         for chunk in range((count - 1) // K, -1, -1):
@@ -202,7 +204,7 @@ def composite_backward(
             for k in range(n - 1, -1, -1):
                 i = entries[base + k]
                 b = (k * _SLAB) & 0x7FFFFFFF  # so that the compiler knows it is not negative: indices wrap
-                if moments:
+                if needs_moments:
                     ux, uy = layers[k, 1] - cx, layers[k, 2] - cy
                     m0 = mx = my = mxx = mxy = myy = ZERO
                     for p in range(P):
@@ -227,7 +229,7 @@ def composite_backward(
                     sums[i, 3] += mxx
                     sums[i, 4] += mxy
                     sums[i, 5] += myy
-                if colors:
+                if needs_features:
                     for f in range(F):
                         total = ZERO
                         for p in range(P):
@@ -254,7 +256,7 @@ def fill_gradients(
 ):  # fmt: skip
     """From moments to gradients, see `kgs.covariance.moment_gradients`; what is not wanted is empty."""
     F = d_features.shape[1] if len(d_features) else 0
-    moments = len(d_opacities) > 0
+    needs_moments = len(d_opacities) > 0
     gathered = np.empty((_BLOCK, 6 + F), np.float32)
     for block in range(begin, end, _BLOCK):
         stop = min(block + _BLOCK, end)
@@ -265,13 +267,13 @@ def fill_gradients(
             total = gathered[g - block]
             for f in range(F):
                 d_features[g, f] = total[6 + f]
-            if not moments:
+            if not needs_moments:
                 continue
             a0, a1, a2 = factors[g, 0, 0], factors[g, 0, 1], factors[g, 0, 2]
             b0, b1, b2 = factors[g, 1, 0], factors[g, 1, 1], factors[g, 1, 2]
             xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
             d_opacities[g] = total[0] / opacities[g] if ranks[g] >= 0 else ZERO
-            if ranks[g] < 0 or not is_finite(det):  # in no list, or wider than numbers reach: flat over the image
+            if ranks[g] < 0 or not is_finite(det):  # in no list, or it overflows: flat over the image
                 d_means2d[g, 0] = d_means2d[g, 1] = ZERO
                 d_factors[g] = ZERO
                 continue

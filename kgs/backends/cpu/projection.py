@@ -27,10 +27,10 @@ def project(
     if not _is_plain(cameras) or options.near_plane < 1e-8:  # Kornia does not divide by less
         return project_torch(gaussians, cameras, size, options, colors)
     opacities = gaussians.opacities.detach()
-    wide = bool((opacities > 2.0).any())  # only these matter for the reach
+    wide = bool((opacities > 2.0).any())  # only these change the cutoff
     opacities = opacities.masked_fill(~finite_gaussians(gaussians), 0.0) if wide else opacities[..., :0]
-    reach = float(seen_within(opacities, options.alpha_threshold))
-    rules = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, reach))
+    cutoff = float(seen_within(opacities, options.alpha_threshold))
+    rules = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, cutoff))
     harmonics = colors and gaussians.colors.ndim == 3
     views = _views(cameras, size)
     inputs = *vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics

@@ -137,7 +137,7 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, r
     Gaussians, and in `counts` how many of each block are seen and how many are not finite, `(blocks, 2)`.
     """
     v, k, limits, centre = camera
-    height, width, near, eps2d, reach = rules
+    height, width, near, eps2d, cutoff = rules
     means2d, factors, depths, alphas, rgb, radii, ids = lists
     bands = colors.shape[1] // 3 if rgb.shape[1] else 0
     b = np.empty(16, np.float32)
@@ -165,7 +165,7 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, r
             largest = HALF * (xx + yy) + f32(math.sqrt(difference * difference + across * across))
             if not (det > ZERO and is_finite(det + largest + px + py)):
                 continue
-            rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
+            rx, ry = cutoff * math.sqrt(xx), cutoff * math.sqrt(yy)
             if px + rx > -HALF and px - rx < width - HALF and py + ry > -HALF and py - ry < height - HALF:
                 ids[m], depths[m], alphas[m], radii[m] = g, z, opacities[row, g], np.ceil(THREE * math.sqrt(largest))
                 means2d[m, 0], means2d[m, 1] = px, py

@@ -1,4 +1,4 @@
-"""One cell of the study: one fit, and everything that the report says of it."""
+"""One cell of the study: one fit, and everything the report needs of it."""
 
 import time
 import warnings
@@ -29,18 +29,17 @@ from kgs.page.pictures import Picture, encoded
 from .overfitting import coadaptation, count_over_threshold
 from .rivals import Rival, RivalTrainer
 
-FULL = "full-model"  # a start that no fit may have: the upper bound
-_FULL_MODEL = f"{FULL}: points seen in any two photos that are no test views, refined with test views; not allowed"
+FULL = "full-model"  # initial points that use test views: an upper bound
+_FULL_MODEL = f"{FULL}: points seen in any two photos that are not test views, refined with test views; not allowed"
 _lpips = lru_cache(maxsize=1)(Lpips.load)
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
-    """Fit once and measure; fits of the same scene, views, start and seed begin alike and see the views in one order.
+    """Fit once and measure. Fits of one scene, views, start and seed share initial points and the order of views.
 
     Args:
         cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of
-            initial points, or "full-model": 10 000 of the points that a COLMAP model has of all photos that are no test
-            views),
+            initial points, or "full-model": 10 000 points of a COLMAP model of all photos but the test views),
             "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given), and the
             fields of FitConfig and of Rival that are not as it has them.
         data: the folder of the scenes; DataError: the scene is not there or damaged.
@@ -116,7 +115,7 @@ def _start(
     else:
         scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
     begin, config = time.process_time(), _config(start, seed, {"preset": preset})
-    with warnings.catch_warnings(action="ignore", category=UserWarning):  # a start that fell back says so by its kind
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback
         points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
     return scene, points, time.process_time() - begin
 
@@ -134,7 +133,7 @@ def _config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
 
 
 def _full_model(scene: Scene, seed: int) -> InitialPoints:
-    """Points of the model that two photos observe, also such as lie between the fit's few views; no test views."""
+    """Points of the model that two photos observe, none of them a test view."""
     everything = load_scene(scene.root, points="model-points")
     chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
     points = everything.points[chosen].double() + (everything.offset - scene.offset)

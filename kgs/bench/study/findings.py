@@ -1,4 +1,4 @@
-"""What may be concluded from the study: its comparisons as a table and in sentences, and what the default loses."""
+"""Conclusions of the study: its comparisons as a table and as sentences, and the default's regret."""
 
 from collections.abc import Iterable
 from itertools import groupby, product

@@ -62,7 +62,8 @@ def run_grid(
 
 def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Callable[[str], None]) -> None:
     """Do the cells on the client's workers and append each to the file when it is done."""
-    waiting, cell_of, failed = iter(cells), {}, 0
+    cell_of: dict[Any, Cell] = {}  # of the futures that are not done
+    waiting, failed = iter(cells), 0
     futures = as_completed()
 
     def submit_to_free_workers() -> None:

@@ -1,4 +1,4 @@
-"""The cells of the study in one table, their pairs, and what these say: means with their intervals, and noise."""
+"""The cells of the study as one table, and statistics of their pairs: means, intervals and noise."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,7 +11,7 @@ from kgs.metrics.evaluate import MEASURES
 
 from .presets import METHODS, SCENES
 
-KEYS = ("scene", "views", "start", "method")  # what cells have in common that differ in the seed alone
+KEYS = ("scene", "views", "start", "method")  # equal for cells that differ only in the seed
 COLUMNS = [f"{part}.{name}" for part in ("test", "train") for name in MEASURES]
 COLUMNS += ["init.points", "init.seconds", "gaussians", "wall_seconds", "cpu_seconds", "peak_rss_mb", "coadaptation"]
 ORIGIN = ["revision", "date", "versions.machine"]
@@ -107,7 +107,7 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def grouped(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:
-    """The cells that share these fields, group by group in their order; the fields are a tuple."""
+    """The cells grouped by these fields, in order of appearance; each group comes with its tuple of values."""
     return frame.groupby(list(keys), sort=False)
 
 

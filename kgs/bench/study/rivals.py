@@ -76,7 +76,7 @@ class SelectiveDrop(DropGaussian):
 
     `scores` is a plain attribute: a tensor of the shape of the opacities that stays until it is replaced, or None. The
     call drops the share of the rate with the highest scores, of each camera's row in `(C, N)`, equal ones in order,
-    and scales the rest by 1/(1 - rate). Unlike that of a random subset this render is no unbiased estimate.
+    and scales the rest by 1/(1 - rate). Unlike that of a random subset this render is not an unbiased estimate.
     """
 
     scores: Tensor | None = None
