@@ -91,7 +91,7 @@ def layers(
     near_plane: float = RasterOptions.near_plane,
     eps2d: float = RasterOptions.eps2d,
 ) -> Layers:
-    """The layers that :func:`render` sums; it documents the arguments and errors."""
+    """The layers that :func:`render` sums; see there for arguments and errors."""
     check_kind("gaussians", gaussians, Gaussians)
     check_kind("camera", camera, PinholeCamera)
     if camera.batch_size != 1 or gaussians.opacities.numel() != len(gaussians):

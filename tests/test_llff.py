@@ -134,7 +134,7 @@ def with_value(row: int, column: int, value: float) -> np.ndarray:
         (with_value(3, 4, 0), "row 3.*whole pixels"),
         (with_value(3, 14, -80), r"image003\.png.*focal length"),
         (with_value(3, 0, 0.7), r"image003\.png.*rotation"),
-        (with_value(3, 9, 60), r"image003\.png.*no scaled version"),
+        (with_value(3, 9, 60), r"image003\.png.*not a scaled version"),
     ],
 )
 def test_wrong_arrays(tmp_path: Path, array: np.ndarray, message: str) -> None:

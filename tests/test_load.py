@@ -52,7 +52,7 @@ def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path
         (["IMG_1.HEIC", "IMG_2.HEIC"], "holds 2 HEIC photos that cannot be read: convert them to JPEG or PNG"),
         (["a.dng", "b.avif", "c.AVIF"], "holds 3 AVIF and DNG photos that cannot be read"),
         (["walk.MP4"], "holds 1 MP4 videos: take photos out"),
-        (["notes.txt", "._IMG_1.HEIC"], r"is no scene: looked for poses_bounds\.npy"),
+        (["notes.txt", "._IMG_1.HEIC"], r"is not a scene: looked for poses_bounds\.npy"),
     ],
 )
 def test_what_is_no_scene_is_named(tmp_path: Path, folder: str, names: list[str], message: str) -> None:

@@ -156,7 +156,7 @@ def test_test_poses_never_reach_the_training_cameras(tmp_path: Path) -> None:
         ({"cx": None}, "cx.*got none"),
         ({"w": 40.5}, "whole numbers"),
         ({"w": 0}, "image size"),
-        ({"w": 30, "h": 40}, "no scaled version"),
+        ({"w": 30, "h": 40}, "not a scaled version"),
         ({"k1": -4.0}, "distortion"),
         ({"k1": [0.1]}, "k1.*finite number"),
     ],
