@@ -69,7 +69,7 @@ def test_every_flipped_byte_and_every_cut_is_found(path):
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 something else", pickle.dumps({"x": 1}), bytes(100)])
 def test_other_files_are_refused(path, content):
     path.write_bytes(content)
-    with pytest.raises(DataError, match="no whole checkpoint"):
+    with pytest.raises(DataError, match="not a whole checkpoint"):
         load_checkpoint(path)
 
 
