@@ -100,7 +100,7 @@ def test_eval_refuses_measures_of_other_views(fitted, capsys, tmp_path):
     metrics["test"]["views"][0]["name"] = "another"
     path.write_text(json.dumps(metrics))
     assert run("eval", tmp_path / "copy") == 2
-    assert "is about other views" in one_line(capsys)
+    assert "has other views" in one_line(capsys)
     assert json.loads(path.read_text()) == metrics
 
 
