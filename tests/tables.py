@@ -1,6 +1,6 @@
 """The option `--tables=FOLDER`: a run of the tests ends with tables of what they found, printed and written there.
 
-    pytest tests/fuzz tests/faults tests/stiff -m "" --tables=docs/results
+    pytest tests/faults tests/stiff -m "" --tables=docs/results
 
 A test leaves a row with `record_property(table, row)`, with or without pytest-xdist. Of rows with the same name the one
 with the most trials is shown, so that the slow tests replace what the fast ones found.
@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--tables",
         type=Path,
         metavar="FOLDER",
-        help="print the tables of tests/fuzz, faults and stiff, and write them as Markdown, CSV and JSON into FOLDER",
+        help="print the tables of tests/faults and stiff, and write them as Markdown, CSV and JSON into FOLDER",
     )
 
 
@@ -57,24 +57,6 @@ def _of_most_trials(rows: list[Row]) -> list[Row]:
     for row in sorted(rows, key=lambda row: (row["name"].casefold(), row["trials"])):
         kept[row["name"]] = row
     return list(kept.values())
-
-
-def _hostile(rows: list[Row], _: Path) -> str:
-    def mib(value: int | None) -> str:
-        return "not measured" if value is None else f"{value / 2**20:.1f}"
-
-    counts = ("trials", "sound", "DataError", "other")
-    lines = [
-        [r["name"], *(r[key] for key in counts), r["slowest_s"], mib(r["memory"]), mib(r["allowed"])] for r in rows
-    ]
-    memory = max((row["memory"] for row in rows if row["memory"] is not None), default=None)
-    total = [sum(row[key] for row in rows) for key in counts]
-    lines.append(["all", *total, max(row["slowest_s"] for row in rows), mib(memory), ""])
-    title = (
-        "Damaged files (valid ones with seeded changes): loaded with sound numbers, refused with DataError, or other"
-    )
-    heads = ("tried", "loaded, sound", "DataError", "other", "slowest [s]", "memory [MiB]", "allowed [MiB]")
-    return markdown_table(title, heads, lines, first="reader")
 
 
 def _faults(rows: list[Row], _: Path) -> str:
@@ -117,7 +99,6 @@ def _projection(rows: list[Row], path: Path) -> str:
 
 
 _TABLES: dict[str, tuple[str, Callable[[list[Row], Path], str]]] = {  # by folder
-    "hostile": ("hostile", _hostile),
     "faults": ("faults", _faults),
     "bits": ("extremes", _bits),
     "projection": ("precision", _projection),

@@ -1,24 +1,47 @@
-"""What is fuzzed: a reader of files, a valid set of files for it, and how each file is damaged."""
+"""The readers of kgs, each with a tiny valid set of files, the damage that is done to them, and what must hold."""
 
 from __future__ import annotations
 
-import io
 import json
-import random
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
-import safetensors.torch
-from mutations import Mutator
+import torch
+import trimesh
+from damage import (
+    Damage,
+    damaged_bytes,
+    damaged_checkpoint,
+    damaged_json,
+    damaged_png_chunk,
+    damaged_text,
+    damaged_zip_member,
+)
+from tiny_scenes import (
+    write_blender,
+    write_colmap,
+    write_config,
+    write_image,
+    write_llff,
+    write_lpips,
+    write_nerfstudio,
+    write_ply,
+)
 from torch import Tensor
 
-from kgs.fit.checkpoint import _digest_all
+from kgs.datasets import Scene, Views, load_scene, synthetic_scene
+from kgs.datasets.image_file import read_image
+from kgs.fit.config import FitConfig, timetable
+from kgs.fit.saved import read_settings
+from kgs.fit.trainer import Trainer
+from kgs.init_points import InitialPoints
+from kgs.init_points.files import read_points
+from kgs.io.ply import load_ply
+from kgs.metrics.lpips import Lpips
 
-__all__ = ["Reader", "Target", "Unsound", "check_range", "inside_checkpoint", "inside_png", "inside_zip"]
+Target = tuple[str, Damage]  # a file of the set, and how it is damaged
 
 
 class Unsound(Exception):
@@ -26,44 +49,21 @@ class Unsound(Exception):
 
 
 @dataclass(frozen=True)
-class Target:
-    """A file that is damaged.
-
-    Args:
-        path: relative to the set's folder.
-        mutate: the damage, see `mutations.py`.
-    """
-
-    path: str
-    mutate: Mutator
-
-
-@dataclass(frozen=True)
 class Reader:
     """One reader of kgs.
 
     Args:
-        name: what the tables call it.
+        name: the id of its tests.
         write: writes a valid set of files into a folder.
         read: reads them and checks what it got; raises DataError for files that are refused and `Unsound` for numbers
             that should not have passed.
         targets: the files that are damaged, one at a time.
-        share: of the trials that others get, for a slow one.
     """
 
     name: str
     write: Callable[[Path], None]
     read: Callable[[Path], None]
     targets: tuple[Target, ...]
-    share: float = 1.0
-
-    def damage(self, folder: Path, seed: int) -> tuple[Path, bytes, str]:
-        """The file of a valid set in `folder` that this seed damages, its damaged bytes, and what was done."""
-        rng = random.Random(f"{self.name} {seed}")
-        target = rng.choice(self.targets)
-        path = folder / target.path
-        data, what = target.mutate(path.read_bytes(), rng)
-        return path, data, f"{self.name}, seed {seed}: {target.path}: {what}"
 
 
 def check_range(name: str, value: Tensor, low: float = -1e30, high: float = 1e30) -> None:
@@ -72,61 +72,158 @@ def check_range(name: str, value: Tensor, low: float = -1e30, high: float = 1e30
         raise Unsound(f"{name}: expected numbers from {low:g} to {high:g}")
 
 
-def inside_checkpoint(mutate: Mutator, part: int) -> Mutator:
-    """Damage to a checkpoint's JSON (part 1) or to its tensors (part 2), with the checksum made right again."""
-
-    def mutate_part(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-        size = int.from_bytes(data[:8], "little")
-        header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
-        metadata = header["__metadata__"]
-        if part == 1:
-            text, what = mutate(metadata["state"].encode(), rng)
-            metadata["state"] = text.decode(errors="replace")
-        else:
-            body, what = mutate(body, rng)
-            body = body[: len(data) - 8 - size].ljust(len(data) - 8 - size, b"\0")  # of the size in the header
-        head = json.dumps(header).encode()
-        tensors = safetensors.torch.load(len(head).to_bytes(8, "little") + head + body)
-        metadata["sha256"] = _digest_all(metadata["state"], tensors)
-        head = json.dumps(header).encode()
-        return len(head).to_bytes(8, "little") + head + body, f"part {part}, checksum right: {what}"
-
-    return mutate_part
+_CONFIG = FitConfig(steps=3, evaluations=1, seed=1, sh_degree=1)
+_POINTS = 12
 
 
-def inside_zip(mutate: Mutator) -> Mutator:
-    """Damage to one file of an archive, which is then packed again with its checksums right."""
-
-    def mutate_member(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-        chosen = rng.choice(list(members))
-        members[chosen], what = mutate(members[chosen], rng)
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in members.items():
-                archive.writestr(zipfile.ZipInfo(name), content)
-        return packed.getvalue(), f"{chosen}, checksum right: {what}"
-
-    return mutate_member
+def _read_image(folder: Path, suffix: str) -> None:
+    check_range("image", torch.from_numpy(read_image(folder / f"image.{suffix}")), 0, 1)
 
 
-def inside_png(mutate: Mutator) -> Mutator:
-    """Damage to one chunk of a PNG image, its checksum made right again."""
+def _read_ply(folder: Path) -> None:
+    for name, value in load_ply(folder / "splat.ply").state_dict().items():
+        check_range(name, value, -3.5e38, 3.5e38)
 
-    def mutate_chunk(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-        chunks, at = [], 8
-        while at < len(data):
-            size = struct.unpack_from(">I", data, at)[0]
-            chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
-            at += size + 12
-        chosen = rng.randrange(len(chunks))
-        content, what = mutate(chunks[chosen][1], rng)
-        chunks[chosen] = chunks[chosen][0], content
-        packed = [
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-            for kind, body in chunks
-        ]
-        return data[:8] + b"".join(packed), f"{chunks[chosen][0].decode()}, checksum right: {what}"
 
-    return mutate_chunk
+def check_scene(scene: Scene) -> None:
+    """Raise Unsound where a scene holds numbers that are not finite or not valid."""
+    for views in filter(None, (scene.train, scene.test, scene.finer)):
+        _check_views(views)
+    check_range("points", scene.points)
+    check_range("point_colors", scene.point_colors, 0, 1)
+    check_range("offset", scene.offset)
+    check_range("background", scene.background, 0, 1)
+
+
+def _check_views(views: Views) -> None:
+    check_range("images", views.images, 0, 1)
+    if views.masks is not None:
+        check_range("masks", views.masks, 0, 1)
+    check_range("intrinsics", views.cameras.intrinsics)
+    check_range("extrinsics", views.cameras.extrinsics)
+    check_range("focal lengths", torch.stack([views.cameras.fx, views.cameras.fy]), 1e-30)
+    rotation = views.cameras.extrinsics[:, :3, :3].double()
+    if float((rotation.mT @ rotation - torch.eye(3)).abs().max()) > 1e-5 or float(torch.linalg.det(rotation).min()) < 0:
+        raise Unsound("extrinsics: expected right-handed rotations")
+    if len(set(views.names)) < len(views.names):
+        raise Unsound("names: expected each one once")
+
+
+@cache
+def _scene() -> Scene:
+    return synthetic_scene(train_views=2, test_views=1, size=(16, 16))
+
+
+def _write_checkpoint(folder: Path) -> None:
+    points = torch.rand(_POINTS, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 4.0])
+    trainer = Trainer(_scene(), _CONFIG, InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random"))
+    trainer.fit(lambda trainer, _: trainer.step == 2)
+    trainer.save(folder / "checkpoint.safetensors")
+
+
+def _read_checkpoint(folder: Path) -> None:
+    trainer = Trainer.resume(_scene(), _CONFIG, folder / "checkpoint.safetensors")
+    for name, value in trainer.model.state_dict().items():
+        check_range(name, value, -3.5e38, 3.5e38)
+    for parameter, state in trainer.optimizer.state.items():
+        for name, value in state.items():
+            check_range(name, value.expand(parameter.shape), -3.5e38, 3.5e38)
+
+
+def _read_config(folder: Path) -> None:
+    _, config = read_settings(folder / "config.json")
+    timetable(config)
+    json.dumps(config.to_dict(), allow_nan=False)
+
+
+def _read_lpips(folder: Path) -> None:
+    for name, value in Lpips.load(folder, "alexnet").state_dict().items():
+        check_range(name, value, -3.5e38, 3.5e38)
+
+
+def _write_points(folder: Path, kind: str) -> None:
+    points, colors = torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(0)).numpy()
+    trimesh.PointCloud(points, (255 * colors).astype("uint8")).export(folder / f"points.{kind}")
+
+
+def _read_cloud(folder: Path, kind: str) -> None:
+    points, colors = read_points(folder / f"points.{kind}")
+    check_range("points", points, -3.5e38, 3.5e38)
+    check_range("colors", colors, 0, 1)
+
+
+def _image_reader(name: str, suffix: str, *targets: Target, channels: int = 3) -> Reader:
+    path = f"image.{suffix}"
+    return Reader(
+        name,
+        partial(write_image, suffix=suffix, channels=channels),
+        partial(_read_image, suffix=suffix),
+        targets or ((path, damaged_bytes),),
+    )
+
+
+def _read(root: Path, points: str = "none", downscale: float | None = None) -> None:
+    check_scene(load_scene(root, downscale=downscale, points=points))
+
+
+_MODEL = ("cameras", "images", "points3D")
+SCENE_READERS = (
+    Reader("LLFF", write_llff, partial(_read, downscale=2), (("poses_bounds.npy", damaged_bytes),)),
+    Reader(
+        "COLMAP, binary",
+        write_colmap,
+        partial(_read, points="model-points"),
+        tuple((f"sparse/0/{stem}.bin", damaged_bytes) for stem in _MODEL),
+    ),
+    Reader(
+        "COLMAP, text",
+        partial(write_colmap, text=True),
+        partial(_read, points="model-points"),
+        tuple((f"sparse/0/{stem}.txt", damaged_text) for stem in _MODEL),
+    ),
+    Reader(
+        "Blender",
+        write_blender,
+        partial(_read, downscale=1.5),
+        tuple((f"transforms_{split}.json", damaged_json) for split in ("train", "test")),
+    ),
+    Reader("nerfstudio", write_nerfstudio, _read, (("transforms.json", damaged_json),)),
+)
+_PNG, _HEADS = "image.png", "lpips_lin_alexnet.npz"
+_CHECKPOINT = "checkpoint.safetensors"
+_CLOUDS = {"ply": ("points.ply", damaged_bytes), "xyz": ("points.xyz", damaged_text)}
+FILE_READERS = (
+    Reader("PLY, binary", write_ply, _read_ply, (("splat.ply", damaged_bytes),)),
+    Reader("PLY, ascii", partial(write_ply, text=True), _read_ply, (("splat.ply", damaged_text),)),
+    Reader(
+        "checkpoint",
+        _write_checkpoint,
+        _read_checkpoint,
+        (
+            (_CHECKPOINT, damaged_bytes),
+            *[(_CHECKPOINT, damaged_checkpoint)] * 3,
+        ),
+    ),
+    Reader("config.json", write_config, _read_config, (("config.json", damaged_json),)),
+    Reader(
+        "LPIPS weights",
+        write_lpips,
+        _read_lpips,
+        (
+            (_HEADS, damaged_bytes),
+            (_HEADS, damaged_zip_member),
+            ("alexnet_features.npz", damaged_bytes),
+        ),
+    ),
+    _image_reader("PNG", "png", (_PNG, damaged_bytes), (_PNG, damaged_png_chunk), channels=4),
+    _image_reader("JPEG", "jpg"),
+    _image_reader("WebP", "webp"),
+    _image_reader("BMP", "bmp"),
+    _image_reader("TIFF", "tif"),
+    _image_reader("TIFF, RGBA", "tif", channels=4),
+    *(
+        Reader(f"points, {kind}", partial(_write_points, kind=kind), partial(_read_cloud, kind=kind), (target,))
+        for kind, target in _CLOUDS.items()
+    ),
+)
+READERS = (*SCENE_READERS, *FILE_READERS)
