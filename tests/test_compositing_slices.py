@@ -139,7 +139,7 @@ def test_byte_budget_changes_nothing(dtype, drawn):
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", [pytest.param(DTYPES[0], marks=pytest.mark.slow), *DTYPES[1:]])
 def test_alphas_made_again_are_those_that_were_kept(dtype, drawn, monkeypatch):
     settings = dataclasses.replace(compositing.SETTINGS["cpu"], pairs=2**12)  # steps that fit whatever the budget
     monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)

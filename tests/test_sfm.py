@@ -148,7 +148,8 @@ def test_photos_that_tell_the_focal_length_are_believed_more_than_their_exif(tmp
     assert report["focal_px"] == pytest.approx(focal_length(WIDTH), rel=0.05)
 
 
-@pytest.mark.parametrize("strength", [0.03, pytest.param(-0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("strength", [0.03, -0.1])
 def test_the_distortion_of_the_lens_is_found(tmp_path, strength):
     images = np.stack([distorted(image, strength) for image in planes()])
     report = pose_photos(write_photos(tmp_path / "photos", images), tmp_path / "out", say=lambda line: None)

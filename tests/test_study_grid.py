@@ -144,9 +144,8 @@ def test_an_interrupt_leaves_nothing_at_the_scheduler(tmp_path, cluster):
     assert left == 1  # a client that every scheduler has
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGINT))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_killed_grid_leaves_no_process_and_goes_on(tmp_path, monkeypatch, threads, number):
     path, cells = tmp_path / "g.jsonl", cells_in(tmp_path, 5, seconds=0.5)
     script = f"""
