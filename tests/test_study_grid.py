@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -37,11 +38,11 @@ def cluster():
         yield cluster
 
 
-@pytest.fixture(params=["local", "dask"])
+@pytest.fixture(params=["local", "one", "dask"])
 def where(request):
     """Where the cells run: arguments of run_grid."""
-    if request.param == "local":
-        return {"processes": 2}
+    if request.param != "dask":
+        return {"processes": 1 if request.param == "one" else 2}
     return {"scheduler": request.getfixturevalue("cluster").scheduler_address}
 
 
@@ -114,7 +115,7 @@ def test_a_failing_cell_stops_no_other(tmp_path, threads):
 
 @pytest.mark.slow
 def test_a_process_that_dies_takes_no_other_cell_with_it(tmp_path, where):
-    """Its cell is done again; a cell that always kills fails alone."""
+    """Its cell is done again, and no other twice; a cell that always kills fails alone."""
     killer = 3
     path, cells = tmp_path / "g.jsonl", cells_in(tmp_path, 7, kill={2: "once", killer: "always"})
     said = []
@@ -125,7 +126,7 @@ def test_a_process_that_dies_takes_no_other_cell_with_it(tmp_path, where):
     assert sorted((row["cell"]["x"], row["result"]["y"]) for row in read_rows(path)) == [
         (x, x**2) for x in sorted(others)
     ]
-    assert times_done(tmp_path).keys() == others
+    assert times_done(tmp_path) == dict.fromkeys(others, 1)
     assert (tmp_path / "killed 2").exists()
     assert "scheduler" in where or not processes_left(tmp_path)
 
@@ -171,10 +172,13 @@ run_grid({cells!r}, do, Path({str(path)!r}), processes=2)
 
 
 def test_an_address_where_no_scheduler_answers(tmp_path, monkeypatch, cluster):
-    monkeypatch.setattr(grid, "_TIMEOUT", 0.5)
-    for address in ("tcp://127.0.0.1:1", "127.0.0.1", "nonsense", cluster.workers[0].worker_address):
-        with pytest.raises(ValueError, match=f"^scheduler: expected .* Dask scheduler.*, got '{address}'"):
-            run_grid(CELLS, square, tmp_path / "g.jsonl", scheduler=address, say=quiet)
+    monkeypatch.setattr(grid, "PATIENCE", 0.5)
+    worker = cluster.workers[0].worker_address
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # takes connections and says nothing, as a web server does
+        mute = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        for address in ("tcp://127.0.0.1:1", "127.0.0.1", "nonsense", worker, mute):
+            with pytest.raises(ValueError, match=f"^scheduler: expected .* Dask scheduler.*, got '{address}'"):
+                run_grid(CELLS, square, tmp_path / "g.jsonl", scheduler=address, say=quiet)
 
 
 def test_wrong_arguments(tmp_path):

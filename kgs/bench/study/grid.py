@@ -1,22 +1,26 @@
 """Runs the cells of an experiment on Dask, each once: a finished cell is a line of a file, and is not done again."""
 
+import asyncio
 import json
 import logging
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+from distributed.core import rpc
 
 from kgs.io.results_folder import held
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
 _key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
-_TIMEOUT = 10  # seconds for a scheduler to answer
+PATIENCE = 10  # seconds for a scheduler to answer
+_LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
 
 
 def run_grid(
@@ -31,7 +35,8 @@ def run_grid(
     """Do the cells that the file does not have yet; return the lines of those that it has then, in the cells' order.
 
     A run that is killed goes on where it stopped when it is started again. Dask repeats a cell whose worker dies, three
-    times at most; a cell that fails is reported and does not stop the others.
+    times at most; those that died as often are tried once more in the end, each alone. A cell that fails is reported
+    and does not stop the others.
 
     Args:
         cells: dicts of plain values, each different.
@@ -63,29 +68,44 @@ def run_grid(
 def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Callable[[str], None]) -> None:
     """Do the cells on the client's workers and append each to the file when it is done."""
     cell_of: dict[Any, Cell] = {}  # of the futures that are not done
-    waiting, failed = iter(cells), 0
+    waiting, suspects = deque(cells), deque[Cell]()  # suspects died with workers: each is done alone in the end
+    alone, finished, failed = False, 0, 0
     futures = as_completed()
 
-    def submit_to_free_workers() -> None:
-        free = sum(client.nthreads().values()) - len(cell_of)  # a queued cell would be lost with its worker
-        for cell in islice(waiting, max(0, free)):
+    def submit() -> None:
+        nonlocal alone
+        if not cell_of and not waiting and suspects:
+            alone = True
+            waiting.append(suspects.popleft())
+        if not cell_of and waiting:
+            client.wait_for_workers(1)  # at the start, and where the last one died
+        try:
+            free = sum(client.nthreads().values()) - len(cell_of)  # a queued cell would be lost with its worker
+        except OSError:
+            raise ValueError(_LOST) from None
+        for _ in range(min(free, len(waiting))):
+            cell = waiting.popleft()
             future = client.submit(work, cell, pure=False)
             cell_of[future] = cell
             futures.add(future)
 
-    client.wait_for_workers(1)
-    submit_to_free_workers()
-    for count, future in enumerate(futures, 1):
+    submit()
+    for future in futures:
         cell = cell_of.pop(future)
-        if future.cancelled():
-            raise ValueError("scheduler: lost the connection to it; run again to go on")
-        if error := future.exception():
+        if future.status in ("cancelled", "lost"):
+            raise ValueError(_LOST)
+        error = future.exception()
+        if isinstance(error, KilledWorker) and not alone:
+            suspects.append(cell)
+        elif error:
             failed += 1
             say(f"failed: {_key(cell)}: {type(error).__name__}: {error}")
         else:
+            finished += 1
             _append(path, {"cell": cell, "result": future.result()})
-            say(f"{count} of {len(cells)}: {_key(cell)}")
-        submit_to_free_workers()
+            say(f"{finished + failed} of {len(cells)}: {_key(cell)}")
+        future.release()  # else Dask does the cell again if this worker dies later
+        submit()
     if failed:
         say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
 
@@ -101,28 +121,45 @@ def _append(path: Path, row: dict[str, Any]) -> None:
 def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
     """A client of the scheduler at this address, or of processes of this machine."""
     if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=_TIMEOUT)
-        except (OSError, ValueError, TypeError) as error:  # what Dask raises for no answer, no port, and a worker
-            expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
-            raise ValueError(f"scheduler: {expected}, got {scheduler!r} ({error})") from error
-        with client:
+        _check_scheduler(scheduler)
+        with Client(scheduler) as client:
             yield client
         return
     cores = os.cpu_count() or 1
     count = processes or cores
     threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // count))
-    cluster = LocalCluster(
-        count,
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=None,  # a cell may need any share of the memory; Dask would kill its process
-        env={"OMP_NUM_THREADS": threads},
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    )
-    with cluster, Client(cluster) as client:
-        yield client
+    before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
+    try:
+        cluster = LocalCluster(
+            count,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,  # a cell may need any share of the memory; Dask would kill its process
+            env={"OMP_NUM_THREADS": threads},
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        )
+        with cluster, Client(cluster) as client:
+            yield client
+    finally:
+        for name in set(os.environ) - before:
+            del os.environ[name]
+
+
+def _check_scheduler(address: str) -> None:
+    """Raise a ValueError unless a scheduler answers; a Client waits for ever for an open port that says nothing."""
+    with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
+        found = thread.submit(asyncio.run, _identify(address))
+    kind = found.exception() or found.result()
+    if kind != "Scheduler":
+        expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+        raise ValueError(f"scheduler: {expected}, got {address!r} ({kind!r})")
+
+
+async def _identify(address: str) -> str:
+    """What answers at the address."""
+    async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
+        return str((await asyncio.wait_for(server.identity(), PATIENCE))["type"])
 
 
 def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
