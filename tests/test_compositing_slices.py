@@ -28,9 +28,17 @@ def assert_gradients_close(got, expected, bound):
         assert (a.double() - b.double()).abs().max() <= bound * b.abs().max()
 
 
+@pytest.mark.parametrize(
+    "sizes",  # of tiles and chunks
+    [
+        [(4, None), (5, 3), (8, 1), (8, 32), (16, 8), (64, 3)],
+        pytest.param([(8, 3), (8, 8), (32, 32), (64, None)], marks=pytest.mark.slow),
+    ],
+    ids=["default", "others"],
+)
 @pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP)])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds):
+def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds, sizes):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     gaussians = random_gaussians(300, 5, dtype, image_size=40)
     camera = random_camera(40, 56, 5, dtype)
@@ -42,7 +50,7 @@ def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds):
     first, first_gradients = loss_and_gradients(
         projected, projected.colors, weights, tile_size=4, chunk_size=1, **options
     )
-    for tile_size, chunk_size in [(4, None), (5, 3), (8, 1), (8, 32), (16, 8), (64, 3)]:
+    for tile_size, chunk_size in sizes:
         image, gradients = loss_and_gradients(
             projected, projected.colors, weights, tile_size=tile_size, chunk_size=chunk_size, **options
         )
@@ -157,7 +165,7 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, drawn, monkeypatch):
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
-@pytest.mark.parametrize("thresholds", [(TH, STOP), (TH, 0.1)])
+@pytest.mark.parametrize("thresholds", [pytest.param((0.0, 0.0), marks=pytest.mark.slow), (TH, STOP), (TH, 0.1)])
 @pytest.mark.parametrize("tight", [False, True])
 def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, drawn, monkeypatch):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))

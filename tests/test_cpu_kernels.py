@@ -22,7 +22,7 @@ from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 # -- lists ---------------------------------------------------------------------------------------------------------
 
 
-def reach_of(projected, threshold=TH, max_spans=2**40):
+def coverage_of(projected, threshold=TH, max_spans=2**40):
     inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
     fields = arrays(*inputs, projected.depths, projected.camera_ids)
     rules = np.float32(projected.eps2d), np.float32(threshold)
@@ -39,7 +39,7 @@ def test_lists_are_those_of_torch(cameras, threshold, rows):
         depths[::7] = -0.0
         opacities = projected.opacities.masked_fill(off, 0.0)
         projected = dataclasses.replace(projected, depths=depths, opacities=opacities)
-        bins, coverage = bin_to_tiles(projected, 8, threshold), reach_of(projected, threshold)
+        bins, coverage = bin_to_tiles(projected, 8, threshold), coverage_of(projected, threshold)
         begin, end = rows or (0, coverage.total_rows)
         expected = torch.tensor_split(bins.ids[bins.entries.long()], bins.offsets[1:-1])
         part, tile = coverage.row_slice(begin, end), begin * bins.grid[1]
@@ -57,7 +57,7 @@ def test_lists_are_those_of_torch(cameras, threshold, rows):
 @pytest.mark.parametrize("max_spans", [2**40, 200, 1])
 def test_rows_hold_what_was_counted(max_spans):
     projected = scene(0, cameras=2)
-    coverage, bins = reach_of(projected, max_spans=max_spans), bin_to_tiles(projected)
+    coverage, bins = coverage_of(projected, max_spans=max_spans), bin_to_tiles(projected)
     assert torch.equal(torch.from_numpy(coverage.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
     assert coverage.spans_per_row.tolist() == [len(coverage.row_slice(row, row + 1).spans) for row in range(12)]
 
@@ -79,11 +79,11 @@ def test_pixels_are_the_lanes(kernel):
     types |= {
         "starts": f[:, ::1],
         "done": i8[::1],
-        "light": f[:, :, ::1],
+        "transmittance": f[:, :, ::1],
         "depths": f[:, :, ::1],
-        "grad_light": f[:, :, ::1],
+        "grad_transmittance": f[:, :, ::1],
     }
-    types |= {"grads": f[:, :, :, ::1], "moments": nb.boolean, "colors": nb.boolean}
+    types |= {"grads": f[:, :, :, ::1], "needs_moments": nb.boolean, "needs_features": nb.boolean}
     types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
     names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
     text = assembly(kernel, *(types.get(name, i8) for name in names))

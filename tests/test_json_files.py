@@ -39,9 +39,9 @@ def test_anything_else_is_a_value_error(text: bytes) -> None:
         (b'{"a": NaN}', "NaN is not a finite number"),
         (b'{"a": 1e400}', "1e400 is not a finite number"),
         (b'{"a": ' + b"[" * 100_000, "nested too deep"),
-        (b'{"a": 1', "JSON"),
-        (b"\xff\xfe", "JSON"),
-        (b'{"a": ' + b"9" * 5000 + b"}", "JSON"),  # Python's own limit of the digits
+        (b'{"a": 1', "not readable JSON"),
+        (b"\xff\xfe", "not readable JSON"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "not readable JSON"),  # Python's own limit of the digits
     ],
 )
 def test_files_that_are_refused(tmp_path: Path, text: bytes, reason: str) -> None:

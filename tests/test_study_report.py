@@ -85,6 +85,7 @@ def test_every_part_of_the_study_gives_sound_files(case, reports):
     page = (out / "index.html").read_text()
     images = re.findall(r'<img[^>]*src="data:image/png;base64,([^"]*)"', page)
     drawn = {path.read_bytes() for path in out.glob("*.png")}
+    assert page.count("<img") == len(images) == len(drawn)
     assert {base64.b64decode(image) for image in images} == drawn
     assert not re.search(r"<script|<link|@import|src=\"(?!data:)", page)
     tables = [line for line in text.splitlines() if line.startswith("|")]

@@ -1,4 +1,4 @@
-"""PSNR of held-out views apart: where at least two training views show the scene, and elsewhere.
+"""PSNR of held-out views, separately where at least two training views show the scene and elsewhere.
 
 One training view gives no measured depth, and what none shows is guessed: a mean over both says little.
 """
@@ -23,7 +23,7 @@ OCCLUDED = 1.05  # a point farther than this times a training view's depth is hi
 
 @torch.no_grad()
 def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str, float | None] | None:
-    """PSNR of the test views, apart for pixels that at least `MIN_VIEWS` training views show and for the rest.
+    """PSNR of the test views, separately for pixels that at least `MIN_VIEWS` training views show and for the rest.
 
     Convention:
         The median depth of the fit gives the point of a pixel. A training view shows it if it projects into that
