@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import torch
@@ -46,6 +48,7 @@ def as_views(posed: PinholeCamera, images: torch.Tensor, masks: torch.Tensor | N
     return Views(posed, images, tuple(f"{i}.png" for i in range(len(images))), masks)
 
 
+@cache
 def texture(seed: int, tint: tuple[float, float, float], size: int = 900) -> np.ndarray:
     """Grey noise of several scales, in [0.1, 1], times a tint."""
     rng = np.random.default_rng(seed)
@@ -53,7 +56,9 @@ def texture(seed: int, tint: tuple[float, float, float], size: int = 900) -> np.
         s * cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), s) for s in (2.5, 5.0, 10.0)
     )
     grey = 0.1 + 0.9 * np.clip(0.5 + noise / (5 * noise.std()), 0, 1)
-    return grey[..., None] * np.array(tint, dtype=np.float32)
+    painted: np.ndarray = grey[..., None] * np.array(tint, dtype=np.float32)
+    painted.flags.writeable = False
+    return painted
 
 
 def painted_planes(posed: PinholeCamera | None = None) -> Views:

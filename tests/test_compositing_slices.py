@@ -154,7 +154,7 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, drawn, monkeypatch):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     kept, kept_gradients = loss_and_gradients(projected, colors, weights)
     assert all(keep_alphas for _, keep_alphas in drawn)
-    budget = 2**30
+    budget = 2**24
     while any(keep_alphas for _, keep_alphas in drawn):  # until there is room for the lists alone
         drawn.clear()
         budget = int(0.9 * budget)

@@ -142,6 +142,7 @@ def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_
     assert any("the Exif says 208 pixels" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_photos_that_tell_the_focal_length_are_believed_more_than_their_exif(tmp_path):
     report = pose_photos(write_photos(tmp_path / "photos", planes(), film=40), tmp_path / "out", say=lambda line: None)
     assert report["exif_focal_px"] > 1.3 * focal_length(WIDTH)

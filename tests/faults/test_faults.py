@@ -50,6 +50,7 @@ def _bits(same: bool) -> str:
     return "the same bits" if same else "other bits"
 
 
+@pytest.mark.slow  # test_study_grid.py kills a grid, test_run.py damages checkpoints
 def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
     """One fit after the other, killed again and again, each time resumed from what it left."""
     steps, expected = alone
