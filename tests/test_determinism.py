@@ -62,9 +62,9 @@ def test_one_and_two_threads_are_equal(threads, dtype, size, n):
 def test_one_and_two_threads_are_equal_under_a_byte_budget(threads):
     options = {"max_bytes": 2**20}
     threads(1)
-    first = run(options=options)
+    first = run(n=300, options=options)
     threads(2)
-    assert_equal_bits(run(options=options), first)
+    assert_equal_bits(run(n=300, options=options), first)
 
 
 def test_rendering_leaves_the_number_of_threads_alone(threads):

@@ -50,7 +50,7 @@ def gradients(inputs, seed=0, **options):
 
 
 @pytest.mark.parametrize("sh_degree", [3, None])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
 def test_gradcheck_of_the_whole_pipeline_along_random_directions(seed, sh_degree):
     inputs = make_inputs(seed, sh_degree=sh_degree)
 

@@ -198,7 +198,7 @@ def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 REAL = [
-    ("llff/fern", 3, 391),
+    pytest.param("llff/fern", 3, 391, marks=pytest.mark.slow),
     pytest.param("llff/flower", 3, 1513, marks=pytest.mark.slow),
     pytest.param("colmap/trex", 3, 544, marks=pytest.mark.slow),
     pytest.param("llff/fern", 6, 742, marks=pytest.mark.slow),

@@ -125,7 +125,12 @@ def test_gradcheck_with_respect_to_extrinsics_and_intrinsics():
 
 
 @pytest.mark.parametrize(
-    "kind", [CameraModelType.BROWN_CONRADY, CameraModelType.KANNALA_BRANDT_K3, CameraModelType.ORTHOGRAPHIC]
+    "kind",
+    [
+        pytest.param(CameraModelType.BROWN_CONRADY, marks=pytest.mark.slow),
+        CameraModelType.KANNALA_BRANDT_K3,
+        CameraModelType.ORTHOGRAPHIC,
+    ],
 )
 def test_gradcheck_through_other_camera_models(kind):
     gaussians, cameras = scene(2, 1)

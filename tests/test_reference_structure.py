@@ -159,7 +159,7 @@ def scene(seed: int, sh_degree: int | None = 3) -> tuple[Gaussians, PinholeCamer
 # -- gradients -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sh_degree", [None, 3])
+@pytest.mark.parametrize("sh_degree", [None, pytest.param(3, marks=pytest.mark.slow)])
 def test_gradients_of_all_inputs(sh_degree):
     gaussians, camera = scene(0, sh_degree)
     colors = gaussians.colors if sh_degree is None else gaussians.colors / 4

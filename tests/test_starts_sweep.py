@@ -43,7 +43,7 @@ def test_costs_and_scores_are_torchs(count, height, width, planes):
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=2e-6, check_stride=False)
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_depth_maps_are_torchs(count):
     views = synthetic_scene(train_views=count, test_views=1, size=(48, 64), seed=0).train
     maps = [plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend) for backend in ("numba", "torch")]
