@@ -198,20 +198,21 @@ def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 REAL = [
-    pytest.param("llff/fern", 3, 391, marks=pytest.mark.slow),
-    pytest.param("llff/flower", 3, 1513, marks=pytest.mark.slow),
-    pytest.param("colmap/trex", 3, 544, marks=pytest.mark.slow),
-    pytest.param("llff/fern", 6, 742, marks=pytest.mark.slow),
-    pytest.param("llff/flower", 6, 2394, marks=pytest.mark.slow),
-    pytest.param("colmap/trex", 6, 1455, marks=pytest.mark.slow),
-    pytest.param("llff/fern", 9, 1350, marks=pytest.mark.slow),
-    pytest.param("llff/flower", 9, 4021, marks=pytest.mark.slow),
-    pytest.param("colmap/trex", 9, 2109, marks=pytest.mark.slow),
-    pytest.param("nerfstudio/fox", 12, 1957, marks=pytest.mark.slow),
-    pytest.param("nerfstudio/fox", 24, 3731, marks=pytest.mark.slow),
+    ("llff/fern", 3, 391),
+    ("llff/flower", 3, 1513),
+    ("colmap/trex", 3, 544),
+    ("llff/fern", 6, 742),
+    ("llff/flower", 6, 2394),
+    ("colmap/trex", 6, 1455),
+    ("llff/fern", 9, 1350),
+    ("llff/flower", 9, 4021),
+    ("colmap/trex", 9, 2109),
+    ("nerfstudio/fox", 12, 1957),
+    ("nerfstudio/fox", 24, 3731),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "train_views", "expected"), REAL)
 def test_real_scene_gives_enough_points(kgs_data: Path, name: str, train_views: int, expected: int) -> None:
     from kgs.datasets import load_scene

@@ -10,12 +10,6 @@ from kgs import DataError
 from kgs.bench.study import grid, presets, study
 
 
-@pytest.fixture
-def _no_plots(monkeypatch):
-    monkeypatch.setattr("kgs.bench.study.report.write_plots", lambda *_: {})  # time; test_study_report.py has them
-
-
-@pytest.mark.usefixtures("_no_plots")
 def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
     cells = [tiny_cell("off"), tiny_cell("progressive 0.2"), tiny_cell("off", seed=1)]
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: cells[:2])
@@ -40,13 +34,11 @@ def studied(tmp_path_factory, threads):
     """The folder of a study of one cell."""
     out = tmp_path_factory.mktemp("studied")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.study.report.write_plots", lambda *_: {})
         patch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
         study(out=out, scheduler=threads)
     return out
 
 
-@pytest.mark.usefixtures("_no_plots")
 def test_a_report_of_what_is_there_fits_nothing(tmp_path, monkeypatch, threads, studied):
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     with pytest.raises(DataError, match="expected cells of --preset quick, got none"):
@@ -60,7 +52,6 @@ def test_a_report_of_what_is_there_fits_nothing(tmp_path, monkeypatch, threads, 
     assert (tmp_path / "sparse.jsonl").read_bytes() == cells
 
 
-@pytest.mark.usefixtures("_no_plots")
 def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, threads, studied):
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     shutil.copytree(studied, tmp_path, dirs_exist_ok=True)
@@ -71,7 +62,6 @@ def test_the_report_of_another_preset_is_not_overwritten(tmp_path, monkeypatch, 
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-@pytest.mark.usefixtures("_no_plots")
 def test_a_second_run_is_refused_and_writes_nothing(tmp_path, monkeypatch, threads, studied):
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     shutil.copytree(studied, tmp_path, dirs_exist_ok=True)
@@ -83,7 +73,6 @@ def test_a_second_run_is_refused_and_writes_nothing(tmp_path, monkeypatch, threa
     assert [path.name for path in tmp_path.iterdir()] == ["sparse.jsonl"]
 
 
-@pytest.mark.usefixtures("_no_plots")
 def test_a_cell_that_is_there_twice_counts_once(tmp_path, monkeypatch, threads, studied):
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
     shutil.copytree(studied, tmp_path, dirs_exist_ok=True)
