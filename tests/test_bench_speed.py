@@ -92,6 +92,7 @@ def test_the_exponent_of_a_power_law():
     assert _exponent(np.array([(x, 3 * x**1.5) for x in (1.0, 2.0, 8.0)])) == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 def test_the_files_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "SIZE", (36, 48))
     monkeypatch.setattr(speed, "_memory_of_its_own", lambda *_: 1.0)

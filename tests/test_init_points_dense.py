@@ -43,6 +43,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+@pytest.mark.slow
 def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
     for view, found in enumerate(sweep_depths(views, *span)):
         accepted = found.is_inner & (found.scores > 0.6)

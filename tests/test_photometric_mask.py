@@ -100,6 +100,7 @@ def test_what_is_outside_does_not_matter_whatever_it_is(dtype, value):
         torch.testing.assert_close(found[1], expected_gradient)
 
 
+@pytest.mark.slow
 def test_gradcheck():
     image, target = make((1, 2, 11, 13))
     mask = torch.ones(11, 13, dtype=torch.bool)

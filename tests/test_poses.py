@@ -108,6 +108,7 @@ def test_no_step_without_a_finite_gradient(room, slope):
     assert poses.moved()["most_degrees"] == 0
 
 
+@pytest.mark.slow
 def test_a_fit_turns_wrong_cameras_back():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
     wrong = place_cameras(scene, turned(scene.train.cameras.extrinsics, 0.7, seed=5))

@@ -110,6 +110,7 @@ def test_the_report_says_what_was_found(posed):
     assert any("3 photos" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_the_same_photos_and_seed_give_the_same_files(posed, tmp_path):
     folder, out, report, _ = posed
     again = pose_photos(folder, tmp_path / "again")
@@ -134,6 +135,7 @@ def test_a_second_run_uses_what_is_there(posed, monkeypatch):
     }.items() <= before.items()
 
 
+@pytest.mark.slow
 def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_path):
     lines, folder = [], write_photos(tmp_path / "photos", close(1), film=30)
     report = pose_photos(folder, tmp_path / "out", say=lines.append)

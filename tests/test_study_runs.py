@@ -10,6 +10,7 @@ from kgs import DataError
 from kgs.bench.study import grid, presets, study
 
 
+@pytest.mark.slow
 def test_it_goes_on_and_reports(tmp_path, monkeypatch, threads, capsys):
     cells = [tiny_cell("off"), tiny_cell("progressive 0.2"), tiny_cell("off", seed=1)]
     monkeypatch.setattr(presets, "sparse_cells", lambda *_: cells[:2])

@@ -101,7 +101,7 @@ def test_the_interval_over_scenes_covers_the_mean_of_all_scenes_as_often_as_it_s
 
 
 def test_intervals_over_seeds_hold_as_often_as_they_say():
-    rng, held, repeats = random.Random(0), 0, 600
+    rng, held, repeats = random.Random(0), 0, 200
     for _ in range(repeats):
         scenes = [[effect + rng.gauss(0, 0.2) for _ in range(n)] for effect, n in ((0.5, 3), (-0.2, 2), (0.0, 1))]
         found = paired_difference(columns(*scenes))

@@ -269,6 +269,7 @@ def test_nothing_is_dropped_in_the_last_tenth(scene, points):
 # -- backgrounds ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_dark_photos_become_opaque_before_random_backgrounds_alone(scene, points):
     """Where the background is black, nothing says whether a dark photo is transparent."""
     dark = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images)))
@@ -283,6 +284,7 @@ def test_dark_photos_become_opaque_before_random_backgrounds_alone(scene, points
     assert seen["random"] > 1.5 * seen["scene"]
 
 
+@pytest.mark.slow
 def test_transparent_photos_stay_transparent_before_random_backgrounds(scene, points):
     masks = torch.zeros_like(scene.train.images[:, :1])
     clear = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images), masks=masks))
