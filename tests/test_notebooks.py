@@ -15,7 +15,7 @@ backend_inline = pytest.importorskip("matplotlib_inline.backend_inline")
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 LIMIT = 300  # seconds for a full run
-FITTING = ("02_camera_pose_by_gradient", "03_three_views", "07_your_own_photos")  # seconds even when small: in full only
+FITTING = ("02_camera_pose_by_gradient", "03_three_views", "07_your_own_photos")  # in full only: slow when small, too
 
 # What must be true in the kernel after the last cell: of any run, and of a full one.
 CLAIMS = {
@@ -113,8 +113,6 @@ CLAIMS["07_your_own_photos"] = (
 
 # Sizes that are smaller still than those of the notebooks' own quick runs: time.
 SMALLER = {
-    "02_camera_pose_by_gradient": {"STEPS = 15 if": "STEPS = 8 if", "SLICE = 9 if": "SLICE = 5 if"},
-    "03_three_views": {"STEPS = 30 if": "STEPS = 10 if"},
     "06_a_study_of_one_scene": {"STEPS = 15 if": "STEPS = 4 if"},
 }
 
