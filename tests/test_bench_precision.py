@@ -16,6 +16,8 @@ from kgs.bench.scenes import exact
 
 pytest.importorskip("matplotlib")
 
+pytestmark = pytest.mark.slow  # one run of the whole program
+
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):

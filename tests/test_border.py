@@ -29,6 +29,7 @@ def behind(left=1.0, top=2.0, right=0.5, bottom=0.0):
     return math.prod(side.clamp(0, 1) for side in sides)
 
 
+@pytest.mark.slow
 def test_a_border_is_found_as_it_is(scene):
     light = behind()
     found = border_light(scene.train.images * light)

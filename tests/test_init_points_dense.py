@@ -214,7 +214,7 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
     assert planes_wanted(views.select([0]), 2.0, 10.0) == 0.0
 
 
-@pytest.mark.parametrize("draw", ["uniform", "spread"])
+@pytest.mark.parametrize("draw", [pytest.param("uniform", marks=pytest.mark.slow), "spread"])
 def test_few_points_are_enough_where_many_agree(draw: str) -> None:
     found = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
     assert found.kind == "dense"

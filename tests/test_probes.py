@@ -113,6 +113,7 @@ def test_a_probe_knows_nothing_of_the_view_that_is_left_out(monkeypatch, eight):
     assert all(left_out.isdisjoint(names) or len(left_out & set(names)) == 1 for names in asked)
 
 
+@pytest.mark.slow
 def test_probes_of_many_views_have_a_dozen_of_them(monkeypatch):
     probes = Probes([20.0] * 4)
     monkeypatch.setattr(needs, "Trainer", probes)

@@ -103,6 +103,7 @@ def test_one_photo_twice(folder, refused):
     refused(folder, "3.png: is the same photo as 1.png: remove one of them")
 
 
+@pytest.mark.slow
 def test_one_photo_twice_saved_anew(folder, refused):
     save(folder, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"])
     refused(folder, "1.png and 2.jpg match at the same pixels", "remove one of them")
@@ -126,6 +127,7 @@ def test_photos_of_several_lenses(folder, refused):
     refused(folder, "one focal length, got 2", "13 mm: 2.jpg", "26 mm: 0.jpg, 1.jpg", "without zoom")
 
 
+@pytest.mark.slow
 def test_photos_without_overlap(folder, refused):
     save(folder, [texture(seed, (220.0, 220.0, 220.0), 120).astype(np.uint8) for seed in range(3)])
     refused(folder, "no two of the 3 photos show enough of the same things", "smaller step", "Matches of each pair")

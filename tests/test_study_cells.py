@@ -133,6 +133,7 @@ def test_only_the_built_in_scene_is_shown(folder):
     assert "pictures" not in sparse_cell(other, data=str(folder.parent))
 
 
+@pytest.mark.slow
 def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
     begun = []
 

@@ -131,6 +131,7 @@ def test_a_process_that_dies_takes_no_other_cell_with_it(tmp_path, where):
     assert "scheduler" in where or not processes_left(tmp_path)
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_nothing_at_the_scheduler(tmp_path, cluster):
     def interrupt(line):
         if line.startswith("2 of 6"):
@@ -171,6 +172,7 @@ run_grid({cells!r}, do, Path({str(path)!r}), processes=2)
     assert {times_done(tmp_path)[x] for x in kept} == {1}
 
 
+@pytest.mark.slow
 def test_an_address_where_no_scheduler_answers(tmp_path, monkeypatch, cluster):
     monkeypatch.setattr(grid, "PATIENCE", 0.5)
     worker = cluster.workers[0].worker_address

@@ -4,6 +4,7 @@ import base64
 import csv
 import math
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -56,23 +57,31 @@ def _coarse_plots():
 
 
 @pytest.fixture(scope="module")
-def reports(tmp_path_factory):
-    """The report on each case: its folder, and what was returned."""
+def report(tmp_path_factory):
+    """From the name of a case to its report: the folder, and what was returned."""
     folder = tmp_path_factory.mktemp("reports") / "new"
-    return {
-        name: (folder / str(k), write_report(rows, folder / str(k), "kgs study --preset cpu", 99))
-        for k, (name, rows) in enumerate(CASES.items())
-    }
+
+    @cache
+    def written(case):
+        out = folder / str(list(CASES).index(case))
+        return out, write_report(CASES[case], out, "kgs study --preset cpu", 99)
+
+    return written
 
 
 @pytest.fixture(scope="module")
-def markdown(reports):
-    return reports["full"][1]
+def markdown(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kgs.bench.study.report.write_plots", lambda *_: {})  # time
+        return write_report(FULL, tmp_path_factory.mktemp("text") / "new", "kgs study --preset cpu", 99)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_every_part_of_the_study_gives_sound_files(case, reports):
-    rows, (out, text) = CASES[case], reports[case]
+SLOW = pytest.param("full", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("case", [SLOW, *(case for case in CASES if case != "full")])
+def test_every_part_of_the_study_gives_sound_files(case, report):
+    rows, (out, text) = CASES[case], report(case)
     assert text == (out / "sparse.md").read_text()
     for name in TEXTS:
         content = (out / name).read_text()
@@ -101,21 +110,29 @@ def test_each_method_has_a_table():
     assert {*MAIN, *(name for family in FAMILIES.values() for name in family)} == METHODS.keys()
 
 
-def test_plots_without_data_are_left_out(reports, tmp_path):
-    drawn = {case: sorted(path.name for path in out.glob("*.png")) for case, (out, _) in reports.items()}
-    assert drawn["full"] == sorted(PLOTS)
-    assert drawn["one cell"] == sorted(set(PLOTS) - {"forest.png"})
-    assert drawn["other starts alone"] == []
+@pytest.mark.parametrize(
+    ("case", "names"),
+    [
+        pytest.param("full", set(PLOTS), marks=pytest.mark.slow),
+        ("one cell", set(PLOTS) - {"forest.png"}),
+        ("other starts alone", set()),
+    ],
+)
+def test_plots_are_drawn_of_what_is_there(case, names, report):
+    assert {path.name for path in report(case)[0].glob("*.png")} == names
+
+
+def test_plots_without_data_are_left_out(tmp_path):
     rows = full()[:1]
     rows[0]["result"] |= {"curve": [], "coadaptation": None, "thresholds": None, "cpu_seconds": None}
     write_report(rows, tmp_path, "command", 1)
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["gap.png"]
 
 
-def test_the_same_rows_give_the_same_bytes(reports, tmp_path):
+def test_the_same_rows_give_the_same_bytes(report, tmp_path):
     write_report(CASES["one cell"], tmp_path, "kgs study --preset cpu", 99)
     for path in tmp_path.iterdir():
-        assert path.read_bytes() == (reports["one cell"][0] / path.name).read_bytes()
+        assert path.read_bytes() == (report("one cell")[0] / path.name).read_bytes()
 
 
 def test_the_main_table(markdown):
@@ -231,13 +248,13 @@ def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
         write_report([*rows, longer], tmp_path, "command", 2)
 
 
-def test_text_is_escaped(reports):
-    out, _ = reports["unknown method, no LPIPS"]
+def test_text_is_escaped(report):
+    out, _ = report("unknown method, no LPIPS")
     assert "<b>" not in (out / "index.html").read_text()
 
 
-def test_the_page_can_be_cited(reports):
-    page = (reports["full"][0] / "index.html").read_text()
+def test_the_page_can_be_cited(report):
+    page = (report("partial")[0] / "index.html").read_text()
     assert "@software{kgs," in page
     assert "@inproceedings{park2025dropgaussian," in page
     assert f"version = {{{__version__}}}" in page

@@ -221,6 +221,7 @@ def test_regret_is_against_the_best_other_method_of_each_scene():
     assert regret(cells_of({("llff/fern", 3, "off"): [1.0]})) == []
 
 
+@pytest.mark.slow
 def test_the_default_stands_beside_the_others():
     """On each scene that has it, with what its probes chose; the means are over the scenes that a method has."""
     settings = [("llff/fern", 3), ("nerfstudio/fox", 12), ("nerfstudio/fox", 6)]

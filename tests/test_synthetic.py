@@ -43,7 +43,7 @@ def test_fields_are_those_of_a_scene_without_first_points(scene):
     torch.testing.assert_close(scene.train.cameras.cy, torch.full((3,), 62.5))
 
 
-@pytest.mark.parametrize("kind", ["room", "orbit"])
+@pytest.mark.parametrize("kind", ["room", pytest.param("orbit", marks=pytest.mark.slow)])
 def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
     first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (3, 3, 4))
     for split in ("train", "test"):
@@ -54,6 +54,7 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
         assert not torch.equal(a.cameras.extrinsics, c.cameras.extrinsics)
 
 
+@pytest.mark.slow
 def test_world_does_not_depend_on_the_number_of_views(scene):
     few = synthetic_scene(train_views=1, test_views=0)
     depth = synthetic_depths(few.train.cameras)

@@ -151,6 +151,7 @@ def test_the_usual_limit_is_reached_without_a_word(whole, points):
     assert whole.notes == []
 
 
+@pytest.mark.slow
 def test_the_number_may_grow_evenly(scene, points):
     config = replace(CONFIG, max_gaussians=450, growth=0.5)
     counts = []
@@ -238,6 +239,7 @@ def test_the_rate_follows_the_papers_schedule(scene, points):
     assert rates == pytest.approx([0.3 * step / 12 for step in range(1, 13)])
 
 
+@pytest.mark.slow
 def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path):
     config = replace(CONFIG, coarse=0.5)
     trainer = Trainer(scene, config, points)
@@ -254,6 +256,7 @@ def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path)
     assert not torch.equal(trainer.model.means, whole.model.means[: len(trainer.model)])
 
 
+@pytest.mark.slow
 def test_nothing_is_dropped_in_the_last_tenth(scene, points):
     trainer, active = Trainer(scene, replace(CONFIG, drop_until=0.9, evaluations=1), points), []
 
