@@ -140,7 +140,7 @@ def test_what_is_asked_for_beside_the_image_does_not_change_its_bits(kernel_back
             assert torch.equal(out.transmittance, first.transmittance)
 
 
-@pytest.mark.parametrize("width", [3, 11])
+@pytest.mark.parametrize("width", [3, pytest.param(11, marks=pytest.mark.slow)])
 def test_row_slices_change_nothing(kernel_backend, run, width):
     projected, certain = sample(800, size=(80, 112))
     features = random(len(projected), width)

@@ -150,6 +150,7 @@ def test_random_points_where_no_two_views_see_the_same(count: int) -> None:
     assert int(seeing_views(posed, points).min()) == 1
 
 
+@pytest.mark.slow
 def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixture[str]) -> None:
     small = planes.halved()
     initial_points(small, "dense")

@@ -203,7 +203,13 @@ def sampson_error(views: Views, first: int, second: int) -> float:
 
 @pytest.mark.parametrize(
     ("name", "train_views"),
-    [("llff/fern", 6), ("llff/flower", 6), ("colmap/trex", 9), ("nerfstudio/fox", 24), ("blender/lego", None)],
+    [
+        ("llff/fern", 6),
+        ("llff/flower", 6),
+        ("colmap/trex", 9),
+        ("nerfstudio/fox", 24),
+        pytest.param("blender/lego", None, marks=pytest.mark.slow),
+    ],
 )
 def test_matches_of_real_photos_lie_on_epipolar_lines(kgs_data: Path, name: str, train_views: int | None) -> None:
     """A wrong axis, a shifted pairing of images and poses or a wrong focal length gives tens of pixels."""

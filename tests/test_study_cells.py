@@ -118,6 +118,7 @@ def test_a_cell_measures_and_repeats_bit_for_bit():
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 def test_only_the_built_in_scene_is_shown(folder):
     """Photo, render and difference of a test view, in a few kilobytes."""
     pictures = sparse_cell(tiny_cell())["pictures"]

@@ -100,6 +100,7 @@ def test_the_interval_over_scenes_covers_the_mean_of_all_scenes_as_often_as_it_s
     assert too_sure / repeats > 0.2
 
 
+@pytest.mark.slow
 def test_intervals_over_seeds_hold_as_often_as_they_say():
     rng, held, repeats = random.Random(0), 0, 200
     for _ in range(repeats):
@@ -128,6 +129,7 @@ def test_noise_floor():
     assert noise_floor(columns([1.0], [2.0])).freedom == 0
 
 
+@pytest.mark.slow
 def test_two_means_differ_by_less_than_the_noise_as_often_as_it_says():
     rng, held, repeats = random.Random(1), 0, 600
     for _ in range(repeats):

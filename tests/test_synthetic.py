@@ -82,7 +82,10 @@ def test_forward_test_views_lie_around_the_training_views(scene):
     assert ((test[:, 0] > train[:, 0].min()) & (test[:, 0] < train[:, 0].max())).sum() >= 3
 
 
-@pytest.mark.parametrize(("seed", "size"), [(0, (42, 56)), (1, (56, 42)), (2, (48, 48))])
+@pytest.mark.parametrize(
+    ("seed", "size"),
+    [(0, (42, 56)), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, (56, 42)), (2, (48, 48))))],
+)
 def test_forward_views_are_covered_wholly(seed, size):
     scene = synthetic_scene(train_views=3, test_views=6, size=size, seed=seed)
     for views in (scene.train, scene.test):

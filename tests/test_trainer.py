@@ -99,7 +99,15 @@ def test_with_and_without_drop_see_the_same_views(scene, points):
     assert orders[0] == orders[1]
 
 
-@pytest.mark.parametrize("at", [1, 10, 16, 29], ids=["first", "densify", "mid-epoch", "last"])
+@pytest.mark.parametrize(
+    "at",
+    [
+        pytest.param(1, marks=pytest.mark.slow, id="first"),
+        pytest.param(10, id="densify"),
+        pytest.param(16, id="mid-epoch"),
+        pytest.param(29, marks=pytest.mark.slow, id="last"),
+    ],
+)
 def test_resumed_is_bit_identical(whole, scene, points, tmp_path, at):
     if at == 10:
         assert at in whole.times.densify
