@@ -53,6 +53,7 @@ def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: 
         assert float((errors[accepted] < 0.02).double().mean()) > 0.7
 
 
+@pytest.mark.slow
 def test_points_lie_on_the_surfaces(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
     points, colors, _ = dense_points(views, *span, 2000, generator())
     assert points.shape == colors.shape == (2000, 3)

@@ -30,6 +30,7 @@ def depths(scene):
     return synthetic_depths(scene.train.cameras, "room")
 
 
+@pytest.mark.slow
 def test_photos_are_filled_and_neither_dark_nor_burnt_out(scene, depths):
     assert scene.train.images.shape == (3, 3, *SIZE)
     assert scene.test.images.shape == (5, 3, *SIZE)

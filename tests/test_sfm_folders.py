@@ -133,6 +133,7 @@ def test_photos_without_overlap(folder, refused):
     refused(folder, "no two of the 3 photos show enough of the same things", "smaller step", "Matches of each pair")
 
 
+@pytest.mark.slow
 def test_two_scenes_in_one_folder(folder, refused):
     save(folder, small([*planes()[:2], *planes()[:2, :, ::-1]]))
     text = refused(folder, "2 groups that do not overlap (1: 0.png, 1.png; 2: 2.png, 3.png)", "If they show two scenes")
@@ -170,6 +171,7 @@ def test_a_blurred_photo_is_told(folder):
     ]
 
 
+@pytest.mark.slow
 def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
     save(folder, [planes()[0], *(cv2.resize(image, (480, 360)) for image in planes()[1:])])
     photos = read_photos(open_photos(sorted(folder.iterdir())), silent)

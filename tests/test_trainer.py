@@ -47,6 +47,7 @@ def test_it_learns(each_backend, scene, points):
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
 
 
+@pytest.mark.slow
 def test_opacities_decay_or_are_reset_when_the_timetable_says(scene, points, monkeypatch):
     done = []
 

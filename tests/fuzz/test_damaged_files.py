@@ -30,7 +30,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Reader], Path]:
     return folder_of
 
 
-@pytest.mark.parametrize("examples", [20, pytest.param(1500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [40, pytest.param(1500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_damaged_files_are_sound_or_refused(
     reader: Reader, examples: int, valid: Callable[[Reader], Path], capfd: pytest.CaptureFixture[str]
