@@ -20,9 +20,9 @@ from kgs.errors import DataError
 from .border import border_light
 from .frames import LARGEST, Frame, FrameSet
 from .images import rectification, remap, resize
-from .layouts import find_layout
+from .layouts import CAMERAS_REPORT, find_layout
 from .scene import Scene, Views, pinholes
-from .splits import TEST_EVERY, select_evenly, split_by_name
+from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
@@ -56,7 +56,8 @@ def load_scene(
         downscale: how many times smaller the images shall be than those that are read (`images/`, else the largest
             `images_k/`), >= 1; None leaves them as they are.
         hold_out: N >= 2 holds out every Nth photo by name, the first included, whatever the files say; 0 none, and
-            `Scene.test` is empty. None holds out the test views that the files name, or else every eighth photo.
+            `Scene.test` is empty. None holds out the test views that the files name, or else every eighth photo. Where
+            kgs found the cameras (photos.json), the two photos at the ends of the row of cameras are for training.
         background: "black" or "white", put behind images with an alpha channel.
         points: "none", or "model-points" for the points of a COLMAP model that at least two training views observe.
             Their positions were refined with the test views too.
@@ -134,7 +135,12 @@ def _split(
         frames, every = [*frames, *test_frames], TEST_EVERY if hold_out is None else hold_out
         if len(frames) < 2 and every:
             raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
-        train, test = split_by_name([frame.name for frame in frames], train_views, every)
+        names = [frame.name for frame in frames]
+        if every and len(frames) > 2 and (root / CAMERAS_REPORT).is_file():  # of photos that came without cameras
+            centers = torch.stack([frame.pose[:3, 3] for frame in frames]).numpy()
+            train, test = split_between_ends(names, centers, train_views, every)
+        else:
+            train, test = split_by_name(names, train_views, every)
         return [frames[i] for i in train], [frames[i] for i in test]
     chosen: Sequence[int] = select_evenly(len(frames), train_views)
     if train_views == len(found.published) and len(frames) > max(found.published):

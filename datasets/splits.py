@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 TEST_EVERY = 8
 BLENDER_TRAIN_FRAMES = (2, 16, 26, 55, 73, 76, 86, 93)
@@ -19,6 +20,22 @@ def split_by_name(
     order = sorted(range(len(names)), key=lambda i: names[i])
     test = order[::every] if every else []
     pool = [index for position, index in enumerate(order) if not every or position % every]
+    return [pool[i] for i in select_evenly(len(pool), train_views)], test
+
+
+def split_between_ends(
+    names: Sequence[str], centers: NDArray[np.float64], train_views: int | None = None, every: int = TEST_EVERY
+) -> tuple[list[int], list[int]]:
+    """As `split_by_name`, but hold out no photo at an end of the row of cameras: beyond it nothing was seen.
+
+    The ends are the two cameras that lie farthest apart along the main direction in which the centres `(V, 3)` spread.
+    At least one photo is held out, of at least three.
+    """
+    spread = centers - centers.mean(axis=0)
+    along = spread @ np.linalg.svd(spread, full_matrices=False)[2][0]
+    inner = sorted({*range(len(names))} - {int(along.argmin()), int(along.argmax())}, key=lambda i: names[i])
+    test = inner[min(every // 2, (len(inner) - 1) // 2) :: every]
+    pool = sorted({*range(len(names))} - {*test}, key=lambda i: names[i])
     return [pool[i] for i in select_evenly(len(pool), train_views)], test
 
 

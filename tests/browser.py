@@ -101,12 +101,14 @@ class Browser:
             assert time.monotonic() < end, f"after {_SECONDS} s not {expression}: {self.problems}"
             time.sleep(0.05)
 
-    def size(self, width: int, height: int, scheme: str = "light") -> None:
-        """The size of the page in CSS pixels, one of the screen's each, and its colour scheme."""
+    def size(self, width: int, height: int, scheme: str = "light", motion: str = "reduce") -> None:
+        """The size of the page in CSS pixels, one of the screen's each, its colour scheme, and how much may move."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
-        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        wanted = {"prefers-color-scheme": scheme, "prefers-reduced-motion": motion}
+        features = [{"name": name, "value": value} for name, value in wanted.items()]
+        self.call("Emulation.setEmulatedMedia", features=features)
 
     def picture(self, data_url: str) -> np.ndarray[Any, Any]:
         """RGB in [0, 1], `(H, W, 3)`, of a PNG in a data URL."""

@@ -132,6 +132,7 @@ def test_clamp_holds_pixel_by_pixel_in_the_gradient(opacity):
 # -- many layers ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [1 / 250, 0.05])
 def test_twenty_thousand_layers(alpha):
     n = 20000

@@ -65,6 +65,7 @@ def test_gradcheck_of_the_whole_pipeline_along_random_directions(seed, sh_degree
         assert torch.autograd.gradcheck(run, values, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True), INPUTS[i]
 
 
+@pytest.mark.slow
 def test_gradcheck_of_every_single_number():
     inputs = make_inputs(7, sh_degree=1)
     weights = weights_like(render(inputs, **EXACT).image)

@@ -15,8 +15,8 @@ backend_inline = pytest.importorskip("matplotlib_inline.backend_inline")
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 LIMIT = 300  # seconds for a full run
-# Those whose small run takes a second or two; the others run in full only.
-QUICK = ("01_drop_gaussian_layer", "04_error_against_run_time")
+# Those whose small run takes a second; the others run in full only.
+QUICK = ("01_drop_gaussian_layer",)
 
 # What must be true in the kernel after the last cell: of any run, and of a full one.
 CLAIMS = {

@@ -12,7 +12,7 @@ import torch
 from factories import batch, random_camera, random_gaussians
 
 from kgs.page import Picture, write_page
-from kgs.page.figures import facts, headline, measure_table, psnr_plot, without_folders
+from kgs.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
 
 SIZE = (24, 32)
 GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)
@@ -99,7 +99,43 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
     assert head == ["", "held out (2), off", "training (1), off", "held out (2), on"]
     assert rows[0] == ["PSNR [dB]", "22.00 (20.00 to 24.00)", "30.00", "22.75 (21.00 to 24.50)"]
     assert [row[0] for row in rows] == ["PSNR [dB]", "SSIM"]  # none of what nobody measured
-    assert headline(runs)["PSNR [dB], held out (2 views), on"] == "22.75"
+
+
+@pytest.mark.parametrize(
+    ("runs", "expected"),
+    [
+        ({"": {"test": views(20.0, 24.0)}}, "PSNR on 2 photos held out of the training: 22.0 dB, that is clearly the"),
+        (
+            {"off": {"test": views(20.0)}, "on": {"test": views(30.0)}},
+            "1 photo held out of the training: 20.0 dB off, 3",
+        ),
+        (
+            {"": {"train": views(33.0)}},
+            "was not measured (kgs fit with --hold-out 8 measures it). PSNR on the 1 photo it",
+        ),
+        ({"": {"train": views(10.0)}}, "10.0 dB, that is recognisable, with large errors."),
+        ({"": {"views": views(27.0)}}, "PSNR on 1 photo: 27.0 dB, that is close to the photos"),
+        ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "training: not measured."),
+    ],
+)
+def test_one_sentence_says_how_good_it_is(runs: Any, expected: str) -> None:
+    assert expected in verdict(runs)
+
+
+def test_without_measures_nothing_is_said() -> None:
+    assert verdict({}) == verdict({"": {"test": None}}) == ""
+
+
+def test_a_film_is_left_out_before_anything_of_the_splat(tmp_path: Path) -> None:
+    path, film = tmp_path / "index.html", bytes(20_000)
+    tag = '<video controls loop muted playsinline src="data:video/webm;base64,AAAA'
+    assert "<video" not in write(path)
+    bare = len(path.read_bytes())
+    assert tag in write(path, film=film)
+    text = write(path, film=film, most_bytes=bare + 20_000)  # base64 makes 27 000 of them
+    assert "<video" not in text
+    assert "To keep this page small" not in text
+    assert "<video" not in write(path, film=bytes(1_500_001))
 
 
 def test_curves_stay_in_their_picture() -> None:

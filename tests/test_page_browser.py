@@ -16,6 +16,8 @@ from factories import batch, random_camera, random_gaussians, with_camera
 
 import kgs
 from kgs import Gaussians
+from kgs.datasets.scene import Views
+from kgs.io import film as films
 from kgs.page import Picture, write_page
 
 SIZE = (150, 200)  # height, width
@@ -70,10 +72,12 @@ def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
     curve = [{"step": i, "seconds": 1.0 * i, "test_psnr": 20 + i / 9, "train_psnr": 25.0 + i} for i in range(4)]
     metrics = {"test": {**views[0], "views": views}, "train": None, "curve": curve, "seconds": 3.0, "steps": 3}
     rules: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "pictures": pictures}
+    film = path.with_name("film.webm")
+    views_of_film = Views(cameras, renders, tuple(names))
+    assert films.write_film(film, lambda _: renders[:1], views_of_film, 4.0) == ""
     settings = {"init_file": "/photos/someone/points.ply", "a_setting_with_a_long_name": "x" * 60}
-    write_page(
-        path, "A test", gaussians, cameras, names, PARTS, runs={"": metrics}, settings=settings, **rules,
-    )  # fmt: skip
+    shown: dict[str, Any] = {"runs": {"": metrics}, "settings": settings, "film": film.read_bytes()}
+    write_page(path, "A test", gaussians, cameras, names, PARTS, **shown, **rules)
     return path
 
 
@@ -160,6 +164,7 @@ def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -
         mouse("mouseReleased", 40, clickCount=1)
         views.append(browser.run(eye))
 
+    browser.run("document.querySelector('.pyramids').click()")
     drag()
     browser.run("viewer.canvas.focus()")
     for key in ("ArrowUp", "+"):
@@ -204,7 +209,116 @@ def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path)
     for _ in range(30):
         browser.call("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", windowsVirtualKeyCode=37)
     clips.append(browser.run(f"{over}.style.clipPath"))
-    assert clips == ["inset(0px 0px 0px 100%)", "inset(0px 0px 0px 70%)"]
+    assert clips == ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 20%)"]
+    browser.run("document.querySelector('.pair').scrollIntoView()")
+    left, top, width = browser.run(
+        "(() => { const b = document.querySelector('.pair').getBoundingClientRect(); return [b.x, b.y, b.width]; })()"
+    )
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=left + 0.75 * width, y=top + 20)
+    assert browser.run("Number(document.querySelector('.wipe input').value)") == pytest.approx(75, abs=1)
+
+
+TURNED = """(() => {
+  const { up, arc } = viewer.scene, back = viewer.eye.rotation[2].map((value) => -value);
+  return [Math.atan2(dot(up, cross(arc.origin, back)), dot(arc.origin, back)), Math.asin(dot(up, back))];
+})()"""
+
+
+def test_a_drag_ends_a_quarter_beyond_the_cameras_unless_it_roams(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    arc = browser.run("viewer.scene.arc")
+    for sign in (1, -1):
+        for axis, name in enumerate(("yaw", "pitch")):
+            browser.run("viewer.place(viewer.scene.first)")
+            # a drag to the right is a turn to the left
+            step = [0.0, 0.0]
+            step[axis] = sign * (-0.02 if axis == 0 else 0.02)
+            browser.run(f"for (let i = 0; i < 400; i++) viewer.turn({step[0]}, {step[1]})")
+            low, high = arc[name]
+            end = high if sign > 0 else low
+            beyond = sign * (browser.run(TURNED)[axis] - end) / (high - low)
+            assert 0.15 < beyond <= 0.25 + 1e-6, (sign, name)
+    browser.run("viewer.place(viewer.scene.first)")
+    browser.run("viewer.turn(-1e3 * viewer.turnPerPixel(), 0)")  # one long drag stops there, too
+    assert browser.run(TURNED)[0] <= arc["yaw"][1] + 0.25 * (arc["yaw"][1] - arc["yaw"][0]) + 1e-6
+    browser.run("viewer.place(viewer.scene.first); document.querySelector('.roam').click()")
+    assert browser.run("document.querySelector('.roam').getAttribute('aria-pressed')") == "true"
+    browser.run("viewer.turn(-2.5, 0)")
+    assert browser.run(TURNED)[0] == pytest.approx(2.5, abs=0.02)
+
+
+def test_a_drag_across_the_stage_is_the_arc_of_the_cameras(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    low, high = browser.run("viewer.scene.arc.yaw")
+    assert browser.run("viewer.turnPerPixel() * viewer.canvas.clientWidth") == pytest.approx(high - low)
+
+
+def test_the_distance_has_limits(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    start = browser.run("viewer.eye.distance")
+    for factor, limit in ((1.3, 3), (0.7, 0.3)):
+        browser.run(f"for (let i = 0; i < 40; i++) viewer.zoom({factor})")
+        assert browser.run("viewer.eye.distance") == pytest.approx(limit * start)
+
+
+def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, page: Path) -> None:
+    browser.size(1000, 500)
+    browser.open(page, READY)
+    assert browser.run("getComputedStyle(viewer.canvas).touchAction") == "pan-y"
+    browser.run("document.querySelector('.stage').scrollIntoView()")
+    box = (
+        "(() => { const b = viewer.canvas.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+    )
+    x, y = browser.run(box)
+    distance, before = browser.run("viewer.eye.distance"), browser.run("scrollY")
+    wheel: dict[str, Any] = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": 100}
+    browser.call("Input.dispatchMouseEvent", **wheel)
+    browser.wait(f"scrollY > {before}")
+    assert browser.run("viewer.eye.distance") == distance
+    x, y = browser.run(box)
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    before = browser.run("scrollY")
+    browser.call("Input.dispatchMouseEvent", **wheel | {"y": y})
+    browser.wait(f"viewer.eye.distance > {distance}")
+    assert browser.run("scrollY") == before
+
+
+def test_it_sways_until_it_is_touched(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800, motion="no-preference")
+    browser.open(page, READY)
+    place = "JSON.stringify(viewer.eye.position)"
+    start = browser.run(place)
+    browser.wait(f"{place} !== {start!r}")
+    browser.run("document.querySelector('.stage').dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
+    assert not browser.run("viewer.isSwaying")
+    stopped = browser.run(place)
+    browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert browser.run(place) == stopped
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    assert not browser.run("viewer.isSwaying")  # where the system asks for less motion
+
+
+def test_the_cameras_are_hidden_until_they_are_wanted(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    shown = "getComputedStyle(viewer.overlay).display !== 'none'"
+    assert not browser.run(shown)
+    browser.run("document.querySelector('.pyramids').click()")
+    assert browser.run(shown)
+
+
+def test_the_film_plays(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    film = "document.querySelector('video')"
+    browser.wait(f"{film}.readyState >= 2")
+    assert browser.run(f"[{film}.videoWidth, {film}.videoHeight]") == [SIZE[1], SIZE[0]]
+    assert browser.run(f"{film}.duration") == pytest.approx(films.FRAMES / films.RATE, abs=0.01)
 
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from factories import batch, pinhole
@@ -46,6 +48,65 @@ def test_it_opens_at_a_training_camera() -> None:
 
 def test_one_camera_and_no_gaussians() -> None:
     assert first([camera(0.0)], ["training"], MEANS[:0]) == 0
+
+
+def around(*degrees: float, height: float = 0.0) -> dict[str, Any]:
+    """What the viewer gets of cameras at these angles on a circle around the Gaussian, which they look at."""
+    cameras = []
+    for angle in map(math.radians, degrees):
+        place = MEANS[0].double() + 4.0 * torch.tensor([math.sin(angle), -height, -math.cos(angle)]).double()
+        forward = torch.nn.functional.normalize(MEANS[0].double() - place, dim=0)
+        right = torch.nn.functional.normalize(
+            torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
+        )
+        pose = torch.eye(4).double()
+        pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ place
+        cameras.append(pinhole(60, 80, (80.0, 80.0), (39.5, 29.5), 0.0, pose))
+    return viewer_scene(batch(*cameras), ["a"] * len(cameras), ["training"] * len(cameras), MEANS)
+
+
+@pytest.mark.parametrize("degrees", [(-20.0, 0.0, 30.0), (160.0, 180.0, -150.0), (70.0, 90.0, 120.0), (0.0, 50.0)])
+def test_the_arc_is_that_of_the_cameras(degrees: tuple[float, ...]) -> None:
+    arc = around(*degrees)["arc"]
+    low, high = arc["yaw"]
+    assert high - low == pytest.approx(math.radians(50))
+    assert low <= 1e-9
+    assert high >= -1e-9  # the first camera, at 0, is on it
+    assert arc["pitch"] == pytest.approx([-0.15, 0.15])
+
+
+def test_cameras_all_around_set_no_limit() -> None:
+    assert around(0.0, 90.0, 180.0, 270.0)["arc"]["yaw"] is None
+    assert around(0.0, 90.0, 180.0)["arc"]["yaw"] is not None
+
+
+def test_the_arc_reaches_up_to_where_the_cameras_are() -> None:
+    low, high = around(0.0, 120.0, 240.0, height=1.0)["arc"]["pitch"]
+    assert (low + high) / 2 == pytest.approx(math.pi / 4)
+
+
+def test_a_single_camera_has_a_small_arc_also_one_that_looks_down() -> None:
+    assert around(0.0)["arc"]["yaw"] == pytest.approx([-0.15, 0.15])
+    down = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    cameras = pinhole(60, 80, (80.0, 80.0), (39.5, 29.5), 0.0, down.double())
+    arc = viewer_scene(cameras, ["a"], ["photo"], torch.tensor([[0.0, 4.0, 0.0]]))["arc"]
+    assert np.isfinite([*arc["origin"], *arc["yaw"], *arc["pitch"]]).all()
+    assert np.linalg.norm(arc["origin"]) == pytest.approx(1)
+
+
+def test_the_sway_begins_at_the_first_camera_and_passes_them_all() -> None:
+    scene = around(-20.0, 0.0, 30.0)
+    places = np.array([pose["position"] for pose in scene["sway"]])
+    cameras = np.array([camera["position"] for camera in scene["cameras"]])
+    distances = np.linalg.norm(places - cameras[:, None], axis=2)
+    assert distances[scene["first"]].argmin() == 0
+    assert distances.min(axis=1).max() < 0.15
+    steps = np.linalg.norm(np.diff(places, axis=0, append=places[:1]), axis=1)
+    assert steps.max() < 0.3  # also from the last to the first
+    for pose in scene["sway"]:
+        rotation = np.array(pose["rotation"])
+        assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5
 
 
 def test_pyramids_are_smaller_than_the_distance_of_neighbours() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kgs.datasets.splits import BLENDER_TRAIN_FRAMES, select_evenly, split_by_name
+from kgs.datasets.splits import BLENDER_TRAIN_FRAMES, select_evenly, split_between_ends, split_by_name
 
 # Global positions in the name-sorted list; the strings are the tables of the sparse-view literature.
 LLFF = {
@@ -110,3 +110,19 @@ def test_one_view_and_all_views() -> None:
     assert select_evenly(17, 1) == [0]
     assert select_evenly(17, 17) == list(range(17))
     assert select_evenly(17, np.int64(2)) == [0, 16]  # type: ignore[arg-type]  # numpy's integers are none for mypy
+
+
+@pytest.mark.parametrize("every", [2, 3, 4, 8])
+@pytest.mark.parametrize("count", [3, 4, 5, 6, 9, 10, 17])
+def test_photos_at_the_ends_of_the_row_are_never_held_out(count: int, every: int) -> None:
+    rng = np.random.default_rng(count)
+    places = rng.permutation(count)  # names in another order than the cameras
+    angles = np.linspace(-1, 1, count)[places]
+    centers = np.stack([np.sin(angles), 0.1 * rng.uniform(-1, 1, count), np.cos(angles)], 1)
+    names = [f"IMG_{i:02}.jpg" for i in range(count)]
+    train, test = split_between_ends(names, centers, every=every)
+    assert sorted([*train, *test]) == list(range(count))
+    assert 1 <= len(test) <= max(1, -(-count // every))
+    assert not {*test} & {int(places.argmin()), int(places.argmax())}
+    assert [*train] == sorted(train)
+    assert len(split_between_ends(names, centers, 2, every)[0]) == 2

@@ -91,14 +91,23 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     assert run("eval", tmp_path / "moved") == 0
 
 
-def test_of_nine_photos_every_eighth_is_held_out(folder, tmp_path):
+def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
     nine = folder(9)
-    assert run("fit", nine, "-o", tmp_path / "out", *FIT) == 0
-    protocol = json.loads((tmp_path / "out" / "metrics.json").read_text())["protocol"]
-    assert protocol["test"] == ["IMG_0.png", "IMG_8.png"]
-    assert run("fit", nine, "-o", tmp_path / "all", "--hold-out", 0, "--downscale", 1.5, *FIT) == 0
+    assert run("fit", nine, "-o", tmp_path / "all", "--downscale", 1.5, *FIT) == 0
     protocol = json.loads((tmp_path / "all" / "metrics.json").read_text())["protocol"]
     assert (protocol["test"], protocol["image_size"]) == ([], [48, 64])
+    assert run("fit", nine, "-o", tmp_path / "out", "--hold-out", 4, "--size", 48, *FIT) == 0
+    protocol = json.loads((tmp_path / "out" / "metrics.json").read_text())["protocol"]
+    assert protocol["image_size"] == [36, 48]
+    cameras = {
+        view["img_name"]: view["position"] for view in json.loads((tmp_path / "out" / "cameras.json").read_text())
+    }
+    held_out = protocol["test"]
+    assert held_out
+    places = np.array(list(cameras.values()))
+    along = (places - places.mean(0)) @ np.linalg.svd(places - places.mean(0))[2][0]
+    ends = [list(cameras)[int(i)] for i in (along.argmin(), along.argmax())]
+    assert not {*held_out} & {*ends}
 
 
 def test_photos_are_told_from_scenes(folder, tmp_path, asked):

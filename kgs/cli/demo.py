@@ -71,6 +71,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path) -> dict[str, dict[str
     from kgs.fit.trainer import Trainer
     from kgs.io.figures import write_curve, write_sheet
     from kgs.io.json_files import write_json
+    from kgs.io.outputs import FILM
     from kgs.io.ply import save_ply
     from kgs.page.fit_page import PAGE, write_fit_page
 
@@ -95,5 +96,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path) -> dict[str, dict[str
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
     write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
     notes = [f"The viewer and the sliders show the fit {title}."]
-    write_fit_page(out / PAGE, "kgs demo", scene, trainer.shown, trainer.near_plane, drawn, measured, notes=notes)
+    write_fit_page(
+        out / PAGE, "kgs demo", scene, trainer.shown, trainer.near_plane, drawn, measured, notes=notes, film=out / FILM
+    )
     return runs

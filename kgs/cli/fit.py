@@ -14,6 +14,8 @@ from kgs.io.console import VIEWER, as_line, say, say_next
 from .inputs import load
 from .options import Existing, Out
 
+SMALLEST = 32  # pixels of the longer side
+
 
 def defaults(words: list[str]) -> dict[str, Any]:
     """The numbers that a fit has unless an option says else: those of --preset and --fast."""
@@ -32,6 +34,7 @@ def fit(
     out: Out,
     views: int | None = None,
     hold_out: int | None = None,
+    size: int | None = None,
     downscale: float | None = None,
     background: Background = "black",
     preset: Literal["auto", "paper", "plain"] = "auto",
@@ -44,7 +47,7 @@ def fit(
 
     For example:
       kgs fit PHOTOS -o OUT
-      kgs fit fern -o fern-3 --views 3 --downscale 2
+      kgs fit fern -o fern-3 --views 3 --size 504
 
     Args:
         scene: a folder of 3 or more photos, whose cameras are found first (extra sfm) and written to the output folder
@@ -53,8 +56,9 @@ def fit(
             metrics.json, test/*.png, curve.png, config.json and the checkpoints.
         views: training views, spread over the views that are not held out; all of them unless given.
         hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
-            scene's files name, or else every eighth; of fewer than 9 unposed photos none.
-        downscale: shrink the photos by this factor; unposed ones on a CPU to 504 pixels unless given.
+            scene's files name, or else every eighth; of unposed photos none.
+        size: shrink the photos to this many pixels on their longer side; unposed ones on a CPU to 504 unless given.
+        downscale: shrink the photos by this factor, in the place of --size.
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
             counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
@@ -64,6 +68,7 @@ def fit(
         config: every number of the fit.
     """
     del preset, fast  # `defaults` has read them
+    from kgs.datasets import load_scene
     from kgs.datasets.layouts import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
@@ -77,6 +82,10 @@ def fit(
 
     from .unposed import find_scene, is_unposed, settle
 
+    if size is not None and downscale is not None:
+        raise ValueError("size: expected --size or --downscale, got both")
+    if size is not None and size < SMALLEST:
+        raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     check_folder(out, replaced_files(out), scene, make=False)
@@ -85,9 +94,12 @@ def fit(
     request["points"] = config.init if config.init == "model-points" else "none"
     place = out
     if unposed := is_unposed(scene):
-        request, place = find_scene(scene, out, request, config)
+        request, place = find_scene(scene, out, request, config, size)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
+    elif size is not None:
+        height, width = load_scene(scene, photos=False).train.images.shape[-2:]
+        request["downscale"] = max(1.0, max(height, width) / size)
     loaded = load(request, place)
     height, width = loaded.train.images.shape[-2:]
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")

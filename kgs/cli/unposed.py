@@ -10,7 +10,6 @@ from kgs.io.console import each, say
 from kgs.io.results_folder import locked
 
 LONGEST = 504  # pixels of the longer side in a fit on a CPU
-FEW = 9  # photos: of fewer none is held out
 
 
 def is_unposed(scene: Path) -> bool:
@@ -20,7 +19,9 @@ def is_unposed(scene: Path) -> bool:
     return scene.is_dir() and nearest_scene(scene) is None
 
 
-def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConfig) -> tuple[dict[str, Any], Path]:
+def find_scene(
+    photos: Path, out: Path, request: dict[str, Any], config: FitConfig, size: int | None = None
+) -> tuple[dict[str, Any], Path]:
     """Find the cameras of unposed photos; returns how the scene is to be loaded, as config.json has it, and from where.
 
     That folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
@@ -28,8 +29,9 @@ def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConf
     Args:
         photos: the folder of the photos.
         out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
-        request: what the user asked for; None stands for what was left open.
-        config: of the fit; on a CPU the photos are fitted at `LONGEST` pixels unless `request` says else.
+        request: what the user asked for; None stands for what was left open. No photo is held out unless it says so.
+        config: of the fit; on a CPU the photos are fitted at `LONGEST` pixels unless `request` or `size` says else.
+        size: longer side of the photos in the fit, in pixels.
 
     Raises:
         DataError: as of `pose_photos`.
@@ -37,11 +39,11 @@ def find_scene(photos: Path, out: Path, request: dict[str, Any], config: FitConf
     from kgs.sfm import pose_photos
 
     report = pose_photos(photos, out, seed=config.seed, wait=True, stage=each, say=say)
-    count, longest = len(report["photos"]), max(report["size"])
-    if request["hold_out"] is None and count < FEW:
-        request = request | {"hold_out": 0}
-    downscale = _downscale(request["downscale"], longest, config)
-    request = request | {"downscale": downscale, "scene": ".", "title": photos.resolve().name}
+    if size is None and request["downscale"] is None and config.device == "cpu":
+        size = LONGEST
+    request = request | {"hold_out": request["hold_out"] or 0, "scene": ".", "title": photos.resolve().name}
+    if size is not None:
+        request["downscale"] = max(1.0, max(report["size"]) / size)
     return request, Path(report["folder"])
 
 
@@ -51,8 +53,3 @@ def settle(out: Path) -> None:
 
     with locked(out):
         photo_staging(out).complete()
-
-
-def _downscale(asked: float | None, longest: float, config: FitConfig) -> float | None:
-    """By how much posed photos are shrunk for the fit; `longest` is their longer side in pixels."""
-    return max(1.0, longest / LONGEST) if asked is None and config.device == "cpu" else asked

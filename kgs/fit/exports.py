@@ -8,6 +8,7 @@ from kgs.io.console import each
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
 from kgs.io.json_files import write_json
+from kgs.io.outputs import FILM
 
 from .trainer import Trainer
 
@@ -18,5 +19,5 @@ def write_exports(trainer: Trainer, folder: Path) -> None:
     write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset))
     save_glb(folder / "splat.glb", model, upright(scene.train.cameras.extrinsics), scene.offset)
     depth = typical_depths(model.means, scene.train.cameras)[1]
-    if note := write_film(folder / "turntable.webm", trainer.render, scene.train, depth, each):
+    if note := write_film(folder / FILM, trainer.render, scene.train, depth, each):
         trainer.note(note)

@@ -20,7 +20,8 @@ from .images import eight_bits
 from .json_files import write_whole
 from .ownership import MARK, is_own
 
-EXPORTS = ("cameras.json", "splat.glb", "turntable.webm")  # for other programs
+FILM = "turntable.webm"
+EXPORTS = ("cameras.json", "splat.glb", FILM)  # for other programs
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
 _LONGEST = 120  # bytes of a picture's name

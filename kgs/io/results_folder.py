@@ -8,13 +8,13 @@ from pathlib import Path
 from kgs.errors import DataError
 
 from .json_files import read_json
-from .outputs import EXPORTS
+from .outputs import EXPORTS, FILM
 from .ownership import is_own
 from .staging import Staging
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
-_OPTIONAL = (PREVIOUS, "turntable.webm")
+_OPTIONAL = (PREVIOUS, FILM)
 
 
 def fit_staging(out: Path) -> Staging:

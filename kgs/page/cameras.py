@@ -1,5 +1,6 @@
-"""The photos' cameras for the viewer: intrinsics, poses, the depth of what they see, and which way is up."""
+"""The photos' cameras for the viewer: lenses, poses, what they see, which way is up, and how far they reach around."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,10 +10,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.geometry import camera_centers, common_up
+from kgs.io.film import tour
 
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # depth of a pyramid, as a share of the median distance between neighbouring cameras
 _LARGEST_PYRAMID = 0.1  # its upper bound, as a share of the median depth of the scene
+_LEAST_ARC = 0.3  # radians
+_RING_GAP = 2 * math.pi / 3  # cameras with smaller gaps between them surround the scene
+_SWAY_POSES = 60
 
 
 def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[str], means: Tensor) -> dict[str, Any]:
@@ -33,6 +38,8 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         first: index of the camera that the viewer opens at, the training camera nearest the mean pose.
         up: the upright direction in the world, of length 1.
         pyramid: depth of the pyramids that stand for the cameras, in world units.
+        arc: how far around the scene the cameras reach, see `_arc`.
+        sway: rotations and positions of a closed path through the training cameras, see :func:`kgs.io.film.tour`.
     """
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()
@@ -53,11 +60,17 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         )
     depth = float(np.median([camera["distance"] for camera in found]))
     rotations = np.array([camera["rotation"] for camera in found])
+    training = [part != "test" for part in parts]
+    training = training if any(training) else [True] * len(parts)
+    first = _nearest_mean_pose(rotations, positions / depth, training)
+    up = common_up(cameras.extrinsics)
     return {
         "cameras": found,
-        "first": _nearest_mean_pose(rotations, positions / depth, [part != "test" for part in parts]),
-        "up": common_up(cameras.extrinsics).tolist(),
+        "first": first,
+        "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
+        "arc": _arc(rotations, positions, first, found[first]["distance"], up.numpy()),
+        "sway": _sway(tour(cameras.extrinsics[training], _SWAY_POSES, depth).numpy(), positions[first]),
     }
 
 
@@ -78,17 +91,66 @@ def visible_points(points: Array, k: Array, pose: Array, size: NDArray[np.intp],
 
 
 def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bool]) -> int:
-    """Index of the training camera whose pose is nearest the mean of the training poses; of all, without training ones.
+    """Index of the training camera whose pose is nearest the mean of the training poses.
 
     Args:
         rotations: world to camera, `(C, 3, 3)`.
         positions: `(C, 3)`, in depths of the scene: to move by 0.1 of the depth counts about as much as to turn by 0.1.
         training: which cameras took training photos, C values.
     """
-    chosen = np.flatnonzero(training) if any(training) else np.arange(len(positions))
+    chosen = np.flatnonzero(training)
     # Rotation matrices that differ by a small angle have a distance of sqrt(2) times it.
     poses = np.concatenate([rotations.reshape(-1, 9), 2**0.5 * positions], axis=1)[chosen]
     return int(chosen[np.linalg.norm(poses - poses.mean(axis=0), axis=1).argmin()])
+
+
+def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Array) -> dict[str, Any]:
+    """The angles from which the cameras see the scene, in radians.
+
+    An eye looks from the opposite of its forward direction. So does a camera; it also shows what an eye would see that
+    stood in its place and looked at the point in front of the first camera, at `distance`.
+
+    Returns:
+        origin: the horizontal direction of yaw 0, from which the first camera looks, `(3,)`.
+        yaw: smallest and largest angle about `up`, counterclockwise; None where the cameras surround the scene.
+        pitch: smallest and largest angle above the horizon.
+    """
+    focus = positions[first] + distance * rotations[first, 2]
+    beside = positions - focus
+    beside = beside[np.linalg.norm(beside, axis=1) > 1e-6 * distance]
+    origin = -rotations[first, 2]
+    origin = origin - (origin @ up) * up
+    if np.linalg.norm(origin) < 1e-6:  # it looks straight down: the top of its picture is where it looks to
+        origin = rotations[first, 1] - (rotations[first, 1] @ up) * up
+    origin /= np.linalg.norm(origin)
+    directions = np.concatenate([-rotations[:, 2], beside / np.linalg.norm(beside, axis=1, keepdims=True)])
+    pitches = np.arcsin((directions @ up).clip(-1, 1))
+    yaws = np.sort(np.arctan2(np.cross(origin, directions) @ up, directions @ origin))
+    gaps = np.diff(yaws, append=yaws[0] + 2 * math.pi)
+    widest = int(gaps.argmax())  # the arc is all but this gap
+    low, high = yaws[(widest + 1) % len(yaws)], yaws[widest]
+    if low > high:
+        low, high = (low - 2 * math.pi, high) if low > 0 else (low, high + 2 * math.pi)
+    return {
+        "origin": origin.tolist(),
+        "yaw": None if gaps[widest] < _RING_GAP else _widened(float(low), float(high)),
+        "pitch": _widened(float(pitches.min()), float(pitches.max())),
+    }
+
+
+def _widened(low: float, high: float) -> list[float]:
+    """Both ends of an arc, at least `_LEAST_ARC` apart."""
+    more = max(0.0, _LEAST_ARC - (high - low)) / 2
+    return [low - more, high + more]
+
+
+def _sway(poses: Array, start: Array) -> list[dict[str, Any]]:
+    """World-to-camera poses `(F, 4, 4)` of a closed path as rotations and positions; the one nearest `start` first."""
+    rotations = poses[:, :3, :3]
+    positions = -np.einsum("fji,fj->fi", rotations, poses[:, :3, 3])
+    begin = int(np.linalg.norm(positions - start, axis=1).argmin())
+    order = [(begin + i) % len(poses) for i in range(len(poses))]
+    return [{"rotation": rotations[i].round(6).tolist(), "position": positions[i].round(6).tolist()} for i in order]
 
 
 def _pyramid_depth(positions: Array, depth: float) -> float:

@@ -13,8 +13,15 @@ MEASURES = {
     "ssim_zero_padded": ("SSIM (zero padded)", 3),
     "lpips_vgg": ("LPIPS", 3),
 }
-# What sets of views are called, by their keys in metrics.json; the first one that was measured is the headline.
+# What sets of views are called, by their keys in metrics.json; the first one that was measured is told.
 PARTS = {"test": "held out", "train": "training", "views": "photos"}
+# What a PSNR of at least so many dB looks like.
+_LEVELS = (
+    (32.0, "hard to tell from the photos at a glance"),
+    (26.0, "close to the photos, without their finest detail"),
+    (21.0, "clearly the same scene, soft or wrong in places"),
+    (-math.inf, "recognisable, with large errors"),
+)
 # The folders of an absolute path inside a text.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[\\/](?:[^\\/\s]+[\\/])+(?=[^\\/\s])")
 # The plot, in the units of its SVG: its size, and the borders of the area with the lines.
@@ -48,21 +55,36 @@ def facts(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return found
 
 
-def headline(runs: Runs) -> dict[str, str]:
-    """The mean of each measure over the held-out views of each run, or over training views if none were held out."""
-    found = dict[str, str]()
-    for run, metrics in runs.items():
-        part = next((part for part in PARTS if metrics.get(part)), None)
-        if part is None:
-            continue
-        count = len(metrics[part]["views"])
-        views = f"{count} view" if count == 1 else f"{count} views"
-        for key, (title, digits) in MEASURES.items():
-            value = metrics[part].get(key)
-            if value is not None and key != "ssim_zero_padded":
-                name = _with_run(f"{title}, {PARTS[part]} ({views})", run)
-                found[name] = f"{value:.{digits}f}"
-    return found
+def verdict(runs: Runs) -> str:
+    """How good the fit is in one or two sentences: by the PSNR of the held-out views, else by that of training views.
+
+    What a PSNR means in words is that of the last run with one; see docs/page.md for the limits of such words.
+    """
+    part = next((part for part in PARTS if any(metrics.get(part) for metrics in runs.values())), None)
+    if part is None:
+        return ""
+    measured = {run: metrics[part] for run, metrics in runs.items() if metrics.get(part)}
+    levels = {run: values["psnr"] for run, values in measured.items() if values.get("psnr") is not None}
+    count = len(next(iter(measured.values()))["views"])
+    photos = "photo" if count == 1 else "photos"
+    which = {
+        "test": f"{count} {photos} held out of the training",
+        "train": f"the {count} {photos} it was trained on",
+        "views": f"{count} {photos}",
+    }[part]
+    text = f"PSNR on {which}: not measured."
+    if levels:
+        numbers = ", ".join(_with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
+        text = f"PSNR on {which}: {numbers}, that is {_in_words(list(levels.values())[-1])}."
+    if part != "train":
+        return text
+    unknown = "No photo was held out, so how good new views are was not measured"
+    return f"{unknown} (kgs fit with --hold-out 8 measures it). {text}"
+
+
+def _in_words(psnr: float) -> str:
+    """What the numbers of `_LEVELS` stand for."""
+    return next(words for least, words in _LEVELS if psnr >= least)
 
 
 def measure_table(runs: Runs) -> tuple[list[str], list[list[str]]]:

@@ -18,6 +18,7 @@ from kgs.fit.run import Finished
 from kgs.fit.saved import SavedFit
 from kgs.io.console import each, say
 from kgs.io.json_files import read_json
+from kgs.io.outputs import FILM
 from kgs.io.ownership import is_own
 from kgs.model import GaussianModel
 
@@ -43,6 +44,7 @@ def write_fit_page(
     notes: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
     report: Path | None = None,
+    film: Path | None = None,
 ) -> str:
     """Write the page of one or more fits of a scene; the viewer shows one of them.
 
@@ -57,9 +59,10 @@ def write_fit_page(
         shown: the views to show beside their renders; only these need pixels. None: up to `MOST_PICTURES` test views,
             or training views if there are no test views.
         words: what training and test views are called.
-        notes: sentences to show below the measures.
+        notes: sentences to show below the one that says how good the fit is.
         settings: the content of config.json.
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
+        film: a WebM file to show; ignored if kgs did not write it.
 
     Returns:
         What was reduced to respect the page's limit of size, in words; "" for nothing.
@@ -80,9 +83,9 @@ def write_fit_page(
             found = read_json(report)
     with torch.no_grad():
         gaussians = model()
-    sentences = [*notes]
+    remarks = list[str]()
     for run, metrics in runs.items():
-        sentences += [*_coverage_note(metrics, run), *_poses_note(metrics)]
+        remarks += [*_coverage_note(metrics, run), *_poses_note(metrics)]
     return write_page(
         path,
         title,
@@ -94,9 +97,11 @@ def write_fit_page(
         background=scene.background,
         pictures=pictures,
         pictures_note=_pictures_note(len(shown), len(views), word),
+        film=film.read_bytes() if film is not None and is_own(film) else b"",
         runs=runs,
         left_out=left_out(next(iter(runs.values()), {}).get("needs") or {}),
-        notes=sentences,
+        notes=notes,
+        remarks=remarks,
         settings=_settings(settings or {}),
         report=_report_facts(found),
         weights=lambda: contributions(model, scene.train, near_plane),
@@ -131,8 +136,8 @@ def _write_page_of(
     """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
     request = settings["request"]
     title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
-    report = scene.root / CAMERAS_REPORT
-    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, settings=settings, report=report)
+    files = {"report": scene.root / CAMERAS_REPORT, "film": path.with_name(FILM)}
+    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, settings=settings, **files)
 
 
 def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:

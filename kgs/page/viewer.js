@@ -1,5 +1,6 @@
 "use strict";
-// The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos.
+// The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos. Until it is touched
+// it sways slowly along a path through these cameras. It turns as far around the splat as they do, unless it may roam.
 // OpenCV axes: the rows of a rotation are the directions right, down and forward in the world.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -12,7 +13,12 @@ const clamped = (value, least, most) => Math.min(most, Math.max(least, value));
 const CLICK_PIXELS = 4;  // a pointer that moves farther than this drags
 const FLIGHT_MILLISECONDS = 700;
 const STEEPEST = 1.5;  // largest angle above or below the horizon, in radians
-const TURN_PER_PIXEL = 0.005;  // radians
+const ROAMING_ARC = Math.PI;  // radians that a drag across the stage turns where the cameras set no limit
+const SOFT_END = 0.25;  // how far beyond the arc of the cameras the eye can turn, as a share of the arc
+const LEAST_ZOOM = 0.3, MOST_ZOOM = 3;  // of the distance at the camera that the eye was last placed at
+const SWAY_SECONDS_PER_CAMERA = 4;
+const SWAY_BEGIN_SECONDS = 2;
+const LONGEST_FRAME_SECONDS = 0.1;  // of the sway: it goes on where it was after a pause
 const TURN_PER_KEY = 0.06;
 const MOVE_PER_KEY = 20;  // pixels
 const ZOOM_PER_KEY = 0.9;
@@ -29,6 +35,15 @@ function rotated(vector, axis, angle) {
   return vector.map((value, i) => cosine * value + sine * side[i] + along * axis[i]);
 }
 
+// The part of a change of an angle that is left near the ends of an arc: beyond them less and less, down to nothing.
+function softened(change, angle, [low, high]) {
+  const soft = SOFT_END * (high - low);
+  const beyond = change > 0 ? angle - high : low - angle;
+  const share = clamped(1 - beyond / soft, 0, 1);
+  const [least, most] = [Math.min(angle, low - soft), Math.max(angle, high + soft)];
+  return clamped(angle + share * change, least, most) - angle;
+}
+
 class Viewer {
   // `scene` is what `viewer_scene` of kgs/page/cameras.py returns.
   constructor(frame, renderer, scene) {
@@ -41,10 +56,14 @@ class Viewer {
     this.flight = 0;  // number of the latest movement: an earlier flight stops
     this.dragged = 0;  // pixels since the pointer was pressed
     this.pyramids = scene.cameras.map((camera, index) => this.addPyramid(camera, index));
+    this.isRoaming = false;
+    this.isEngaged = false;  // the last press of a pointer was on the stage
+    this.isSwaying = false;
     this.place(scene.first);
     this.listen(frame);
     new ResizeObserver(() => this.requestDraw()).observe(this.canvas);
     this.draw();
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.sway();
   }
 
   // -- The eye: rotation, position, distance to the point that it turns around, and the intrinsics of a photo's camera.
@@ -53,12 +72,14 @@ class Viewer {
   place(index) {
     const { rotation, position, distance, size, focal, centre } = this.scene.cameras[index];
     this.eye = { rotation, position, distance, size, focal, centre };
+    this.usualDistance = distance;
     this.choice.value = index;
   }
 
   // Moves the eye to a camera smoothly.
   flyTo(index) {
     const from = this.eye;
+    this.isSwaying = false;
     this.place(index);
     const to = this.eye;
     const begin = performance.now();
@@ -89,8 +110,40 @@ class Viewer {
     };
   }
 
+  // Moves the eye along the path through the training cameras until something else moves it.
+  sway() {
+    const { cameras, first, sway: path } = this.scene;
+    const stops = Math.min(12, cameras.filter((camera) => camera.part !== "test").length);  // as in kgs/io/film.py
+    const posesPerSecond = path.length / (SWAY_SECONDS_PER_CAMERA * Math.max(2, stops));
+    const begin = this.eye;
+    let isVisible = true, seconds = 0, before = null;
+    const observer = new IntersectionObserver((entries) => {
+      isVisible = entries[entries.length - 1].isIntersecting;
+    });
+    observer.observe(this.canvas);
+    this.isSwaying = true;
+    const step = (now) => {
+      if (!this.isSwaying) {
+        observer.disconnect();
+        return;
+      }
+      if (isVisible && before !== null) {
+        seconds += Math.min(LONGEST_FRAME_SECONDS, (now - before) / 1000);
+        const place = posesPerSecond * seconds;
+        const [from, to] = [0, 1].map((next) => ({ ...begin, ...path[(Math.floor(place) + next) % path.length] }));
+        const begun = Math.min(1, seconds / SWAY_BEGIN_SECONDS);
+        this.eye = this.between(begin, this.between(from, to, place % 1), begun * begun * (3 - 2 * begun));
+        this.draw();
+      }
+      before = now;
+      requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+
   change(values) {
     this.flight++;
+    this.isSwaying = false;
     this.eye = { ...this.eye, ...values };
     this.requestDraw();
   }
@@ -100,19 +153,37 @@ class Viewer {
     return add(this.eye.position, this.eye.rotation[2], this.eye.distance);
   }
 
+  // Radians that the eye turns by for one pixel of a drag: across the stage it is the arc of the cameras.
+  turnPerPixel() {
+    const { yaw } = this.scene.arc;
+    return (yaw && !this.isRoaming ? yaw[1] - yaw[0] : ROAMING_ARC) / Math.max(1, this.canvas.clientWidth);
+  }
+
   // Turns the eye around its target by angles in radians: `yaw` about the upright axis, `pitch` about the horizontal.
   turn(yaw, pitch) {
     const { rotation, distance } = this.eye;
-    const { up } = this.scene;
-    const elevation = Math.asin(clamped(dot(up, rotation[2]), -1, 1));
-    const change = clamped(elevation - pitch, -STEEPEST, STEEPEST) - elevation;
-    const rows = rotation.map((row) => rotated(rotated(row, rotation[0], change), up, -yaw));
+    const { up, arc } = this.scene;
+    const back = rotation[2].map((value) => -value);
+    const elevation = Math.asin(clamped(dot(up, back), -1, 1));
+    let [around, raised] = [-yaw, pitch];
+    if (!this.isRoaming) {
+      raised = softened(raised, elevation, arc.pitch);
+      if (arc.yaw) {
+        const angle = Math.atan2(dot(up, cross(arc.origin, back)), dot(arc.origin, back));
+        const turns = Math.round(((arc.yaw[0] + arc.yaw[1]) / 2 - angle) / (2 * Math.PI));
+        around = softened(around, angle + 2 * Math.PI * turns, arc.yaw);
+      }
+    }
+    raised = clamped(elevation + raised, -STEEPEST, STEEPEST) - elevation;
+    const rows = rotation.map((row) => rotated(rotated(row, rotation[0], -raised), up, around));
     this.change({ rotation: rows, position: add(this.target(), rows[2], -distance) });
   }
 
   // Multiplies the distance to the target.
   zoom(factor) {
-    const distance = this.eye.distance * factor;
+    const distance = clamped(
+      this.eye.distance * factor, LEAST_ZOOM * this.usualDistance, MOST_ZOOM * this.usualDistance,
+    );
     this.change({ distance, position: add(this.target(), this.eye.rotation[2], -distance) });
   }
 
@@ -225,7 +296,11 @@ class Viewer {
       const [a, b = a] = [...pointers.values()];
       return { middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], spread: Math.hypot(a[0] - b[0], a[1] - b[1]) };
     };
+    document.addEventListener("pointerdown", (event) => {
+      this.isEngaged = stage.contains(event.target);
+    });
     stage.addEventListener("pointerdown", (event) => {
+      this.isSwaying = false;
       if (!pointers.size) this.dragged = 0;
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
     });
@@ -240,7 +315,7 @@ class Viewer {
       // Captured earlier, a pyramid would not get its click.
       if (this.dragged > CLICK_PIXELS) stage.setPointerCapture(event.pointerId);
       if (pointers.size > 1 || event.shiftKey || event.buttons > 1) this.move(x, y);
-      else this.turn(TURN_PER_PIXEL * x, TURN_PER_PIXEL * y);
+      else this.turn(this.turnPerPixel() * x, this.turnPerPixel() * y);
       if (pointers.size > 1 && after.spread > 0) this.zoom(before.spread / after.spread);
     });
     for (const end of ["pointerup", "pointercancel"]) {
@@ -248,6 +323,7 @@ class Viewer {
     }
     stage.addEventListener("contextmenu", (event) => event.preventDefault());
     stage.addEventListener("wheel", (event) => {
+      if (!this.isEngaged && !document.fullscreenElement) return;  // the page scrolls
       event.preventDefault();
       const logarithm = ZOOM_PER_WHEEL_PIXEL * event.deltaY;
       this.zoom(Math.exp(clamped(logarithm, -MOST_ZOOM_PER_WHEEL_EVENT, MOST_ZOOM_PER_WHEEL_EVENT)));
@@ -270,6 +346,11 @@ class Viewer {
   listenToTools(frame) {
     this.choice.addEventListener("change", () => this.flyTo(Number(this.choice.value)));
     frame.querySelector(".start").addEventListener("click", () => this.flyTo(this.scene.first));
+    const roam = frame.querySelector(".roam");
+    roam.addEventListener("click", () => {
+      this.isRoaming = !this.isRoaming;
+      roam.setAttribute("aria-pressed", String(this.isRoaming));
+    });
     const pyramids = frame.querySelector(".pyramids");
     pyramids.addEventListener("click", () => {
       const hidden = this.overlay.toggleAttribute("hidden");

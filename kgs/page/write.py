@@ -16,12 +16,13 @@ from kgs.io.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 
 from .cameras import viewer_scene
-from .data import pack
-from .figures import facts, headline, measure_table, psnr_plot, without_folders
+from .data import Packed, pack
+from .figures import facts, measure_table, psnr_plot, verdict, without_folders
 from .pictures import GAIN, Picture, encoded
 
 MOST_BYTES = 8_000_000  # of a page
 _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
+_FILM_BYTES = 1_500_000
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
 _FILES = [
     "style.css",
@@ -48,9 +49,11 @@ def write_page(
     background: Tensor,
     pictures: Sequence[Picture] = (),
     pictures_note: str = "",
+    film: bytes = b"",
     runs: Mapping[str, Mapping[str, Any]] | None = None,
     left_out: str = "",
     notes: Sequence[str] = (),
+    remarks: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
     report: Mapping[str, Any] | None = None,
     weights: Callable[[], Tensor] | None = None,
@@ -76,9 +79,12 @@ def write_page(
         background: colour behind the splat, `(3,)` in [0, 1].
         pictures: photos with renders, `kgs.page.Picture`.
         pictures_note: a sentence that says which photos these are.
+        film: the content of a WebM file; b"" for none. It is left out where it is larger than 1.5 MB, or where
+            anything of the splat would have to be.
         runs: the content of metrics.json by the name of the run; "" if there is only one run.
         left_out: what the fit left out, and why.
-        notes: sentences to show below the measures.
+        notes: sentences to show below the one that says how good the fit is.
+        remarks: sentences to show below the table of measures.
         settings: the settings of the fit.
         report: facts about how the cameras were found.
         weights: returns the contribution of each Gaussian, `(N,)`. It is called if Gaussians must be left out.
@@ -106,9 +112,9 @@ def write_page(
         "version": __version__,
         "aspect": f"{width} / {height}",
         "scene": scene,
-        "headline": headline(runs),
-        "nothing_held_out": bool(first_run.get("train")) and not first_run.get("test"),
+        "verdict": verdict(runs),
         "notes": [without_folders(note) for note in notes],
+        "remarks": [without_folders(remark) for remark in remarks],
         "measures_head": measures_head,
         "measures": measures,
         "plot": psnr_plot(runs),
@@ -136,8 +142,15 @@ def write_page(
         html: str = template.render(**context, **words, data=Markup(data.replace("<", "\\u003c")))
         return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
 
-    room = max(0, most_bytes - len(page({}, {})) - _LAYOUT_BYTES)
-    packed = pack(gaussians, cameras, room * 3 // 4, weights, near_plane)  # base64 turns 3 bytes into 4
+    def packed_beside(film: str) -> Packed:
+        context["film"] = film
+        room = max(0, most_bytes - len(page({}, {})) - _LAYOUT_BYTES)
+        return pack(gaussians, cameras, room * 3 // 4, weights, near_plane)  # base64 turns 3 bytes into 4
+
+    has_film = 0 < len(film) <= _FILM_BYTES
+    packed = packed_beside("data:video/webm;base64," + base64.b64encode(film).decode() if has_film else "")
+    if has_film and packed.left_out:
+        packed = packed_beside("")
     content = base64.b64encode(packed.content).decode()
     splat = {"layout": packed.layout, "content": content}
     words = {
