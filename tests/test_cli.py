@@ -144,6 +144,8 @@ def test_bare_photos_need_poses(tmp_path, capsys):
         (["fit", "{scene}", "-o", "{scene}/transforms_train.json"], "expected a folder for results"),
         (["fit", "{scene}", "-o", "{scene}/transforms_train.json/below"], "expected a folder for results"),
         (["fit", "{scene}", "-o", "{out}", "--downscale", "0"], "--downscale: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--size", "31"], "--size: expected at least 32 pixels, got 31"),
+        (["fit", "{scene}", "-o", "{out}", "--size", "48", "--downscale", "2"], "--size or --downscale, got both"),
         (["demo", "-o", "{out}", "--steps", "0"], "--steps: expected"),
         (["demo", "-o", "{out}", "--device", "foo"], "--device: expected"),
         (["demo", "-o", "{out}", "--size", "11", "40"], "--size: expected"),

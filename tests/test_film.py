@@ -60,6 +60,10 @@ def angles(a: Tensor, b: Tensor) -> Tensor:
     return cosine.clamp(-1, 1).acos().rad2deg()
 
 
+def evenly(frames: int) -> Any:
+    return np.arange(frames) / frames
+
+
 PATHS = {
     "ring of 3": ring(3),
     "ring of 8": ring(8),
@@ -71,7 +75,7 @@ PATHS = {
 
 @pytest.mark.parametrize("poses", PATHS.values(), ids=PATHS)
 def test_the_path_passes_each_camera_and_is_smooth(poses: Tensor) -> None:
-    path = tour(poses, 2000, 1.0)
+    path = tour(poses, evenly(2000), 1.0)
     for pose in poses:
         nearest = int((path - pose).abs().amax((1, 2)).argmin())
         assert (centers(path)[nearest] - centers(pose[None])[0]).norm() < 0.02
@@ -86,7 +90,7 @@ def test_the_path_passes_each_camera_and_is_smooth(poses: Tensor) -> None:
 
 def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
     poses = ring(5)
-    path = tour(poses, 100, 1.0)
+    path = tour(poses, evenly(100), 1.0)
     places = centers(path)
     radii, lengths = places.norm(dim=1), centers(poses).norm(dim=1)
     assert (lengths.min() - 0.05 < radii).all()  # a chord of the ring would come to 2.4
@@ -98,19 +102,28 @@ def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
 
 def test_cameras_side_by_side_are_never_left() -> None:
     poses = facing(6)
-    places = centers(tour(poses, 300, 1.0))
+    places = centers(tour(poses, evenly(300), 1.0))
     assert (places >= centers(poses).amin(0) - 1e-9).all()
     assert (places <= centers(poses).amax(0) + 1e-9).all()
 
 
+def test_the_film_begins_and_ends_slowly_and_has_one_speed_between() -> None:
+    shares = film._eased(np.linspace(0, 1, 1001))
+    assert (shares[0], shares[-1]) == pytest.approx((0, 1))
+    speeds = np.diff(shares) * 1000
+    assert speeds[[0, -1]] == pytest.approx(0, abs=0.02)
+    assert speeds[120:880] == pytest.approx(1 / 0.88)
+    assert np.diff(speeds[:120]).min() > 0
+
+
 def test_the_round_trip_is_short() -> None:
-    assert centers(tour(ring(12), 120, 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.2
-    assert centers(tour(ring(40), 120, 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.3
+    assert centers(tour(ring(12), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.2
+    assert centers(tour(ring(40), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.3
 
 
 def test_a_single_camera_sways_and_keeps_its_target() -> None:
     pose = ring(7)[2]
-    path = tour(pose[None], 60, depth=4.0)
+    path = tour(pose[None], evenly(60), depth=4.0)
     torch.testing.assert_close(path[0], pose)
     target = torch.linalg.inv(pose) @ torch.tensor([0.0, 0.0, 4.0, 1.0]).double()
     seen = path @ target
@@ -120,7 +133,7 @@ def test_a_single_camera_sways_and_keeps_its_target() -> None:
 
 
 def test_cameras_at_one_place_are_no_trouble() -> None:
-    assert tour(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
+    assert tour(facing(1).repeat(3, 1, 1), evenly(10), 1.0).isfinite().all()
 
 
 def views_of(size: tuple[int, int]) -> Views:
@@ -157,12 +170,32 @@ def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, size: Any,
         frames.append(torch.from_numpy(np.ascontiguousarray(found[1][:, :, ::-1])).permute(2, 0, 1) / 255)
     assert len(frames) == 8
     assert tuple(frames[0].shape[1:]) == expected
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(30)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
     for frame, image in zip(frames, rendered, strict=True):
         assert (frame - image).square().mean() < 2e-3  # 27 dB; another frame's bar is at another place
     small, photo = rendered[0][0, 0], render(views.camera(0))[0, 0, 0]  # of the first camera, in two sizes
     centre = [float((row * (torch.arange(len(row)) + 0.5)).sum() / row.sum()) / len(row) for row in (small, photo)]
     assert centre[0] == pytest.approx(centre[1], abs=1e-3)
+
+
+def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(film, "FRAMES", 6)
+    path, views = tmp_path / "film.webm", views_of((180, 240))
+    noise = torch.rand(6, 3, 180, 240, generator=torch.Generator().manual_seed(0))
+    frames = iter(noise)
+    assert write_film(path, lambda _: next(frames)[None], views, 1.0) == ""
+    size = path.stat().st_size
+    assert film.film_within(path, size) == path.read_bytes()
+    (tmp_path / "smaller.webm").write_bytes(film.film_within(path, size // 3))
+    assert 0 < (tmp_path / "smaller.webm").stat().st_size <= size // 3
+    video, count = cv2.VideoCapture(str(tmp_path / "smaller.webm")), 0
+    while (found := video.read())[0]:
+        count += 1
+        height, width = found[1].shape[:2]
+    assert count == 6
+    assert width / height == pytest.approx(4 / 3, rel=0.05)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
+    assert film.film_within(path, 100) == b""
 
 
 def test_without_a_codec_there_is_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
@@ -192,7 +225,7 @@ def test_a_browser_plays_it(tmp_path: Path, monkeypatch: Any) -> None:
         page.open(tmp_path / "page.html", ready="v.error || v.readyState == 4")
         assert page.run("v.error && v.error.message") is None
         assert page.run("[v.videoWidth, v.videoHeight]") == [64, 48]
-        assert page.run("v.duration") == pytest.approx(0.5, abs=0.05)
+        assert page.run("v.duration") == pytest.approx(15 / 24, abs=0.05)
         page.run("v.play()")
         page.run("new Promise(done => { v.onended = done })")
         assert page.problems == []

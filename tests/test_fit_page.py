@@ -99,6 +99,19 @@ def test_without_a_photo_held_out_training_views_are_shown(fitted: Any) -> None:
     assert text.count('class="render"') == 3
 
 
+def test_a_page_without_photos_shows_none(folder: Path, tmp_path: Path) -> None:
+    request = REQUEST | {"scene": str(folder), "photos": False}
+    config = replace(CONFIG, init="random", init_points=50)
+    run.fit_scene(load_scene(folder, 3), config, tmp_path, request=request, before_publish=write_own_page)
+    for again in (False, True):
+        if again:
+            evaluate(tmp_path)
+        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+        assert "data:image" not in text
+        assert "<video" in text
+        assert "held out of the training" in text
+
+
 def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None:
     from kgs.cli import main
 

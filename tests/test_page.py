@@ -135,7 +135,7 @@ def test_a_film_is_left_out_before_anything_of_the_splat(tmp_path: Path) -> None
     text = write(path, film=film, most_bytes=bare + 20_000)  # base64 makes 27 000 of them
     assert "<video" not in text
     assert "To keep this page small" not in text
-    assert "<video" not in write(path, film=bytes(1_500_001))
+    assert "<video" not in write(path, film=bytes(1_100_001))
 
 
 def test_curves_stay_in_their_picture() -> None:

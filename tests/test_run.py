@@ -138,6 +138,15 @@ def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, t
         fit_scene(scene, CONFIG, tmp_path, resume=True, say=lines.append)
 
 
+def test_where_there_is_nothing_to_resume_it_says_so(scene: Any, tmp_path: Path) -> None:
+    lines: list[str] = []
+    fit_scene(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
+    assert f"{tmp_path}: there is nothing to resume: the fit starts at the beginning" in lines
+    lines.clear()
+    fit_scene(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
+    assert not any("nothing to resume" in line for line in lines)
+
+
 def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) -> None:
     short = replace(CONFIG, steps=2)
     fit_scene(scene, short, tmp_path, say=lambda line: None)

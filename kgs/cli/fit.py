@@ -40,6 +40,7 @@ def fit(
     preset: Literal["auto", "paper", "plain"] = "auto",
     fast: bool = False,
     resume: bool = False,
+    photos: bool = True,
     lpips_weights: Existing | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
@@ -64,6 +65,7 @@ def fit(
             counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
         fast: half the steps, a third of them on small pictures: other defaults, see --fast --help.
         resume: continue from the checkpoint in the output folder.
+        photos: photos beside their renders on the page; without them it is small, and can be shown where they must not.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
@@ -91,6 +93,7 @@ def fit(
     check_folder(out, replaced_files(out), scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["hold_out"] = hold_out
+    request["photos"] = photos
     request["points"] = config.init if config.init == "model-points" else "none"
     place = out
     if unposed := is_unposed(scene):
@@ -102,6 +105,8 @@ def fit(
         request["downscale"] = max(1.0, max(height, width) / size)
     loaded = load(request, place)
     height, width = loaded.train.images.shape[-2:]
+    if max(height, width) < SMALLEST:
+        raise ValueError(f"size: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
     metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)

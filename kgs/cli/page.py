@@ -24,6 +24,7 @@ def page(
     out: Out = Path("index.html"),
     downscale: float | None = None,
     background: Background = "black",
+    photos: bool = True,
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
@@ -39,6 +40,7 @@ def page(
         out: the HTML file to write.
         downscale: shrink the photos by this factor.
         background: behind the splat, and behind photos with transparency.
+        photos: photos beside their renders; without them the page is small, and can be shown where they must not.
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
@@ -69,12 +71,12 @@ def page(
         return image
 
     few = spread(len(scene.train), MOST_PICTURES)
-    photos = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train  # of another offset
-    shown = replace(photos, cameras=scene.train.camera(few))
+    seen = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train  # of another offset
+    shown = replace(seen, cameras=scene.train.camera(few))
     runs = {"": {"views": evaluate(render, shown), "versions": versions()}}
     notes = ["Whether the splat was fitted to these photos is not known here."]
     title = f"{ply.stem}, {Path(cameras).resolve().name}"
-    words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes}
+    words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes, "photos": photos}
     near_plane = renderer.options.near_plane
     cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
     level = runs[""]["views"]["psnr"]

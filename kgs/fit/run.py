@@ -117,6 +117,8 @@ def fit_scene(
         if trainer is not None:
             say(f"resumed at step {trainer.step}")
         else:
+            if resume:
+                say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
             if is_own(out / "splat.ply"):
                 say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
             points = choose_points(scene, config, each)

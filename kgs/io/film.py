@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -23,10 +24,12 @@ from .cameras import upright
 from .images import eight_bits
 from .ownership import MARK
 
-FRAMES = 90
-RATE = 30.0  # frames per second
+FRAMES = 144
+RATE = 24.0  # frames per second
+_RAMP = 0.12  # share of the film in which it gets up to its speed, and again of that in which it slows down
 LONGEST = 640  # pixels of the longer side
 _STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
+_LEAST_SIDE = 64  # pixels of a film that is made smaller
 _SWAY = 0.03  # radius of the path around a single camera, as a share of the scene's depth
 _EBML_VOID = b"\xec"  # element ID of padding, which players skip
 Array = NDArray[np.float64]
@@ -41,9 +44,9 @@ def write_film(
 ) -> str:
     """Write a film along the :func:`tour` through some views, as WebM with VP8. The write is atomic.
 
-    The film has `FRAMES` frames at `RATE` frames per second and loops without a jump. Frames have the size of the
-    views, reduced to at most `LONGEST` pixels and rounded to even numbers. (OpenCV's VP9 encoder takes six times as
-    long for 0.5 dB.)
+    The film has `FRAMES` frames at `RATE` frames per second; it begins and ends slowly, where it began. Frames have the
+    size of the views, reduced to at most `LONGEST` pixels and rounded to even numbers. (OpenCV's VP9 encoder takes six
+    times as long for 0.5 dB.)
 
     Args:
         path: the file to write, in an existing folder.
@@ -57,7 +60,7 @@ def write_film(
     """
     path = Path(path)
     size, lens = _frame_lens(views)
-    poses = tour(views.cameras.extrinsics, FRAMES, depth).to(lens)
+    poses = tour(views.cameras.extrinsics, _eased(np.arange(FRAMES) / FRAMES), depth).to(lens)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
     try:
         with _stderr_discarded():
@@ -80,6 +83,34 @@ def write_film(
     return ""
 
 
+def film_within(path: Path, most_bytes: int) -> bytes:
+    """The content of a film that was written by `write_film`, with fewer pixels where it has more bytes than these.
+
+    OpenCV's encoder takes about a bit for each pixel, and no other rate. b"" where the film cannot be made so small.
+    """
+    content = path.read_bytes()
+    video = cv2.VideoCapture(str(path))
+    width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    frames = []
+    while len(content) > most_bytes and (found := video.read())[0]:
+        frames.append(found[1])
+    share = 1.0
+    with tempfile.TemporaryDirectory() as folder:
+        smaller = Path(folder) / path.name
+        while frames and len(content) > most_bytes:
+            share *= min(0.9, most_bytes / len(content))
+            size = tuple(2 * int(side * share**0.5 / 2) for side in (width, height))
+            if min(size) < _LEAST_SIDE:
+                return b""
+            with _stderr_discarded():
+                writer = cv2.VideoWriter(str(smaller), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP80"), RATE, size)
+            for frame in frames:
+                writer.write(cv2.resize(frame, size, interpolation=cv2.INTER_AREA))
+            writer.release()
+            content = smaller.read_bytes()
+    return content
+
+
 def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:
     """Height and width of the frames, and the mean intrinsics of the views for this size, `(4, 4)`."""
     height, width = views.images.shape[-2:]
@@ -92,7 +123,14 @@ def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:
     return size, lens
 
 
-def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
+def _eased(times: Array) -> Array:
+    """The shares of a path that are done at times in [0, 1]: at constant speed, but for a ramp at each end."""
+    begun, left = times.clip(max=_RAMP), (1 - times).clip(max=_RAMP)
+    shares: Array = (begun**2 - left**2 + _RAMP**2) / (2 * _RAMP) + (times - begun) - (_RAMP - left)
+    return shares / (1 - _RAMP)
+
+
+def tour(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     """A smooth closed path through some cameras, as poses.
 
     The cameras are passed in the order of a short round trip. Between them, positions and quaternions are cubic splines
@@ -106,7 +144,7 @@ def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
 
     Args:
         extrinsics: `(V, 4, 4)`, V >= 1.
-        frames: number of poses. The first one follows the last.
+        shares: `(frames,)`, of the path, in [0, 1]: 0 is its beginning and 1 the same place again, its end.
         depth: distance from the cameras to the scene, in world units; used for a single camera.
 
     Returns:
@@ -114,7 +152,7 @@ def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
     """
     poses = torch.linalg.inv(extrinsics.double().cpu())  # camera to world
     if len(poses) == 1:
-        return _sway(poses[0], frames, depth)
+        return _sway(poses[0], shares, depth)
     distances = _distances(poses)
     order = _round_trip(distances)
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
@@ -122,7 +160,7 @@ def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
     places, rotations = poses[order, :3, 3], poses[order, :3, :3]
     focus = meeting_point(extrinsics[order])
     if focus is None:
-        places, rotations = _interpolated(places, rotations, times, frames)
+        places, rotations = _interpolated(places, rotations, times, shares)
         return _extrinsics(places, rotations)
 
     # Interpolate the direction and the distance from the focus, and the rotation relative to looking at it.
@@ -130,7 +168,7 @@ def tour(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
     radii = (places - focus).norm(dim=1, keepdim=True)
     rotations = _looking_at(focus, places, down).mT @ rotations
     polar = torch.cat([(places - focus) / radii, radii], 1)
-    polar, rotations = _interpolated(polar, rotations, times, frames)
+    polar, rotations = _interpolated(polar, rotations, times, shares)
     places = focus + polar[:, 3:] * normalize(polar[:, :3], dim=1)
     return _extrinsics(places, _looking_at(focus, places, down) @ rotations)
 
@@ -144,9 +182,9 @@ def _distances(poses: Tensor) -> Array:
     return distances
 
 
-def _sway(pose: Tensor, frames: int, depth: float) -> Tensor:
+def _sway(pose: Tensor, shares: Array, depth: float) -> Tensor:
     """Poses on a small ellipse beside one camera, looking at the point at `depth` on its optical axis."""
-    angles = 2 * torch.pi * torch.arange(frames, dtype=torch.float64) / frames
+    angles = 2 * torch.pi * torch.from_numpy(shares)
     right, down, forward = pose[:3, :3].T
     places = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
     return _extrinsics(pose[:3, 3] + places, _looking_at(depth * forward, places, down))
@@ -185,18 +223,18 @@ def _round_trip(distances: Array) -> list[int]:
     return order
 
 
-def _interpolated(vectors: Tensor, rotations: Tensor, times: Array, frames: int) -> tuple[Tensor, Tensor]:
+def _interpolated(vectors: Tensor, rotations: Tensor, times: Array, shares: Array) -> tuple[Tensor, Tensor]:
     """Vectors `(V, D)` and rotations `(V, 3, 3)` along a closed path: `(frames, D)` and `(frames, 3, 3)`.
 
     `times` has V durations, each from one stop to the next.
     """
     quaternions = rotation_matrix_to_quaternion(rotations.contiguous())
-    rows = torch.from_numpy(_closed_spline(torch.cat([vectors, quaternions], 1).numpy(), times, frames))
+    rows = torch.from_numpy(_closed_spline(torch.cat([vectors, quaternions], 1).numpy(), times, shares))
     return rows[:, :-4], quaternion_to_rotation_matrix(rows[:, -4:])
 
 
-def _closed_spline(stops: Array, times: Array, frames: int) -> Array:
-    """Rows of a cubic spline through the stops `(V, D)`, evenly spaced in time: `(frames, D)`.
+def _closed_spline(stops: Array, times: Array, shares: Array) -> Array:
+    """Rows of a cubic spline through the stops `(V, D)` at these shares of its time: `(frames, D)`.
 
     The last four columns are quaternions, not normalised. `times` has V durations, each from one stop to the next.
     """
@@ -210,7 +248,7 @@ def _closed_spline(stops: Array, times: Array, frames: int) -> Array:
     tangents = _tangents(slopes[:-1], slopes[1:], steps[:-1], steps[1:])
 
     ends = np.cumsum(times)
-    instants = ends[-1] * np.arange(frames) / frames
+    instants = ends[-1] * shares
     i = np.searchsorted(ends, instants, side="right").clip(max=n - 1)  # which stop comes before
     u = ((instants - ends[i]) / times[i] + 1)[:, None]  # 0 at this stop, 1 at the next one
     position = (1 + 2 * u) * (1 - u) ** 2 * values[i + 1] + u * u * (3 - 2 * u) * values[i + 2]

@@ -64,13 +64,14 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
     training = training if any(training) else [True] * len(parts)
     first = _nearest_mean_pose(rotations, positions / depth, training)
     up = common_up(cameras.extrinsics)
+    path = tour(cameras.extrinsics[training], np.arange(_SWAY_POSES) / _SWAY_POSES, depth)
     return {
         "cameras": found,
         "first": first,
         "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
         "arc": _arc(rotations, positions, first, found[first]["distance"], up.numpy()),
-        "sway": _sway(tour(cameras.extrinsics[training], _SWAY_POSES, depth).numpy(), positions[first]),
+        "sway": _sway(path.numpy(), positions[first]),
     }
 
 

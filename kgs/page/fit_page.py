@@ -17,12 +17,14 @@ from kgs.fit.prune import contributions, left_out
 from kgs.fit.run import Finished
 from kgs.fit.saved import SavedFit
 from kgs.io.console import each, say
+from kgs.io.film import film_within
 from kgs.io.json_files import read_json
 from kgs.io.outputs import FILM
 from kgs.io.ownership import is_own
 from kgs.model import GaussianModel
 
 from . import Picture, write_page
+from .write import MOST_FILM_BYTES
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
@@ -45,6 +47,7 @@ def write_fit_page(
     settings: Mapping[str, Any] | None = None,
     report: Path | None = None,
     film: Path | None = None,
+    photos: bool = True,
 ) -> str:
     """Write the page of one or more fits of a scene; the viewer shows one of them.
 
@@ -63,12 +66,15 @@ def write_fit_page(
         settings: the content of config.json.
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
         film: a WebM file to show; ignored if kgs did not write it.
+        photos: whether the page shows photos, renders and their differences.
 
     Returns:
         What was reduced to respect the page's limit of size, in words; "" for nothing.
     """
     views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
     shown = shown or views.select(spread(len(views), MOST_PICTURES))
+    if not photos:
+        shown = shown.select([])
     psnr = {run: _psnr_of_views(metrics) for run, metrics in runs.items()}
     pictures = list[Picture]()
     for i in each(range(len(shown)), "page", "view"):
@@ -97,7 +103,7 @@ def write_fit_page(
         background=scene.background,
         pictures=pictures,
         pictures_note=_pictures_note(len(shown), len(views), word),
-        film=film.read_bytes() if film is not None and is_own(film) else b"",
+        film=film_within(film, MOST_FILM_BYTES) if film is not None and is_own(film) else b"",
         runs=runs,
         left_out=left_out(next(iter(runs.values()), {}).get("needs") or {}),
         notes=notes,
@@ -136,8 +142,9 @@ def _write_page_of(
     """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
     request = settings["request"]
     title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
-    files = {"report": scene.root / CAMERAS_REPORT, "film": path.with_name(FILM)}
-    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, settings=settings, **files)
+    options: dict[str, Any] = {"report": scene.root / CAMERAS_REPORT, "film": path.with_name(FILM)}
+    options |= {"settings": settings, "photos": request.get("photos", True)}
+    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **options)
 
 
 def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:

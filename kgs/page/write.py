@@ -21,8 +21,8 @@ from .figures import facts, measure_table, psnr_plot, verdict, without_folders
 from .pictures import GAIN, Picture, encoded
 
 MOST_BYTES = 8_000_000  # of a page
+MOST_FILM_BYTES = 1_100_000  # 1.5 MB of the page, in base64
 _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
-_FILM_BYTES = 1_500_000
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
 _FILES = [
     "style.css",
@@ -79,8 +79,8 @@ def write_page(
         background: colour behind the splat, `(3,)` in [0, 1].
         pictures: photos with renders, `kgs.page.Picture`.
         pictures_note: a sentence that says which photos these are.
-        film: the content of a WebM file; b"" for none. It is left out where it is larger than 1.5 MB, or where
-            anything of the splat would have to be.
+        film: the content of a WebM file; b"" for none. It is left out where it has more than `MOST_FILM_BYTES`,
+            or where anything of the splat would have to be left out for it.
         runs: the content of metrics.json by the name of the run; "" if there is only one run.
         left_out: what the fit left out, and why.
         notes: sentences to show below the one that says how good the fit is.
@@ -147,7 +147,7 @@ def write_page(
         room = max(0, most_bytes - len(page({}, {})) - _LAYOUT_BYTES)
         return pack(gaussians, cameras, room * 3 // 4, weights, near_plane)  # base64 turns 3 bytes into 4
 
-    has_film = 0 < len(film) <= _FILM_BYTES
+    has_film = 0 < len(film) <= MOST_FILM_BYTES
     packed = packed_beside("data:video/webm;base64," + base64.b64encode(film).decode() if has_film else "")
     if has_film and packed.left_out:
         packed = packed_beside("")
