@@ -181,8 +181,16 @@ def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
     assert r"a\nb" in one_line(capsys)
 
 
+def test_demo_fits_with_dropping(tmp_path, capsys):
+    assert run("demo", "-o", tmp_path, "--steps", 2, "--size", 32, 40) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(metrics) == {"generator", "with"}
+    assert "difference on test views" not in capsys.readouterr().out
+    assert {"index.html", "demo.png", "curve.png", "splat.ply"} <= set(os.listdir(tmp_path))
+
+
 def test_demo_compares_at_equal_starts(tmp_path, capsys):
-    assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40) == 0
+    assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40, "--compare") == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
     assert set(runs) == {"generator", "without", "with"}
     assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, 0.2)

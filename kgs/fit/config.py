@@ -263,5 +263,5 @@ PAPER = FitConfig(
 PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
 # Half the steps, a third of them on a quarter of the pixels, see docs/recipe.md.
 FAST = FitConfig(steps=1000, coarse=0.3)
-# Two fits within a minute on two cores, with the page and the film.
-DEMO = replace(FAST, steps=500, init_points=12_000, max_gaussians=16_000)
+# A fit within a minute on two cores, with the page and the film.
+DEMO = replace(FAST, steps=350, init_points=12_000, max_gaussians=16_000, evaluations=4)

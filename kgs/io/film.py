@@ -98,7 +98,7 @@ def film_within(path: Path, most_bytes: int) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         smaller = Path(folder) / path.name
         while frames and len(content) > most_bytes:
-            share *= min(0.9, most_bytes / len(content))
+            share *= 0.9 * most_bytes / len(content)
             size = tuple(2 * int(side * share**0.5 / 2) for side in (width, height))
             if min(size) < _LEAST_SIDE:
                 return b""
