@@ -160,6 +160,11 @@ def test_bare_photos_need_poses(tmp_path, capsys):
         (["page", "{file}", "--cameras", "{scene}", "-o", "{out}"], "--out: expected a file that ends in .html"),
         (["nonsense"], "one of demo, fit, render, eval, page, bench, study, got 'nonsense'"),
         (["fti", "{scene}"], "did you mean fit?"),
+        (
+            ["fit", "{scene}", "--views", "3"],
+            "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o ",
+        ),
+        (["render", "{file}", "--cameras", "{scene}"], " -o transforms_train-render"),
         (["bench", "nonsense"], "one of speed, precision, extremes, got"),
         (["bench", "sped"], "did you mean speed?"),
         (["render", "{missing}", "--cameras", "{scene}", "-o", "{out}"], "missing"),
@@ -171,7 +176,7 @@ def test_mistakes_are_one_line_and_exit_code_2(folder, tmp_path, capsys, argumen
     places["file"] = folder / "transforms_train.json"
     before = sorted(folder.rglob("*"))
     assert run(*(argument.format(**places) for argument in arguments)) == 2
-    assert said in one_line(capsys)
+    assert said.format(**places) in one_line(capsys)
     assert sorted(folder.rglob("*")) == before
     assert os.listdir(tmp_path) == []  # nothing was begun
 

@@ -10,11 +10,12 @@ from contextlib import suppress
 from dataclasses import fields
 from functools import partial, wraps
 from importlib import import_module
+from pathlib import Path
 from typing import Any, get_args
 
 from kgs.errors import DataError, TrainingDiverged, printable
 from kgs.fit.config import FitConfig, Recipe
-from kgs.io.console import say
+from kgs.io.console import as_line, say
 
 from .interrupts import interrupt_as_usual
 
@@ -164,11 +165,25 @@ def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
     return {name: "--" + path.replace("_", "-") for name, path in paths.items()}
 
 
+def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None:
+    """Suggest a folder for the results where the command needs one and got everything but that."""
+    out = inspect.signature(command).parameters.get("out")
+    is_given = any(word in ("-o", "--out", "-h", "--help") or word.startswith("--out=") for word in words)
+    is_needed = out is not None and out.kind is out.KEYWORD_ONLY and out.default is out.empty
+    if is_given or not is_needed or not words or words[0].startswith("-"):
+        return
+    name = f"{Path(words[0]).resolve().stem}-{prog.rpartition(' ')[2]}"
+    whole = as_line(*prog.split(), *words, "-o", name)
+    raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
+
+
 def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: dict[str, Any]) -> Callable[[], Any]:
     """Read the options; returns the call that they ask for, once its input paths are there."""
     import tyro
 
     from .options import EXISTS
+
+    _check_out(command, prog, words)
 
     @wraps(command)
     def bind(*arguments: Any, **options: Any) -> Callable[[], Any]:
