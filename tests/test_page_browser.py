@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,13 +26,14 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
 PARTS = ["training", "training", "training", "test"]
 CENTRAL = 1  # the training camera nearest the mean pose
 READY = "document.querySelector('.viewer').dataset.state === 'ready'"
-SHOW = f"""(index) => {{
+SHOW = """(index, width, height, fades = false) => {
   const canvas = document.querySelector("canvas");
-  Object.assign(canvas.style, {{ width: "{SIZE[1]}px", height: "{SIZE[0]}px" }});
-  viewer.place(index);
+  Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
+  if (index !== null) viewer.place(index);
+  viewer.isFading = fades;
   viewer.draw();
   return canvas.toDataURL();
-}}"""
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,12 @@ def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, 
     assert browser.problems == []
 
 
+def show(browser: Browser, index: int | None, width: int = SIZE[1], height: int = SIZE[0], fades: bool = False) -> Any:
+    """The canvas in some size of pixels, at a camera of the page or, without index, where the eye is now."""
+    words = ", ".join(json.dumps(value) for value in (index, width, height, fades))
+    return browser.picture(browser.run(f"({SHOW})({words})"))
+
+
 def array(image: torch.Tensor) -> np.ndarray[Any, Any]:
     """`(H, W, 3)` of `(3, H, W)`."""
     return image.permute(1, 2, 0).double().numpy()
@@ -95,14 +103,15 @@ def array(image: torch.Tensor) -> np.ndarray[Any, Any]:
 
 def psnr(shown: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> float:
     assert shown.shape == expected.shape
-    return -10 * math.log10(np.mean((shown - expected) ** 2))
+    error = np.mean((shown - expected) ** 2)
+    return -10 * math.log10(error) if error else math.inf
 
 
 def test_the_canvas_shows_what_kgs_renders(browser: Browser, page: Path, renders: Any) -> None:
     browser.size(1000, 800)
     browser.open(page, READY)
     for index, render in enumerate(renders):
-        shown, expected = browser.picture(browser.run(f"({SHOW})({index})")), array(render)
+        shown, expected = show(browser, index), array(render)
         assert psnr(shown, expected) >= 38, PARTS[index]
         assert np.abs(shown - expected).max() < 0.05
 
@@ -135,15 +144,53 @@ def test_start_goes_back_to_the_first_view(browser: Browser, page: Path) -> None
     assert browser.run("document.querySelector('select').value") == str(CENTRAL)
 
 
-def test_footprints_do_not_depend_on_the_shape_of_the_canvas(browser: Browser, page: Path, renders: Any) -> None:
-    """A canvas that is wider than the photo shows the photo's frame in its middle as kgs renders it."""
+@pytest.mark.parametrize("shape", [(4, 3), (16, 9), (9, 16)])
+def test_what_the_photos_frame_shows_does_not_depend_on_the_canvas(
+    browser: Browser, page: Path, scene: Any, shape: tuple[int, int]
+) -> None:
+    """In orbits around the middle of the scene, on canvases that hold the frame of a photo in its own pixels."""
+    gaussians, cameras = scene
     browser.size(1000, 800)
     browser.open(page, READY)
-    wide = SHOW.replace(f"{SIZE[1]}px", f"{3 * SIZE[1]}px")
-    for index, render in enumerate(renders):
-        shown = browser.picture(browser.run(f"({wide})({index})"))
-        assert shown.shape == (SIZE[0], 3 * SIZE[1], 3)
-        assert psnr(shown[:, SIZE[1] : 2 * SIZE[1]], array(render)) >= 38
+    height, width = SIZE
+    wide, tall = round(height * shape[0] / shape[1] / 2), round(width * shape[1] / shape[0] / 2)
+    canvas = max(width, 2 * wide), max(height, 2 * tall)  # even: the frame lies on whole pixels
+    left, top = (canvas[0] - width) // 2, (canvas[1] - height) // 2
+    browser.run("viewer.isRoaming = true")
+    for yaw, pitch in ((0, 0), (12, 0), (25, 0), (-25, 0), (0, 20)):
+        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({math.radians(yaw)}, {math.radians(pitch)})")
+        rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
+        pose = torch.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+        camera = with_camera(
+            Views(cameras, torch.zeros(4, 3, *SIZE), tuple("abcd")).camera(CENTRAL), extrinsics=pose[None]
+        )
+        with torch.no_grad():
+            render = kgs.GaussianRenderer(backend="torch").eval()(gaussians, camera, background=BACKGROUND).image
+        shown = show(browser, None, *canvas)[top : top + height, left : left + width]
+        assert psnr(shown, array(render[0].clamp(0, 1))) >= 38, (yaw, pitch)
+
+
+def test_nothing_that_training_photos_show_fades(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    for index, part in enumerate(PARTS):
+        for width, height in ((SIZE[1], SIZE[0]), (2 * SIZE[1] + 37, 2 * SIZE[0] + 28)):
+            level = psnr(show(browser, index, width, height, True), show(browser, index, width, height))
+            assert part == "test" or level >= 45, (index, width)
+
+
+def test_what_no_photo_shows_fades_until_it_is_switched_off(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    browser.run("viewer.isRoaming = true; viewer.turn(2.5, 0)")  # behind the scene
+    whole, faded = show(browser, None), show(browser, None, fades=True)
+    ground = np.rint(255 * BACKGROUND.numpy()) / 255
+    assert np.abs(faded - ground).mean() < 0.1 * np.abs(whole - ground).mean()
+    switch = "document.querySelector('.fade')"
+    assert browser.run(f"[viewer.isFading, {switch}.getAttribute('aria-pressed')]") == [True, "true"]
+    browser.run(f"{switch}.click()")
+    assert browser.run(f"[viewer.isFading, {switch}.getAttribute('aria-pressed')]") == [False, "false"]
 
 
 def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:
@@ -189,14 +236,14 @@ def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -
 def test_graphics_that_the_browser_took_back_come_again(browser: Browser, page: Path) -> None:
     browser.size(1000, 800)
     browser.open(page, READY)
-    before = browser.picture(browser.run(f"({SHOW})(0)"))
+    before = show(browser, 0)
     browser.run("window.loss = viewer.renderer.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
     browser.wait("document.querySelector('.viewer').dataset.state === 'lost'")
     assert "graphics" in browser.run("document.querySelector('.failure').textContent")
     browser.run("loss.restoreContext()")
     browser.wait(READY)
     assert browser.run("document.querySelector('.failure').textContent") == ""
-    assert np.array_equal(browser.picture(browser.run(f"({SHOW})(0)")), before)
+    assert np.array_equal(show(browser, 0), before)
 
 
 def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path) -> None:

@@ -1,14 +1,22 @@
 "use strict";
-// Decodes a splat (the format is described in kgs/page/data.py) and draws it with WebGL2, sorted from back to front.
+// Decodes a splat (the format is described in kgs/page/data.py) and draws it with WebGL2, sorted from back to front. What
+// no photo shows fades (kgs/page/seen.py).
 
 const TEXELS_PER_ROW = 2048;
 const FLOATS_PER_GAUSSIAN = 12;  // in the geometry texture, see splat.vert.glsl
 
-// The splat as the content of two textures, from its layout and base64-encoded content.
-async function decodeSplat(layout, base64) {
+const COVERAGE_PIXELS = 4;  // of the canvas, along one side of a pixel of the coverage
+
+// The bytes of a gzip file that is encoded in base64.
+async function unzipped(base64) {
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+// The splat as the content of two textures, from its layout and base64-encoded content.
+async function decodeSplat(layout, base64) {
+  const planes = await unzipped(base64);
   const columns = decodeColumns(layout, planes);
   const coefficients = (layout.degree + 1) ** 2;
   return {
@@ -87,6 +95,21 @@ function harmonicsTexels(columns, count, coefficients) {
   return harmonics;
 }
 
+// The depths that the photos show and the cameras of these photos, as the content of two textures.
+async function decodeSeen({ layout, content }, cameras) {
+  const { views, width, height } = layout;
+  const planes = await unzipped(content);
+  const count = views.length * width * height;
+  const depths = new Uint8Array(2 * count);
+  for (let i = 0; i < count; i++) depths.set([planes[i], planes[count + i]], 2 * i);
+  const lenses = views.flatMap((view) => {
+    const { rotation, position, focal, centre } = cameras[view];
+    const rows = rotation.map((row) => [...row, -row.reduce((sum, value, i) => sum + value * position[i], 0)]);
+    return [...rows.flat(), ...focal, ...centre, ...position, 0];
+  });
+  return { layout, depths, lenses: new Float32Array(lenses), photoSize: cameras[views[0]].size };
+}
+
 // Sorts Gaussians by depth, exactly: a radix sort with two passes over 16 bits each. The bits of positive floats, read
 // as integers, have the order of the floats.
 class DepthOrder {
@@ -121,33 +144,9 @@ class DepthOrder {
   }
 }
 
-class SplatRenderer {
-  // `shaders` holds the sources by name. `settings` has nearPlane (world units), lowPass (variance in square pixels of
-  // a photo), margin (share of a photo's size) and background (RGB).
-  constructor(canvas, splat, shaders, settings) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
-    if (!gl) throw new Error("this browser has no WebGL2");
-    Object.assign(this, { canvas, gl, splat, settings });
-    this.order = new DepthOrder(splat.count);
-    this.hasFloatTargets = Boolean(gl.getExtension("EXT_color_buffer_float"));  // otherwise blending has 8 bits
-    this.splatProgram = this.link(shaders.splatVertex, shaders.splatFragment);
-    this.screenProgram = this.link(shaders.screenVertex, shaders.screenFragment);
-    this.upload(0, gl.RGBA32F, splat.geometry);
-    this.upload(1, gl.RGBA16F, splat.harmonics);
-    this.addBuffer(0);  // the corners of a quadrilateral
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
-    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
-    this.indices = this.addBuffer(1);  // of Gaussians, one per quadrilateral
-    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(1, 1);
-    this.target = gl.createTexture();
-    gl.activeTexture(gl.TEXTURE2);
-    gl.bindTexture(gl.TEXTURE_2D, this.target);
-    this.framebuffer = gl.createFramebuffer();
-  }
-
-  link(vertexSource, fragmentSource) {
-    const { gl } = this;
+// A pair of shaders; its uniforms are set by name.
+class Program {
+  constructor(gl, vertexSource, fragmentSource) {
     const program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
       const shader = gl.createShader(kind);
@@ -159,17 +158,116 @@ class SplatRenderer {
     gl.bindAttribLocation(program, 1, "gaussian");
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    return program;
+    Object.assign(this, { gl, program, locations: new Map() });
   }
 
-  upload(unit, format, values) {
+  // `textures` has texture units by name, `values` floats: numbers, vectors, and matrices of 3 by 3 as rows.
+  use(textures, values) {
+    this.gl.useProgram(this.program);
+    for (const [name, unit] of Object.entries(textures)) this.gl.uniform1i(this.location(name), unit);
+    for (const [name, value] of Object.entries(values)) this.set(this.location(name), [value].flat(2));
+  }
+
+  set(location, values) {
     const { gl } = this;
-    const rows = values.length / 4 / TEXELS_PER_ROW;
+    if (values.length === 9) gl.uniformMatrix3fv(location, true, values);
+    else gl[`uniform${values.length}f`](location, ...values);
+  }
+
+  location(name) {
+    if (!this.locations.has(name)) this.locations.set(name, this.gl.getUniformLocation(this.program, name));
+    return this.locations.get(name);
+  }
+}
+
+// A texture that can be drawn to.
+class Target {
+  constructor(gl, unit, [format, channels, type], filter) {
+    Object.assign(this, { gl, unit, format, channels, type, texture: gl.createTexture() });
+    this.framebuffer = gl.createFramebuffer();
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, filter);
+    for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
+  }
+
+  resize(width, height) {
+    const { gl } = this;
+    Object.assign(this, { width, height });
+    gl.activeTexture(gl.TEXTURE0 + this.unit);
+    gl.texImage2D(gl.TEXTURE_2D, 0, this.format, width, height, 0, this.channels, this.type, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.texture, 0);
+  }
+
+  // The next draw calls draw to it, on this colour.
+  begin(...colour) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.viewport(0, 0, this.width, this.height);
+    gl.clearColor(...colour);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+}
+
+// Texture units.
+const GEOMETRY = 0, HARMONICS = 1, PICTURE = 2, DEPTH = 3, SEEN = 4, LENSES = 5, COVERAGE = 6, CLOSED = 7;
+
+class SplatRenderer {
+  // `shaders` holds the sources by name. `settings` has nearPlane (world units), lowPass (variance in square pixels of
+  // a photo), margin (share of a photo's size) and background (RGB). `seen` comes from `decodeSeen`.
+  constructor(canvas, splat, seen, shaders, settings) {
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
+    if (!gl) throw new Error("this browser has no WebGL2");
+    Object.assign(this, { canvas, gl, splat, seen, settings });
+    this.order = new DepthOrder(splat.count);
+    const hasFloatTargets = Boolean(gl.getExtension("EXT_color_buffer_float"));  // otherwise blending has 8 bits
+    const half = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
+    this.canFade = hasFloatTargets;
+    this.splatProgram = new Program(gl, shaders.splatVertex, shaders.splatFragment);
+    this.screenProgram = new Program(gl, shaders.screenVertex, shaders.screenFragment);
+    this.picture = new Target(gl, PICTURE, hasFloatTargets ? half : [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], gl.NEAREST);
+    if (this.canFade) {
+      this.depthProgram = new Program(gl, shaders.splatVertex, shaders.depthFragment);
+      this.coverageProgram = new Program(gl, shaders.screenVertex, shaders.coverageFragment);
+      this.closingProgram = new Program(gl, shaders.screenVertex, shaders.closingFragment);
+      this.depth = new Target(gl, DEPTH, half, gl.NEAREST);
+      this.coverage = new Target(gl, COVERAGE, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.NEAREST);
+      this.closed = new Target(gl, CLOSED, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.LINEAR);
+      this.uploadSeen();
+    }
+    this.upload(GEOMETRY, gl.RGBA32F, TEXELS_PER_ROW, splat.geometry);
+    this.upload(HARMONICS, gl.RGBA16F, TEXELS_PER_ROW, splat.harmonics);
+    this.addBuffer(0);  // the corners of a quadrilateral
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+    this.indices = this.addBuffer(1);  // of Gaussians, one per quadrilateral
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(1, 1);
+  }
+
+  // A texture of four floats per texel.
+  upload(unit, format, width, values) {
+    const { gl } = this;
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXELS_PER_ROW, rows, 0, gl.RGBA, gl.FLOAT, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, values.length / 4 / width, 0, gl.RGBA, gl.FLOAT, values);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  }
+
+  uploadSeen() {
+    const { gl } = this;
+    const { views, width, height } = this.seen.layout;
+    this.upload(LENSES, gl.RGBA32F, 5, this.seen.lenses);
+    gl.activeTexture(gl.TEXTURE0 + SEEN);
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texImage3D(
+      gl.TEXTURE_2D_ARRAY, 0, gl.RG8, width, height, views.length, 0, gl.RG, gl.UNSIGNED_BYTE, this.seen.depths,
+    );
+    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   }
 
   // A buffer for the vertex attribute at this location.
@@ -181,20 +279,17 @@ class SplatRenderer {
     return buffer;
   }
 
-  // Sets the size of the canvas and of the texture in which Gaussians are blended, in pixels.
+  // Sets the size of the canvas, and with it of all targets, in pixels.
   resize(width, height) {
-    const { canvas, gl } = this;
+    const { canvas } = this;
     if (canvas.width === width && canvas.height === height && this.hasSize) return;
     canvas.width = width;
     canvas.height = height;
     this.hasSize = true;
-    const format = this.hasFloatTargets ? gl.RGBA16F : gl.RGBA8;
-    const type = this.hasFloatTargets ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE;
-    gl.activeTexture(gl.TEXTURE2);
-    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, null);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
+    this.picture.resize(width, height);
+    if (!this.canFade) return;
+    const fewer = [width, height].map((side) => Math.ceil(side / COVERAGE_PIXELS));
+    for (const target of [this.depth, this.coverage, this.closed]) target.resize(...fewer);
   }
 
   // Smallest and largest x/z and y/z at which footprints are linearised: those of the photo's frame and a margin around
@@ -207,45 +302,62 @@ class SplatRenderer {
     ];
   }
 
-  // Draws what a camera sees. `camera` has rotation (rows), position, and size, focal and centre in pixels of the
-  // photo; `view` has focal and centre in pixels of the canvas, and scale, the number of these per pixel of the photo.
-  draw(camera, view) {
+  // Draws what a camera sees. `camera` has rotation (rows), position, distance (to what it looks at), and size, focal
+  // and centre in pixels of the photo; `view` has focal and centre in pixels of the canvas, and scale, the number of
+  // these per pixel of the photo. With `fades`, what no photo shows fades to the background.
+  draw(camera, view, fades) {
     const { gl, canvas, settings, splat } = this;
     const { rotation, position } = camera;
     const [leastTangent, largestTangent] = this.tangentLimits(camera);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
-    gl.viewport(0, 0, canvas.width, canvas.height);
-    gl.clearColor(...settings.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-
-    gl.useProgram(this.splatProgram);
-    const location = (name) => gl.getUniformLocation(this.splatProgram, name);
-    gl.uniform1i(location("geometry"), 0);
-    gl.uniform1i(location("harmonics"), 1);
-    gl.uniform1i(location("texelsPerRow"), TEXELS_PER_ROW);
-    gl.uniform1i(location("coefficients"), splat.coefficients);
-    gl.uniformMatrix3fv(location("rotation"), true, rotation.flat());
-    gl.uniform3f(location("position"), ...position);
-    gl.uniform2f(location("focal"), ...view.focal);
-    gl.uniform2f(location("centre"), ...view.centre);
-    gl.uniform2f(location("size"), canvas.width, canvas.height);
-    gl.uniform2f(location("leastTangent"), ...leastTangent);
-    gl.uniform2f(location("largestTangent"), ...largestTangent);
-    gl.uniform1f(location("nearPlane"), settings.nearPlane);
-    // On a canvas larger than the photo, the low-pass filter is enlarged too: it shows the fitted image, enlarged.
-    gl.uniform1f(location("lowPass"), settings.lowPass * Math.max(1, view.scale ** 2));
-
+    const eye = {
+      rotation, position, focal: view.focal, centre: view.centre, size: [canvas.width, canvas.height],
+    };
+    const footprints = {
+      ...eye, leastTangent, largestTangent, nearPlane: settings.nearPlane,
+      // On a canvas larger than the photo, the low-pass filter is enlarged too: it shows the fitted image, enlarged.
+      lowPass: settings.lowPass * Math.max(1, view.scale ** 2),
+    };
     const sorted = this.order.sort(splat.geometry, rotation, position, settings.nearPlane);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
     gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.DYNAMIC_DRAW);
+
+    this.picture.begin(...settings.background, 1);
+    this.drawGaussians(this.splatProgram, footprints, sorted.length);
+    if (fades && this.canFade) {
+      this.depth.begin(0, 0, 0, 0);
+      this.drawGaussians(this.depthProgram, { ...footprints, depthUnit: camera.distance }, sorted.length);
+      this.drawCoverage({ ...eye, depthUnit: camera.distance });
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    this.screenProgram.use({ picture: PICTURE, coverage: CLOSED }, {
+      ground: settings.background, fades: Number(fades && this.canFade),
+    });
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+  }
+
+  drawGaussians(program, uniforms, count) {
+    const { gl } = this;
+    program.use({ geometry: GEOMETRY, harmonics: HARMONICS }, uniforms);
+    gl.uniform1i(program.location("texelsPerRow"), TEXELS_PER_ROW);
+    gl.uniform1i(program.location("coefficients"), this.splat.coefficients);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, sorted.length);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
     gl.disable(gl.BLEND);
+  }
 
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.useProgram(this.screenProgram);
-    gl.uniform1i(gl.getUniformLocation(this.screenProgram, "picture"), 2);
+  // How far the photos show what each pixel shows, with fewer pixels than the canvas.
+  drawCoverage(eye) {
+    const { gl } = this;
+    const { cell, low, step } = this.seen.layout;
+    this.coverage.begin(0, 0, 0, 0);
+    this.coverageProgram.use({ splat: DEPTH, depths: SEEN, lenses: LENSES }, {
+      ...eye, cell, depthCode: [low, step], photoSize: this.seen.photoSize,
+    });
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    this.closed.begin(0, 0, 0, 0);
+    this.closingProgram.use({ coverage: COVERAGE }, {});
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
 }

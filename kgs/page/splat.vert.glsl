@@ -19,6 +19,7 @@ in vec2 corner;               // -1 or 1
 in uint gaussian;             // index
 out vec2 offset;              // from the centre, in standard deviations
 flat out vec4 colour;         // and opacity
+flat out float depth;         // of the centre, in world units
 
 const float ALPHA_THRESHOLD = 1.0 / 255.0;
 
@@ -83,5 +84,6 @@ void main() {
   vec2 shift = offset.x * deviations.x * axis + offset.y * deviations.y * vec2(-axis.y, axis.x);
   vec2 pixel = focal * point.xy / point.z + centre + shift;
   gl_Position = vec4(vec2(2.0, -2.0) * (pixel + 0.5) / size + vec2(-1.0, 1.0), 0.0, 1.0);
+  depth = point.z;
   colour = vec4(colourTowards(normalize(mean - position)), opacity);
 }

@@ -56,6 +56,7 @@ class Viewer {
     this.flight = 0;  // number of the latest movement: an earlier flight stops
     this.dragged = 0;  // pixels since the pointer was pressed
     this.pyramids = scene.cameras.map((camera, index) => this.addPyramid(camera, index));
+    this.isFading = true;
     this.isRoaming = false;
     this.isEngaged = false;  // the last press of a pointer was on the stage
     this.isSwaying = false;
@@ -227,7 +228,7 @@ class Viewer {
       centre: eye.centre.map((value, axis) => borders[axis] + scale * (value + 0.5) - 0.5),  // integer pixel centres
     };
     this.renderer.resize(...sides);
-    this.renderer.draw(eye, this.view);
+    this.renderer.draw(eye, this.view, this.isFading);
     this.drawPyramids();
   }
 
@@ -346,15 +347,16 @@ class Viewer {
   listenToTools(frame) {
     this.choice.addEventListener("change", () => this.flyTo(Number(this.choice.value)));
     frame.querySelector(".start").addEventListener("click", () => this.flyTo(this.scene.first));
-    const roam = frame.querySelector(".roam");
-    roam.addEventListener("click", () => {
-      this.isRoaming = !this.isRoaming;
-      roam.setAttribute("aria-pressed", String(this.isRoaming));
-    });
-    const pyramids = frame.querySelector(".pyramids");
-    pyramids.addEventListener("click", () => {
-      const hidden = this.overlay.toggleAttribute("hidden");
-      pyramids.setAttribute("aria-pressed", String(!hidden));
+    const addSwitch = (name, toggle) => {
+      const button = frame.querySelector(name);
+      button.addEventListener("click", () => button.setAttribute("aria-pressed", String(toggle())));
+    };
+    addSwitch(".roam", () => this.isRoaming = !this.isRoaming);
+    addSwitch(".pyramids", () => !this.overlay.toggleAttribute("hidden"));
+    addSwitch(".fade", () => {
+      this.isFading = !this.isFading;
+      this.requestDraw();
+      return this.isFading;
     });
     const full = frame.querySelector(".full");
     full.hidden = !document.fullscreenEnabled;
@@ -369,10 +371,13 @@ async function openViewer() {
   const frame = document.querySelector(".viewer");
   const canvas = frame.querySelector("canvas");
   const text = (id) => document.getElementById(id).textContent;
-  const { layout, content, scene, settings } = JSON.parse(text("splat"));
+  const { layout, content, seen, scene, settings } = JSON.parse(text("splat"));
   const shaders = {
     splatVertex: text("splat-vertex"),
     splatFragment: text("splat-fragment"),
+    depthFragment: text("depth-fragment"),
+    coverageFragment: text("coverage-fragment"),
+    closingFragment: text("closing-fragment"),
     screenVertex: text("screen-vertex"),
     screenFragment: text("screen-fragment"),
   };
@@ -388,10 +393,11 @@ async function openViewer() {
       show("failed", `The viewer cannot run here: ${error.message}.`);
     }
   };
-  let splat;
-  const newRenderer = () => new SplatRenderer(canvas, splat, shaders, settings);
+  let splat, photos;
+  const newRenderer = () => new SplatRenderer(canvas, splat, photos, shaders, settings);
   await attempt(async () => {
     splat = await decodeSplat(layout, content);
+    photos = await decodeSeen(seen, scene.cameras);
     window.viewer = new Viewer(frame, newRenderer(), scene);
   });
   // Browsers release the graphics context of pages in the background, and restore it later.

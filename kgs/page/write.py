@@ -19,6 +19,7 @@ from .cameras import viewer_scene
 from .data import Packed, pack
 from .figures import facts, measure_table, psnr_plot, verdict, without_folders
 from .pictures import GAIN, Picture, encoded
+from .seen import seen_by
 
 MOST_BYTES = 8_000_000  # of a page
 MOST_FILM_BYTES = 1_100_000  # 1.5 MB of the page, in base64
@@ -32,6 +33,9 @@ _FILES = [
     "pictures.js",
     "splat.vert.glsl",
     "splat.frag.glsl",
+    "depth.frag.glsl",
+    "coverage.frag.glsl",
+    "closing.frag.glsl",
     "screen.vert.glsl",
     "screen.frag.glsl",
 ]
@@ -137,8 +141,12 @@ def write_page(
         "background": background.tolist(),
     }
 
+    training = [view for view, part in enumerate(parts) if part != "test"] or list(range(len(parts)))
+    seen = seen_by(gaussians, cameras, training, near_plane)
+    depths = {"layout": seen.layout, "content": base64.b64encode(seen.content).decode()}
+
     def page(splat: Mapping[str, Any], words: Mapping[str, str]) -> bytes:
-        data = json.dumps({"scene": scene, "settings": viewer_settings, **splat}, separators=(",", ":"))
+        data = json.dumps({"scene": scene, "settings": viewer_settings, "seen": depths, **splat}, separators=(",", ":"))
         html: str = template.render(**context, **words, data=Markup(data.replace("<", "\\u003c")))
         return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
 
@@ -156,6 +164,7 @@ def write_page(
     words = {
         "reduced": packed.left_out,
         "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
+        "seen_size": f"{len(depths['content']) / 1e3:.0f} kB",
         "page_size": _megabytes(0),  # as many characters as the true size
     }
     words["page_size"] = _megabytes(len(page(splat, words)))
