@@ -233,6 +233,25 @@ def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -
     browser.wait(f"{eye} === {there}")
 
 
+def test_a_key_turns_the_pictures_by_a_quarter(browser: Browser, page: Path, renders: Any) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    start = show(browser, CENTRAL)
+    browser.run("viewer.canvas.removeAttribute('style'); viewer.canvas.focus()")
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key="r")
+    stage = browser.run("[document.querySelector('.stage').clientWidth, document.querySelector('.stage').clientHeight]")
+    assert stage[0] == pytest.approx(stage[1] * SIZE[0] / SIZE[1], abs=2)
+    turned = show(browser, None, *SIZE)
+    assert psnr(turned, np.rot90(array(renders[CENTRAL]), -1)) >= 38
+    assert psnr(show(browser, 0, *SIZE), np.rot90(array(renders[0]), -1)) >= 38  # other cameras, too
+    up = browser.run("viewer.scene.up")
+    down = browser.run("viewer.scene.cameras[1].rotation[1]")
+    assert np.dot(up, down) < -0.9
+    for _ in range(3):
+        browser.run("viewer.rollQuarter()")
+    assert np.array_equal(show(browser, CENTRAL), start)
+
+
 def test_graphics_that_the_browser_took_back_come_again(browser: Browser, page: Path) -> None:
     browser.size(1000, 800)
     browser.open(page, READY)

@@ -11,7 +11,7 @@ from kgs.errors import DataError, printable
 from kgs.fit.config import FAST, PRESETS, Background, FitConfig
 from kgs.io.console import VIEWER, as_line, say, say_next
 
-from .inputs import load
+from .inputs import check_roll, load
 from .options import Existing, Out
 
 SMALLEST = 32  # pixels of the longer side
@@ -41,6 +41,7 @@ def fit(
     fast: bool = False,
     resume: bool = False,
     photos: bool = True,
+    roll: float = 0.0,
     lpips_weights: Existing | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
@@ -66,6 +67,7 @@ def fit(
         fast: half the steps, a third of them on small pictures: other defaults, see --fast --help.
         resume: continue from the checkpoint in the output folder.
         photos: photos beside their renders on the page; without them it is small, and can be shown where they must not.
+        roll: turn the pictures of page and film clockwise by this angle in degrees, where photos lie on their side.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
@@ -88,12 +90,13 @@ def fit(
         raise ValueError("size: expected --size or --downscale, got both")
     if size is not None and size < SMALLEST:
         raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
+    check_roll(roll)
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     check_folder(out, replaced_files(out), scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["hold_out"] = hold_out
-    request["photos"] = photos
+    request |= {"photos": photos, "roll": roll}
     request["points"] = config.init if config.init == "model-points" else "none"
     place = out
     if unposed := is_unposed(scene):

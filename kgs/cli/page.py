@@ -8,7 +8,7 @@ from kgs.errors import printable
 from kgs.fit.config import Backend, Background
 from kgs.io.console import as_line, say, say_next
 
-from .inputs import load_cameras, load_splat
+from .inputs import check_roll, load_cameras, load_splat
 from .options import Existing, Out
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ def page(
     downscale: float | None = None,
     background: Background = "black",
     photos: bool = True,
+    roll: float = 0.0,
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
@@ -41,6 +42,7 @@ def page(
         downscale: shrink the photos by this factor.
         background: behind the splat, and behind photos with transparency.
         photos: photos beside their renders; without them the page is small, and can be shown where they must not.
+        roll: turn all pictures clockwise by this angle in degrees, where photos lie on their side.
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
@@ -54,6 +56,7 @@ def page(
     from kgs.metrics.evaluate import evaluate
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
+    check_roll(roll)
     place = check_tools(device, backend, "jinja2")
     if out.suffix != ".html":
         raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
@@ -76,7 +79,7 @@ def page(
     runs = {"": {"views": evaluate(render, shown), "versions": versions()}}
     notes = ["Whether the splat was fitted to these photos is not known here."]
     title = f"{ply.stem}, {Path(cameras).resolve().name}"
-    words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes, "photos": photos}
+    words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes, "photos": photos, "roll": roll}
     near_plane = renderer.options.near_plane
     cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
     level = runs[""]["views"]["psnr"]

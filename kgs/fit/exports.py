@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from kgs.geometry import typical_depths
-from kgs.io.cameras import camera_list, upright
+from kgs.io.cameras import camera_list, rolled, upright
 from kgs.io.console import each
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
@@ -13,11 +13,15 @@ from kgs.io.outputs import FILM
 from .trainer import Trainer
 
 
-def write_exports(trainer: Trainer, folder: Path) -> None:
-    """Write `outputs.EXPORTS`; where there can be no film, the trainer's notes say why."""
+def write_exports(trainer: Trainer, folder: Path, roll: float = 0.0) -> None:
+    """Write `outputs.EXPORTS`; where there can be no film, the trainer's notes say why.
+
+    `roll` turns the pictures of the film, and with them what is up in the glTF file, see :func:`kgs.io.cameras.rolled`.
+    """
     scene, model = trainer.scene, trainer.shown
+    upright_views = rolled(scene.train, roll)
     write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset))
-    save_glb(folder / "splat.glb", model, upright(scene.train.cameras.extrinsics), scene.offset)
+    save_glb(folder / "splat.glb", model, upright(upright_views.cameras.extrinsics), scene.offset)
     depth = typical_depths(model.means, scene.train.cameras)[1]
-    if note := write_film(folder / FILM, trainer.render, scene.train, depth, each):
+    if note := write_film(folder / FILM, trainer.render, upright_views, depth, each):
         trainer.note(note)

@@ -140,7 +140,7 @@ def fit_scene(
             is_trained = True
             save_ply(new / "splat.ply", trainer.shown, offset=scene.offset)
             write_curve(new / "curve.png", {"": trainer.curve})
-            write_exports(trainer, new)
+            write_exports(trainer, new, settings["request"].get("roll", 0.0))
             (new / "test").mkdir(exist_ok=True)
             for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
                 render = trainer.render(scene.test.camera(i))[0]

@@ -1,13 +1,15 @@
 """The list of cameras that 3DGS viewers read, and the rotation that makes a scene upright."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import kgs
-from kgs.datasets.scene import Views
+from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import common_up
 
 from .ownership import MADE_BY
@@ -50,6 +52,41 @@ def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
                 }
             )
     return entries
+
+
+def rolled(views: Views, degrees: float) -> Views:
+    """The views with their pictures turned clockwise, such that photos which lie on their side stand upright.
+
+    The cameras roll about their optical axes: they still show the same of the scene. Whole quarter turns turn the frame
+    too; what is left of the angle, up to 45 degrees, tilts the scene within the frame.
+
+    Args:
+        views: with pinhole cameras.
+        degrees: the angle, in [-360, 360]; positive is clockwise for who looks at a picture.
+    """
+    if not degrees or not len(views):
+        return views
+    angle, quarters = math.radians(degrees), round(degrees / 90)
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    cameras = views.cameras
+    lenses, poses = cameras.intrinsics.clone(), (turn.to(cameras.extrinsics) @ cameras.extrinsics)
+    height, width = views.images.shape[-2:]
+    for _ in range(quarters % 4):  # x' = H - 1 - y, y' = x
+        fx, fy, cx, cy = (lenses[:, i, j].clone() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        lenses[:, 0, 0], lenses[:, 1, 1], lenses[:, 0, 2], lenses[:, 1, 2] = fy, fx, height - 1 - cy, cx
+        height, width = width, height
+
+    def turned(image: Tensor) -> Tensor:
+        return torch.rot90(image, -quarters, (-2, -1))
+
+    return replace(
+        views,
+        cameras=pinholes(lenses, poses, (height, width)),
+        images=turned(views.images),
+        masks=None if views.masks is None else turned(views.masks),
+        light=None if views.light is None else turned(views.light),
+    )
 
 
 def upright(extrinsics: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
@@ -39,6 +40,7 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         up: the upright direction in the world, of length 1.
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
+        turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
         sway: rotations and positions of a closed path through the training cameras, see :func:`kgs.io.film.tour`.
     """
     positions = camera_centers(cameras.extrinsics).numpy()
@@ -71,6 +73,9 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
         "arc": _arc(rotations, positions, first, found[first]["distance"], up.numpy()),
+        "turned": [
+            _turned(cameras.extrinsics, quarters, positions, first, found[first]["distance"]) for quarters in (1, 2, 3)
+        ],
         "sway": _sway(path.numpy(), positions[first]),
     }
 
@@ -137,6 +142,15 @@ def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Ar
         "yaw": None if gaps[widest] < _RING_GAP else _widened(float(low), float(high)),
         "pitch": _widened(float(pitches.min()), float(pitches.max())),
     }
+
+
+def _turned(extrinsics: Tensor, quarters: int, positions: Array, first: int, distance: float) -> dict[str, Any]:
+    """What is up, and the arc of the cameras, where all pictures are turned clockwise by some quarters."""
+    poses = extrinsics.detach().double().cpu().clone()
+    for _ in range(quarters):
+        poses[:, :2] = torch.stack([-poses[:, 1], poses[:, 0]], 1)  # right and down
+    up = common_up(poses)
+    return {"up": up.tolist(), "arc": _arc(poses[:, :3, :3].numpy(), positions, first, distance, up.numpy())}
 
 
 def _widened(low: float, high: float) -> list[float]:

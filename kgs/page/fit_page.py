@@ -16,6 +16,7 @@ from kgs.errors import DataError
 from kgs.fit.prune import contributions, left_out
 from kgs.fit.run import Finished
 from kgs.fit.saved import SavedFit
+from kgs.io.cameras import rolled
 from kgs.io.console import each, say
 from kgs.io.film import film_within
 from kgs.io.json_files import read_json
@@ -48,6 +49,7 @@ def write_fit_page(
     report: Path | None = None,
     film: Path | None = None,
     photos: bool = True,
+    roll: float = 0.0,
 ) -> str:
     """Write the page of one or more fits of a scene; the viewer shows one of them.
 
@@ -67,12 +69,13 @@ def write_fit_page(
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
         film: a WebM file to show; ignored if kgs did not write it.
         photos: whether the page shows photos, renders and their differences.
+        roll: degrees by which all pictures are turned clockwise, see :func:`kgs.io.cameras.rolled`.
 
     Returns:
         What was reduced to respect the page's limit of size, in words; "" for nothing.
     """
     views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
-    shown = shown or views.select(spread(len(views), MOST_PICTURES))
+    shown = rolled(shown or views.select(spread(len(views), MOST_PICTURES)), roll)
     if not photos:
         shown = shown.select([])
     psnr = {run: _psnr_of_views(metrics) for run, metrics in runs.items()}
@@ -96,7 +99,7 @@ def write_fit_page(
         path,
         title,
         gaussians,
-        _all_cameras(scene.train, scene.test),
+        _all_cameras(rolled(scene.train, roll), rolled(scene.test, roll)),
         [*scene.train.names, *scene.test.names],
         [words[0]] * len(scene.train) + [words[1]] * len(scene.test),
         near_plane=near_plane,
@@ -143,7 +146,7 @@ def _write_page_of(
     request = settings["request"]
     title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
     options: dict[str, Any] = {"report": scene.root / CAMERAS_REPORT, "film": path.with_name(FILM)}
-    options |= {"settings": settings, "photos": request.get("photos", True)}
+    options |= {"settings": settings, "photos": request.get("photos", True), "roll": request.get("roll", 0.0)}
     write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **options)
 
 

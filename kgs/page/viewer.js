@@ -47,6 +47,7 @@ function softened(change, angle, [low, high]) {
 class Viewer {
   // `scene` is what `viewer_scene` of kgs/page/cameras.py returns.
   constructor(frame, renderer, scene) {
+    this.frame = frame;
     this.canvas = frame.querySelector("canvas");
     this.overlay = frame.querySelector("svg");
     this.choice = frame.querySelector("select");  // of a camera; it can be used with the keyboard
@@ -56,6 +57,7 @@ class Viewer {
     this.flight = 0;  // number of the latest movement: an earlier flight stops
     this.dragged = 0;  // pixels since the pointer was pressed
     this.pyramids = scene.cameras.map((camera, index) => this.addPyramid(camera, index));
+    this.quarters = 0;  // by which all pictures are turned clockwise
     this.isFading = true;
     this.isRoaming = false;
     this.isEngaged = false;  // the last press of a pointer was on the stage
@@ -194,6 +196,23 @@ class Viewer {
     const unitsPerPixel = distance / (focal[0] * this.scale());
     const sideways = add(position, rotation[0], -x * unitsPerPixel);
     this.change({ position: add(sideways, rotation[1], -y * unitsPerPixel) });
+  }
+
+  // Turns all pictures clockwise by a quarter, where photos lie on their side: right, down = -down, right.
+  rollQuarter() {
+    const { scene } = this;
+    const turnedFrame = ([right, down, forward]) => [down.map((value) => -value), right, forward];
+    const turned = ({ rotation, size: [width, height], focal: [fx, fy], centre: [cx, cy], ...rest }) => ({
+      ...rest, rotation: turnedFrame(rotation), size: [height, width], focal: [fy, fx], centre: [height - 1 - cy, cx],
+    });
+    if (!this.quarters) this.uprights = [{ up: scene.up, arc: scene.arc }, ...scene.turned];
+    this.quarters = (this.quarters + 1) % 4;
+    this.scene = {
+      ...scene, ...this.uprights[this.quarters], cameras: scene.cameras.map(turned),
+      sway: scene.sway.map((pose) => ({ ...pose, rotation: turnedFrame(pose.rotation) })),
+    };
+    this.change(turned(this.eye));
+    this.frame.style.setProperty("--aspect", this.eye.size.join(" / "));
   }
 
   // -- Drawing.
@@ -338,6 +357,7 @@ class Viewer {
       if (arrow && event.shiftKey) this.move(-MOVE_PER_KEY * arrow[0], -MOVE_PER_KEY * arrow[1]);
       else if (arrow) this.turn(TURN_PER_KEY * arrow[0], TURN_PER_KEY * arrow[1]);
       else if (event.key in ZOOM_KEYS) this.zoom(ZOOM_KEYS[event.key]);
+      else if (event.key === "r") this.rollQuarter();
       else if (event.key === "0" || event.key === "Home") this.flyTo(this.scene.first);
       else return;
       event.preventDefault();
