@@ -9,7 +9,7 @@ if "torch" not in sys.modules and "GOMP_SPINCOUNT" not in os.environ:
 
 from .errors import DataError, TrainingDiverged
 
-TYPE_CHECKING = False  # as type checkers know it: typing would be most of what is imported here
+TYPE_CHECKING = False  # type checkers take it as True; importing `typing` would cost more than all the rest here
 if TYPE_CHECKING:
     from typing import Any
 
@@ -54,7 +54,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> "Any":
-    """Load a public name, and torch with it, when it is first asked for: the command `kgs` answers before that."""
+    """Load a public name, and torch with it, on first use, so that the command `kgs` can answer before that."""
     if name in _HOMES:
         value = getattr(import_module(f".{_HOMES[name]}", __name__), name)
     elif name in _HOMES.values():

@@ -2,11 +2,11 @@
 
 The derivative is closed form for pinhole and orthographic cameras and two reverse passes through Kornia's `project`
 for distorted ones. Far outside the field of view the first-order footprint is meaningless and grows without bound;
-as in gsplat it is taken at a point clamped to 15 % of the image size beyond its borders (perspective models without
-a wide-angle mapping only). The limits are constants; the gradient follows the clamp exactly.
+as in gsplat, it is therefore evaluated at a point clamped to 15 % of the image size beyond its borders (perspective
+models without a wide-angle mapping only). The limits are constants; the gradient follows the clamp exactly.
 
-A distorted lens sees up to the angle where the radius in the image stops growing: what lies behind this fold of the
-radial polynomial is not drawn.
+A distorted lens sees only up to the angle where the radius in the image stops growing: what lies beyond this fold of
+the radial polynomial is not drawn.
 """
 
 import math
@@ -37,7 +37,7 @@ Pixels = Callable[[Tensor], Tensor]
 class PosedCamera:
     """One of Kornia's camera models together with its poses: for lenses that `PinholeCamera` cannot describe.
 
-    Its tensors are not cloned: the next render uses a parameter that an optimiser has changed.
+    Its tensors are not cloned, so the next render sees what an optimiser has changed in them.
 
     Convention:
         OpenCV axes (x right, y down, z forward), pixels with integer centres.
@@ -85,9 +85,9 @@ class Lens:
 def pinhole_cameras(
     viewmats: Tensor, Ks: Tensor, width: int, height: int, pixel_centers: str = "integer"
 ) -> PinholeCamera:
-    """Kornia's pinhole cameras from matrices and plain sizes; differentiable.
+    """Kornia's pinhole cameras from matrices and integer sizes; differentiable.
 
-    A `PinholeCamera` clones its arguments. Where poses or intrinsics are optimised, make a new one in each step.
+    A `PinholeCamera` clones its arguments. If you optimise poses or intrinsics, create a new one in each step.
 
     Convention:
         World-to-camera matrices, OpenCV axes. The result has integer pixel centres, whatever those of `Ks`.

@@ -51,9 +51,9 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: holds each of the model's parameters; others that it holds are not touched. Its state for a parameter
-            consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD, RMSprop; not
-            LBFGS or Adafactor.
+        optimizer: holds each of the model's parameters; other parameters in it stay as they are. Its state for a
+            parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD,
+            RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
@@ -107,7 +107,7 @@ class Densifier:
 
     @property
     def mean_gradients(self) -> Tensor:
-        """The statistic since the last `step`, `(N,)`; the value before, or the parent's, counts as one observation."""
+        """The mean since the last `step`, `(N,)`; the value before, or the parent's, counts as one observation."""
         sums, counts, last = self._statistics.values()
         return (last + sums) / (1 + counts)
 

@@ -32,7 +32,7 @@ def drop_gaussian(
             all cameras, `(C, N)` one per camera.
         p: the drop rate, in [0, 1).
         training: if False, nothing is dropped.
-        generator: draws the mask on its own device, whatever that of `opacities`; None takes torch's default one.
+        generator: draws the mask on its own device, whatever that of `opacities`; None uses torch's default one.
 
     Returns:
         A tensor like `opacities`; the same object if nothing is dropped (p = 0 or not training).
@@ -67,8 +67,8 @@ class DropGaussian(nn.Module):
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
         seed: None draws from torch's default generator of the tensor's device, as `nn.Dropout` does. An integer gives
-            the layer a stream of its own, the same on every device, kept through `.to`, deepcopy and pickle; replicas
-            of `nn.DataParallel` draw theirs from it, in `DistributedDataParallel` give each rank another seed. Such a
+            the layer a stream of its own, the same on every device, kept through `.to`, deepcopy and pickle. Replicas
+            of `nn.DataParallel` draw from it; with `DistributedDataParallel` give each rank its own seed. Such a
             layer must not run inside `torch.utils.checkpoint`, which restores only the default generators.
 
     Raises:

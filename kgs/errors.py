@@ -4,7 +4,7 @@ from os import PathLike
 
 
 def printable(text: object) -> str:
-    """Text for one line of a message: control characters, which names of files may have, become escapes."""
+    """Text as one line of a message: control characters, as file names may have, are escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
@@ -14,7 +14,7 @@ class DataError(Exception):
     Args:
         path: the file or folder at fault.
         field: the part of it that is wrong (a key, a property, a line), or "" for the file as a whole.
-        reason: what was expected and what came.
+        reason: what was expected and what was found.
     """
 
     def __init__(self, path: str | PathLike[str], field: str, reason: str) -> None:

@@ -1,4 +1,4 @@
-"""Points, pixels and poses: projections of many points, where cameras stand, how far apart points are."""
+"""Points, pixels and poses: projection of points, positions of cameras, spacing of points."""
 
 import math
 
@@ -31,7 +31,7 @@ def camera_extent(extrinsics: Tensor) -> float:
     Source: the normalisation of NeRF++ (Zhang et al., 2020) as 3D Gaussian Splatting uses it; over training cameras.
 
     Convention:
-        World-to-camera extrinsics; which way the axes point does not matter.
+        World-to-camera extrinsics; the direction of the axes does not matter.
 
     Args:
         extrinsics: matrices [R | t] with a rotation R, `(C, 4, 4)`, C >= 1, else a ValueError.
@@ -78,7 +78,7 @@ def degrees_between(rotations: Tensor, others: Tensor) -> Tensor:
 
 
 def project_points(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, float64; pixels mean nothing at depth <= 0."""
+    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, float64; pixels are invalid at depth <= 0."""
     intrinsics, extrinsics = camera_matrices(cameras)
     local = torch.einsum("vij,pj->pvi", extrinsics[:, :3, :3], points.double()) + extrinsics[:, :3, 3]
     image = torch.einsum("vij,pvj->pvi", intrinsics, local)

@@ -1,4 +1,4 @@
-"""gsplat's call in tensors, for trainers that have it: the same names, order and results, in torch."""
+"""`gsplat.rasterization` on kgs: the same arguments, order and results, for trainers that are written for gsplat."""
 
 import dataclasses
 from typing import Any
@@ -40,11 +40,11 @@ _NO_OPS: dict[str, Any] = {
     "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
-_WITHOUT_EFFECT = ("macro_tile",)  # how gsplat works, not what comes of it
+_WITHOUT_EFFECT = ("macro_tile",)  # they change how gsplat works, not its result
 _LARGEST_RADIUS = 2e9  # pixels, as an int32
 
 
-def rasterization(  # noqa: D417 - what does nothing is described together
+def rasterization(  # noqa: D417 - arguments without effect are described together
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -114,8 +114,8 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         n_cameras.
 
     Raises:
-        TypeError: a tensor is none, or of another dtype or device; an argument that gsplat does not have.
-        ValueError: shapes or options do not fit, or an argument of gsplat's asks for what kgs does not do.
+        TypeError: an argument is not a tensor, or of another dtype or device; gsplat has no such argument.
+        ValueError: shapes do not match, an option is out of range, or kgs does not support what is asked for.
         ModuleNotFoundError: the backend is numba, and it is not installed.
 
     Examples:
@@ -145,7 +145,7 @@ def rasterization(  # noqa: D417 - what does nothing is described together
         colors, sh_degree = means.new_zeros(n, 0), None
     colors = _check_colors(colors, sh_degree, count, n)
     own = sh_degree is None and colors.ndim == 3
-    every = colors.transpose(0, 1).flatten(1) if own else colors  # one that is not finite in some camera is in none
+    every = colors.transpose(0, 1).flatten(1) if own else colors  # not finite in one camera: left out in all
     gaussians = Gaussians(means, quats, scales, opacities, every)
     options = RasterOptions(tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes)
     projected = project(gaussians, posed, options=options, colors=image and not own, backend=backend)

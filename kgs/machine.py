@@ -22,7 +22,7 @@ _AT_FIRST_USE, _PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 
 
 def check_device(name: str) -> torch.device:
-    """The device of that name; ValueError where torch knows none, or it cannot hold a number."""
+    """The device of that name; ValueError if torch has no such device, or it cannot hold a number."""
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # the meta device has no numbers
@@ -33,7 +33,7 @@ def check_device(name: str) -> torch.device:
 
 
 def check_tools(device: str, backend: str, *packages: str) -> torch.device:
-    """The device; an error where it, the backend or a package that a command will need is not there."""
+    """The device; raises if it, the backend or a package that a command needs is missing."""
     place = check_device(device)
     resolve(backend, place)
     for package in packages:
@@ -42,7 +42,7 @@ def check_tools(device: str, backend: str, *packages: str) -> torch.device:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what decides a result; numba is left out where it is not installed."""
+    """Versions of everything that affects a result; without numba if it is not installed."""
     found = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
     with contextlib.suppress(PackageNotFoundError):
         found["numba"] = version("numba")
@@ -61,7 +61,7 @@ def revision(path: Path) -> str | None:
 
 
 def peak_rss_mb() -> int:
-    """Largest resident memory of this process so far, in MiB; 0 where the system does not tell (Windows)."""
+    """Largest resident memory of this process so far, in MiB; 0 where the system does not report it (Windows)."""
     status = Path("/proc/self/status")
     if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
@@ -74,6 +74,6 @@ def peak_rss_mb() -> int:
 
 
 def bytes_of(gaussians: int, photos: Tensor) -> int:
-    """What a fit of so many Gaussians to photos `(V, 3, H, W)` takes at most, without the renderer's working memory."""
+    """Upper bound of a fit's memory, for photos `(V, 3, H, W)`, without the renderer's working memory."""
     pictures: int = photos[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * photos.nbytes
     return _AT_FIRST_USE + gaussians * _PER_GAUSSIAN + pictures

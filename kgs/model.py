@@ -75,7 +75,7 @@ class GaussianModel(nn.Module):
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Self:
-        """Start from a coloured point cloud: one round Gaussian of opacity 0.1 per point, of its colour.
+        """Start from a coloured point cloud: per point one isotropic Gaussian of its colour, with opacity 0.1.
 
         The standard deviation is the root of the mean squared distance to the three nearest points, at least a
         thousandth of the cloud's median one (points may coincide).

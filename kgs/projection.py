@@ -2,7 +2,7 @@
 
 Source: Zwicker et al. 2001 (the affine approximation at the centre), Kerbl et al. 2023.
 
-Whatever cannot be seen is left out before anything is divided: behind the near plane, not finite, beside the image.
+Gaussians nearer than the near plane, beside the image or not finite are left out before anything is divided.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Touches = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 def project_torch(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
-    """`kgs.project` in torch, for every camera, device and dtype; trusts its arguments."""
+    """`kgs.project` in torch, for every camera, device and dtype; does not check its arguments."""
     device, views, finite = gaussians.means.device, lenses(cameras, size), finite_gaussians(gaussians)
     cutoff = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
     touches, near = partial(_touches_image, size, options.eps2d, cutoff), options.near_plane
@@ -38,7 +38,7 @@ def project_torch(
 def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:
     """The shortest axis of each projected Gaussian, turned towards its camera; unit vectors in world axes, `(M, 3)`.
 
-    Differentiable with respect to the quaternions. At right angles to the view both directions are as good.
+    Differentiable with respect to the quaternions. At right angles to the view either direction is correct.
     """
     ids = projected.gaussian_ids
     axis = gaussians.scales.detach().index_select(0, ids).argmin(1)

@@ -41,18 +41,19 @@ def project(
     Args:
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        options: None for the defaults. Of these matter near_plane, eps2d and alpha_threshold (with 0 all in front of
-            the camera are seen).
-        colors: whether colours are wanted.
+        options: None for the defaults. Only near_plane, eps2d and alpha_threshold matter here (at a threshold of 0 all
+            Gaussians in front of the camera are seen).
+        colors: whether colours are computed.
         backend: "auto", or the name of one, see `kgs.backends`.
         fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Returns:
-        The visible pairs (camera, Gaussian): those that would touch the image if their opacity were 2, or the largest
-        of all if that is more. (The opacity of each is left aside, so that a dropped Gaussian counts as seen.)
+        The visible pairs (camera, Gaussian): those that would touch the image with an opacity of 2, or with the largest
+        of all opacities if that is more. (Their own opacity is ignored, so that a dropped Gaussian counts as seen.)
 
     Raises:
-        TypeError: no Gaussians, cameras of another kind, dtype or device, or both `options` and fields of them.
+        TypeError: `gaussians` or `cameras` are of another type, dtype or device, or both `options` and fields of them
+            are given.
         ValueError: an option is out of range, cameras of different image sizes, or opacities `(C, N)` for another
             number of cameras.
     """
@@ -86,7 +87,7 @@ def composite(
     Args:
         projected: M visible pairs (camera, Gaussian).
         features: what to accumulate, `(M, F)`: colours, depths, anything.
-        options: None for the defaults. Of these matter tile_size, alpha_threshold, transmittance_stop and max_bytes.
+        options: None for the defaults. Only tile_size, alpha_threshold, transmittance_stop and max_bytes matter here.
         median_depth: also find the depth at which T falls below one half.
         chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
@@ -130,7 +131,7 @@ def composite(
 
 
 def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
-    """Raise a TypeError or ValueError unless all that compositing reads fits together."""
+    """Raise a TypeError or ValueError unless the inputs of compositing match."""
     check_tensor("features", features)
     m, like = len(projected), projected.means2d
     if features.ndim != 2 or len(features) != m:
@@ -145,7 +146,7 @@ def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
     ids = projected.camera_ids
     if ids.dtype != torch.int64 or ids.device != like.device or tuple(ids.shape) != (m,):
         raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
-    if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # of a GPU this would wait for it
+    if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # on a GPU this would synchronise
         first, last = (int(find(ids.numpy())) for find in (np.min, np.max))
         if first < 0 or last >= projected.num_cameras:
             wrong = first if first < 0 else last
@@ -177,7 +178,7 @@ class _Composite(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         needs = ctx.needs_input_grad[:4]
-        # the memory of what was kept is free as soon as it was used; a second backward makes it again
+        # what was kept is freed as soon as it has been used; a second backward computes it again
         found = ctx.compositor.backward(ctx.saved_tensors, _taken(ctx), grad_sums, grad_transmittance, needs)
         return *found, None, None
 

@@ -19,7 +19,7 @@ SH_SIZES = (1, 4, 9, 16)
 
 @dataclass(frozen=True)
 class RasterOptions:
-    """How Gaussians become pixels: every option with its default and its range, once.
+    """How Gaussians become pixels: the options of the renderer, with their defaults and ranges.
 
     Args:
         tile_size: side of a tile in pixels, >= 1; None for the backend's own (8). The speed depends on it, the

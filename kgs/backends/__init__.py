@@ -3,7 +3,7 @@
     "torch"   every call (`kgs.backends.pytorch`)
     "numba"   float32 on a CPU (`kgs.backends.cpu`, extra "fast")
 
-A backend is a class with its stages as methods, see :class:`Backend`; one more is a folder, and its line in `BACKENDS`.
+A backend is a class with its stages as methods, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ def check_backend(name: str) -> None:
 
 
 def resolve(name: str, device: torch.device) -> str:
-    """The name of what "auto" takes for float32 on a device; another name as it is.
+    """The name of the backend that "auto" takes for float32 on a device; other names are returned unchanged.
 
     Raises:
         ValueError: the backend does not exist, or it does not run on the device.
@@ -71,7 +71,7 @@ def choose(name: str, stage: str, covers: Callable[[Backend], bool]) -> Backend:
 
 
 def takes_kernels(name: str, stage: str, like: Tensor) -> bool:
-    """Whether a stage outside the renderer runs on numba kernels, for those that have nothing but these and torch.
+    """Whether a stage outside the renderer runs on numba kernels; for stages that exist in numba and torch only.
 
     Raises:
         ValueError: the backend does not exist, or numba is named and does not cover such a tensor.

@@ -15,15 +15,15 @@ Inputs = tuple[Tensor, Tensor, Tensor, Tensor]  # means2d (M, 2), factors (M, 2,
 
 
 class Compositor(Protocol):
-    """Compositing of one call, forward and backward, on lists of tiles that were made when it was.
+    """Compositing of one call, forward and backward, on tile lists that its constructor makes.
 
-    `kgs.stages` makes the one autograd function of it. No method is recorded by autograd.
+    `kgs.stages` wraps it in the one autograd function. Autograd records none of its methods.
     """
 
     def forward(self, inputs: Inputs, keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
         """Features `(C, F, H, W)`, transmittance `(C, 1, H, W)`, median depth `(C, 1 or 0, H, W)`; and what was kept.
 
-        With `keep` something may be kept for `backward`: whatever the compositor likes, None where memory is short.
+        With `keep`, any state may be kept for `backward`; None where memory is short.
         """
 
     def backward(
@@ -38,7 +38,7 @@ class Compositor(Protocol):
 class Backend(ABC):
     """An implementation of the renderer. Torch defines what is right; others give the same within rounding.
 
-    Arguments of the stages are checked before.
+    The arguments of the stages have been checked.
 
     Attributes:
         name: what `backend=` calls it.

@@ -1,4 +1,4 @@
-"""The backend in plain torch: every call, device and dtype; the others are measured by it."""
+"""The backend in plain torch: every call, device and dtype; the reference for the others."""
 
 from torch import Tensor
 

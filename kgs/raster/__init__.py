@@ -17,8 +17,8 @@ k on, as if the transmittance before it were 1:
     V_k = alpha_k (c_k . g) + (1 - alpha_k) V_{k+1},   V_end = g_T,   dL/d ln alpha_k = w_k (c_k . g - V_{k+1})
 
 and V_{k+1} = 0 where the transmittance falls below the stop at layer k. V is a mean of colours: no sum grows large,
-nothing is divided by 1 - alpha. What a Gaussian gets from a tile are the six moments of that derivative over the
-pixels, about its centre; they are summed over its tiles.
+nothing is divided by 1 - alpha. For each Gaussian, a tile contributes the six moments of that derivative over
+the pixels, about the centre of the Gaussian; they are summed over its tiles.
 
 An image that needs more than `max_bytes` is made in row slices. Where lists are long, a row slice is made in depth
 slices, nearest first, with lists only for tiles that are not yet opaque: hidden Gaussians are not listed or sorted.

@@ -5,8 +5,8 @@ For each row of tiles the columns that the ellipse touches are closed form, beca
 point within a horizontal strip lies at its own rightmost point if that is in the strip, else on the strip's nearer
 edge. Every tile of this span is touched, every other is not; no tile has to be tested.
 
-Rows of tiles are numbered through all cameras. On a GPU each question for a number waits until all work is done, so
-sizes that follow from others are computed on the host.
+Rows of tiles are numbered through all cameras. On a GPU reading a number waits until all work is done, so sizes
+that follow from others are computed on the host.
 """
 
 from dataclasses import dataclass, replace

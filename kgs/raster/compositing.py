@@ -4,9 +4,9 @@ Tiles are the last dimension of all tensors here, and P the pixels of a tile: an
 many tiles side by side. A row slice is drawn in depth slices; within one, tiles are sorted by the length of their lists
 and cut into steps: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
 
-Nothing here is a product of matrices, which torch may be told to round (`torch.set_float32_matmul_precision`,
-`torch.autocast`), and which adds in an order that depends on sizes. Nothing is added atomically. On a CPU the layers of
-a pixel are added one by one, so that no bit of the image depends on how they were cut into steps.
+There are no matrix products: torch may round them (`torch.set_float32_matmul_precision`, `torch.autocast`), and the
+order of their sums depends on sizes. Nothing is added atomically. On a CPU the layers of a pixel are added one by one,
+so that no bit of the image depends on how they were cut into steps.
 """
 
 import math
@@ -34,7 +34,7 @@ class DeviceSettings:
     pairs: int  # of a Gaussian and a pixel in a step, at most
     layers: int  # entries per tile in a depth slice: few pixels need more before they are opaque
     by_layer: bool  # scans are made layer by layer: least memory is passed, and many operators are called
-    may_ask: bool  # whether a question for a number is cheap; a GPU would have to finish all work before
+    may_ask: bool  # whether reading a number is cheap; on a GPU it waits until all work is done
 
 
 SETTINGS = {"cpu": DeviceSettings(2**19, 192, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
@@ -135,7 +135,7 @@ class TorchCompositing:
         return canvas, (canvas[0], slices) if keep else None
 
     def _gaussians(self, inputs: tuple[Tensor, ...], ids: Tensor) -> "Columns":
-        """What steps need of some Gaussians, and of a dummy at the end that is never seen."""
+        """What steps need of some Gaussians, followed by a dummy that is never seen."""
         means2d, factors, opacities, features = (x.index_select(0, ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self._eps2d), (0, 1))
         table[0, -1] = -torch.inf
@@ -160,7 +160,7 @@ class Thresholds:
     """What counts as a layer; torch's threshold keeps what is strictly larger than a number."""
 
     floor: float  # of the exponent: exp is slow where its result is denormal
-    alpha: float  # smaller alphas, and what the floor lets through, are 0
+    alpha: float  # smaller alphas, and those at the floor, are 0
     transmittance: float  # transmittance below this counts as 0
 
     @classmethod
@@ -174,7 +174,7 @@ class Thresholds:
 
 @dataclass
 class Step:
-    """K layers of n tiles, and what the backward pass wants of them."""
+    """K layers of n tiles, and what the backward pass needs of them."""
 
     tiles: slice  # of the sorted tiles
     first: int  # position of the first layer in the lists
@@ -366,14 +366,14 @@ class DepthSlice:
         return later
 
     def _may(self, condition: Tensor) -> bool:
-        """Whether a condition holds anywhere; where asking is dear, that it may."""
+        """Whether a condition holds anywhere; True, without looking, where reading a number is expensive."""
         return not self._settings.may_ask or bool(condition.any())
 
 
 def _moments(slope: Tensor, dx: Tensor, dy: Tensor) -> list[Tensor]:
     """Sums over the pixels of `slope` `(K, P, n)` times 1, x, y, xx, xy, yy about the Gaussian's centre, `(K, n)`.
 
-    `slope` is used up.
+    `slope` is overwritten.
     """
     square = slope.unflatten(1, (dy.shape[1], dx.shape[1]))
     columns, rows = square.sum(1), square.sum(2)

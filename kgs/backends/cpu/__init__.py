@@ -1,13 +1,14 @@
 """The backend of numba kernels, for float32 on a CPU.
 
 Each `X_kernels.py` has the kernels of a stage, NumPy arrays in and out, and `X.py` beside it brings them to torch.
-Torch defines what is right; a kernel gives the same within the rounding of float32, and the formulas stand beside the
-torch code that it follows. `import kgs` does not import numba: a stage is imported when it is first used.
+Torch defines what is right; a kernel gives the same within the rounding of float32, and its formulas are
+explained in the torch code that it follows. `import kgs` does not import numba: a stage is imported when it is first
+used.
 
-Rules that the speed hangs on. Each was measured to cost a factor of 1.5 to 3 where it was broken, silently:
+Rules that keep the kernels fast. Breaking any of them cost a measured factor of 1.5 to 3, without any warning:
 
 1. Pixels of a tile are the lanes of SIMD. Loops over pixels have a constant length and read and write one flat scratch
-   array at constant distances; other arrays are only read. Else LLVM finds dependences and the loop stays scalar.
+   array at constant distances; other arrays are only read. Otherwise LLVM finds dependences and the loop stays scalar.
 2. An index must be provably >= 0, because indices wrap: a loop that counts down masks its index.
 3. `fastmath` lets sums be reassociated; NaN and infinity keep their meaning.
 4. Literals are float64 in numba: every constant is an `np.float32`.
@@ -41,7 +42,7 @@ class CpuBackend(Backend):
         return not torch.compiler.is_compiling() and super().covers(like)
 
     def covers_compositing(self, projected: ProjectedGaussians, options: RasterOptions, chunk_size: int | None) -> bool:
-        """Tiles of its own size and chunks of its own."""
+        """Only its own tile size, and no `chunk_size`."""
         narrow = projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
         return options.tile_size in (None, self.tile_size) and chunk_size is None and narrow
 

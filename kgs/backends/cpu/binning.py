@@ -1,8 +1,9 @@
-"""Lists of tiles, laid out for the kernels: what each Gaussian reaches, row slices, and in these bands.
+"""Tile lists, laid out for the kernels: what each Gaussian reaches, row slices, and the bands of a row slice.
 
-The lists of a band, some rows of tiles, are made and used by one thread. A Gaussian has a number of its own in each
-band that it reaches, its member in depth order: what a band reads of its Gaussians and adds up for them lies close
-together, however many there are in the picture. Members are few more than Gaussians, which are small.
+The lists of a band, some rows of tiles, are made and used by one thread. The Gaussians that reach a band are its
+members, numbered in depth order within the band: what a band reads of its members and adds up for them lies close
+together in memory, however many Gaussians the image has. Small Gaussians rarely span bands, so there is little
+duplication.
 """
 
 from collections.abc import Sequence

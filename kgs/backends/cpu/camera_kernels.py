@@ -1,4 +1,4 @@
-"""The gradient of projection that goes to pinhole cameras: what each Gaussian says of a pose and of intrinsics."""
+"""The gradient of projection for pinhole cameras: the contribution of each Gaussian to pose and intrinsics."""
 
 import numpy as np
 

@@ -164,7 +164,7 @@ def composite_backward(
     place_pixels(pixels)
     g = scratch(F * P)
     layers = np.empty((K, 7 + F), np.float32)
-    s = scratch((K + 1) * _SLAB)  # of each layer of a chunk: alpha, w, T before it, V from it on
+    s = scratch((K + 1) * _SLAB)  # of each layer of a chunk: alpha, w, T before it, V from this layer on
     for t in range(len(done)):
         count = done[t]
         if count == 0:

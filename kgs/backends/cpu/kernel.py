@@ -21,7 +21,7 @@ _SOURCES = sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()
 
 
 def _cached(**options: Any) -> Callable[[Any], Any]:
-    """Numba's decorator; cached on the disk until any file of kernels changes: they have code of each other in them."""
+    """Numba's decorator; cached on the disk until any file of kernels changes: they contain each other's code."""
 
     def decorate(function: Any) -> Any:
         kernel = nb.njit(nogil=True, cache=True, error_model="numpy", **options)(function)
@@ -70,14 +70,14 @@ class _Notice(event.Listener):
     said = False
 
     def on_start(self, event: Any) -> None:
-        """A function is being compiled: of kgs or of anybody."""
+        """Called before numba compiles any function, of kgs or not."""
         ours = event.data["dispatcher"].py_func.__module__.startswith("kgs.")
         if ours and not self.said and sys.stderr is not None and sys.stderr.isatty():  # None: closed by `2>&-`
             print("kgs: compiling, once, about 20 s", file=sys.stderr, flush=True)
             self.said = True
 
     def on_end(self, event: Any) -> None:
-        """Nothing to say."""
+        """Called after it; does nothing."""
 
 
 event.register("numba:compile", _Notice())

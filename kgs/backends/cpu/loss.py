@@ -1,4 +1,4 @@
-"""The photometric loss by the kernels: the value and its gradient are made in one go."""
+"""The photometric loss by the kernels: value and gradient are computed together."""
 
 import numpy as np
 import torch

@@ -103,7 +103,7 @@ class _Projection(torch.autograd.Function):
 
 
 def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
-    """Whether they are pinhole cameras whose matrices are an affine map and a pose, one with a gradient a rigid one."""
+    """Whether these are pinhole cameras with affine intrinsics and poses; rigid poses if these need a gradient."""
     if not isinstance(cameras, PinholeCamera):
         return False
     matrices = cameras.intrinsics, cameras.extrinsics
@@ -122,7 +122,7 @@ def _is_turn(matrix: Array) -> bool:
 
 
 def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, ...]]:
-    """What the kernels know of each camera; in NumPy, which is faster for numbers as few."""
+    """The cameras as the kernels take them; in NumPy, which is faster for so few numbers."""
     views = list[tuple[Array, ...]]()
     for matrix, pose in zip(*arrays(cameras.intrinsics, cameras.extrinsics), strict=True):
         focal, centre, extent = matrix.diagonal()[:2], matrix[:2, 2], np.array(size[::-1], matrix.dtype)

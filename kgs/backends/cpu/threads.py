@@ -13,7 +13,7 @@ _LEAST = 8192  # numbers or rows of a range: below that a second thread costs mo
 
 @dataclass(frozen=True)
 class _Work:
-    """Ranges that are still to do, and for each one that is done None or its error."""
+    """The ranges still to do, and for each finished one None or its error."""
 
     ranges: deque[tuple[int, int]]
     kernel: Callable[..., None]
@@ -21,7 +21,7 @@ class _Work:
     done: SimpleQueue[BaseException | None] = field(default_factory=SimpleQueue)
 
     def drain(self) -> None:
-        """Do what nobody else has begun."""
+        """Process ranges until no thread has any left to start."""
         while True:
             try:
                 begin, end = self.ranges.popleft()
