@@ -17,7 +17,7 @@ import tyro
 import kgs
 import kgs.cli.run
 from kgs import cli
-from kgs.fit.config import FAST, PAPER, FitConfig
+from kgs.fit.config import DETAILS, PAPER, FitConfig
 from kgs.io.results_folder import RESULTS
 
 STEPS = 30
@@ -145,7 +145,10 @@ def test_bare_photos_need_poses(tmp_path, capsys):
         (["fit", "{scene}", "-o", "{scene}/transforms_train.json/below"], "expected a folder for results"),
         (["fit", "{scene}", "-o", "{out}", "--downscale", "0"], "--downscale: expected"),
         (["fit", "{scene}", "-o", "{out}", "--size", "31"], "--size: expected at least 32 pixels, got 31"),
-        (["fit", "{scene}", "-o", "{out}", "--size", "48", "--downscale", "2"], "--size or --downscale, got both"),
+        (
+            ["fit", "{scene}", "-o", "{out}", "--size", "48", "--downscale", "2"],
+            "--size: expected either a size or a downscale factor, got both",
+        ),
         (["demo", "-o", "{out}", "--steps", "0"], "--steps: expected"),
         (["demo", "-o", "{out}", "--device", "foo"], "--device: expected"),
         (["demo", "-o", "{out}", "--size", "11", "40"], "--size: expected"),
@@ -212,22 +215,35 @@ def test_as_many_first_points_as_asked_for(folder, tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text())["init"] == {"kind": "random", "points": 321}
 
 
-def test_presets_and_fast_are_starts_that_options_change(folder, tmp_path, monkeypatch):
+def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, monkeypatch):
     seen = []
 
     def fit_scene(scene, config, *args, **kwargs):
-        seen.append(config)
+        seen.append((config, max(scene.train.images.shape[-2:])))
         raise kgs.DataError(folder, "", "enough")
 
     monkeypatch.setattr("kgs.fit.run.fit_scene", fit_scene)
-    paper = ["--preset", "paper"]
-    for options in ([], ["--fast"], ["--fast", "--steps", 700], ["--steps", 700], paper, [*paper, "--fast"]):
+    low, high = (DETAILS[name].entries for name in ("low", "high"))
+    cases = [
+        ([], FitConfig()),
+        (["--detail", "low"], FitConfig(**low)),
+        (["--detail=low", "--steps", 700], FitConfig(**{**low, "steps": 700})),
+        (["--detail", "high"], FitConfig(**high)),
+        (["--detail", "high", "--init-points", 9, "--size", 40], FitConfig(**{**high, "init_points": 9})),
+        (["--steps", 700], FitConfig(steps=700)),
+        (["--preset", "paper"], PAPER),
+        (["--preset", "paper", "--detail", "low"], replace(PAPER, **low)),
+    ]
+    for options, _ in cases:
         assert run("fit", folder, "-o", tmp_path, *options) == 2
-    fast_paper = replace(PAPER, steps=FAST.steps, coarse=FAST.coarse)
-    assert seen == [FitConfig(), FAST, replace(FAST, steps=700), FitConfig(steps=700), PAPER, fast_paper]
+    assert [config for config, _ in seen] == [config for _, config in cases]
+    full = seen[0][1]
+    assert [size for _, size in seen] == [full, full, full, full, 40, full, full, full]  # smaller than any detail's
     assert run("fit", folder, "-o", tmp_path, "--preset=plain", "--sh-degree", 1) == 2
-    assert seen[-1] == replace(PAPER, drop=0.0, sh_degree=1)
+    assert seen[-1][0] == replace(PAPER, drop=0.0, sh_degree=1)
     assert run("fit", folder, "-o", tmp_path, "--preset", "none") == 2
+    assert run("fit", folder, "-o", tmp_path, "--size", 40, "--downscale", 2) == 2
+    assert len(seen) == len(cases) + 1
 
 
 def test_versions(capsys):

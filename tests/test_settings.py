@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from kgs.errors import DataError
-from kgs.fit.config import FAST, FitConfig
+from kgs.fit.config import DETAILS, FitConfig
 from kgs.fit.saved import read_settings
 
 REQUEST: dict[str, Any] = {"scene": "/photos", "train_views": 3, "downscale": 2.0, "background": "black"}
@@ -21,7 +20,10 @@ def written(path: Path, request: Any = REQUEST, **fit: Any) -> Path:
     return path
 
 
-@pytest.mark.parametrize("config", [FitConfig(), FAST, replace(FAST, init="file", init_file=Path("/a.ply"))])
+@pytest.mark.parametrize(
+    "config",
+    [FitConfig(), FitConfig(**DETAILS["high"].entries), FitConfig(init="file", init_file=Path("/a.ply"))],
+)
 def test_what_was_written_comes_back(tmp_path: Path, config: FitConfig) -> None:
     path = written(tmp_path / "config.json", **config.to_dict())
     assert read_settings(path) == (REQUEST | {"points": "none", "hold_out": None}, config)

@@ -66,7 +66,11 @@ def asked(truth, monkeypatch):
             numbers = [*rotation_matrix_to_quaternion(pose[:3, :3]).tolist(), *pose[:3, 3].tolist()]
             lines += [f"{name[4:-4]} {' '.join(map(str, numbers))} 1 {name}", ""]
         (model / "images.txt").write_text("\n".join(lines) + "\n")
-        report = {"photos": {name: {"image": name} for name in calls[-1]}, "size": [width, height]}
+        report = {
+            "photos": {name: {"image": name} for name in calls[-1]},
+            "size": [width, height],
+            "photo_size": [2 * width, 2 * height],
+        }
         write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
         return report | {"folder": str(out)}
 
@@ -93,7 +97,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
 
 def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
     nine = folder(9)
-    assert run("fit", nine, "-o", tmp_path / "all", "--downscale", 1.5, *FIT) == 0
+    assert run("fit", nine, "-o", tmp_path / "all", "--downscale", 3, *FIT) == 0  # of photos of 192x144
     protocol = json.loads((tmp_path / "all" / "metrics.json").read_text())["protocol"]
     assert (protocol["test"], protocol["image_size"]) == ([], [48, 64])
     assert run("fit", nine, "-o", tmp_path / "out", "--hold-out", 4, "--size", 48, *FIT) == 0

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from kgs.errors import DataError, printable
-from kgs.fit.config import FAST, PRESETS, Background, FitConfig
+from kgs.fit.config import DETAILS, PRESETS, Background, FitConfig
 from kgs.io.console import VIEWER, as_line, say, say_next
 
 from .inputs import check_roll, load
@@ -18,13 +18,17 @@ SMALLEST = 32  # pixels of the longer side
 
 
 def defaults(words: list[str]) -> dict[str, Any]:
-    """The numbers that a fit has unless an option says else: those of --preset and --fast."""
-    presets = [word.removeprefix("--preset=") for word in words if word.startswith("--preset=")]
-    presets += [value for word, value in pairwise(words) if word == "--preset"]
-    config = PRESETS.get(presets[-1] if presets else "auto", PRESETS["auto"])
-    if "--fast" in words:
-        config = replace(config, steps=FAST.steps, coarse=FAST.coarse)
-    return {"config": config}
+    """The numbers of a fit that no option gives: those of --preset and --detail."""
+    preset = PRESETS.get(_value(words, "--preset"), PRESETS["auto"])
+    detail = DETAILS.get(_value(words, "--detail"), DETAILS["normal"])
+    return {"config": replace(preset, **detail.entries)}
+
+
+def _value(words: list[str], option: str) -> str:
+    """The value of an option, "" where it is not given."""
+    joined = [word.partition("=")[2] for word in words if word.startswith(f"{option}=")]
+    values = joined + [value for word, value in pairwise(words) if word == option]
+    return values[-1] if values else ""
 
 
 def fit(
@@ -38,7 +42,7 @@ def fit(
     downscale: float | None = None,
     background: Background = "black",
     preset: Literal["auto", "paper", "plain"] = "auto",
-    fast: bool = False,
+    detail: Literal["low", "normal", "high"] = "normal",
     resume: bool = False,
     photos: bool = True,
     roll: float = 0.0,
@@ -59,19 +63,21 @@ def fit(
         views: training views, spread over the views that are not held out; all of them unless given.
         hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
             scene's files name, or else every eighth; of unposed photos none.
-        size: shrink the photos to this many pixels on their longer side; unposed ones on a CPU to 504 unless given.
-        downscale: shrink the photos by this factor, in the place of --size.
+        size: reduce the photos to this many pixels on their longer side. Unless given, that of --detail; of photos with
+            poses and --detail normal, and on a GPU, the size that they have (unposed ones at most 1600).
+        downscale: reduce the photos by this factor instead.
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
             counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
-        fast: half the steps, a third of them on small pictures: other defaults, see --fast --help.
+        detail: low: 378 pixels, half the steps, a third of them on small images. high: 1000 pixels, four times the
+            initial points, half the steps on small images. Other options win; --detail high --help shows the numbers.
         resume: continue from the checkpoint in the output folder.
         photos: photos beside their renders on the page; without them it is small, and can be shown where they must not.
         roll: turn the pictures of page and film clockwise by this angle in degrees, where photos lie on their side.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """
-    del preset, fast  # `defaults` has read them
+    del preset  # `defaults` has read it
     from kgs.datasets import load_scene
     from kgs.datasets.layouts import CAMERAS_REPORT
     from kgs.fit.prune import left_out
@@ -87,7 +93,7 @@ def fit(
     from .unposed import find_scene, is_unposed, settle
 
     if size is not None and downscale is not None:
-        raise ValueError("size: expected --size or --downscale, got both")
+        raise ValueError("size: expected either a size or a downscale factor, got both")
     if size is not None and size < SMALLEST:
         raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
     check_roll(roll)
@@ -99,8 +105,11 @@ def fit(
     request |= {"photos": photos, "roll": roll}
     request["points"] = config.init if config.init == "model-points" else "none"
     place = out
-    if unposed := is_unposed(scene):
-        request, place = find_scene(scene, out, request, config, size)
+    unposed = is_unposed(scene)
+    if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
+        size = DETAILS[detail].size
+    if unposed:
+        request, place = find_scene(scene, out, request, config.seed, size)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size is not None:

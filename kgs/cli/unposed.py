@@ -5,11 +5,8 @@ from typing import Any
 
 from kgs.datasets.images import VIDEO_SUFFIXES
 from kgs.datasets.layouts import nearest_scene
-from kgs.fit.config import FitConfig
 from kgs.io.console import each, say
 from kgs.io.results_folder import locked
-
-LONGEST = 504  # pixels of the longer side in a fit on a CPU
 
 
 def is_unposed(scene: Path) -> bool:
@@ -20,7 +17,7 @@ def is_unposed(scene: Path) -> bool:
 
 
 def find_scene(
-    photos: Path, out: Path, request: dict[str, Any], config: FitConfig, size: int | None = None
+    photos: Path, out: Path, request: dict[str, Any], seed: int, size: int | None = None
 ) -> tuple[dict[str, Any], Path]:
     """Find the cameras of unposed photos; returns how the scene is to be loaded, as config.json has it, and from where.
 
@@ -30,7 +27,8 @@ def find_scene(
         photos: the folder of the photos.
         out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
         request: what the user asked for; None stands for what was left open. No photo is held out unless it says so.
-        config: of the fit; on a CPU the photos are fitted at `LONGEST` pixels unless `request` or `size` says else.
+            Its "downscale" divides the photos as they came; that of the result the smaller copies that kgs keeps.
+        seed: of what the solvers draw.
         size: longer side of the photos in the fit, in pixels.
 
     Raises:
@@ -38,13 +36,15 @@ def find_scene(
     """
     from kgs.sfm import pose_photos
 
-    report = pose_photos(photos, out, seed=config.seed, wait=True, stage=each, say=say)
-    if size is None and request["downscale"] is None and config.device == "cpu":
-        size = LONGEST
+    report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
+    kept = max(report["size"])
+    wanted = kept if size is None else size
+    if request["downscale"] is not None:
+        wanted = max(report["photo_size"]) / request["downscale"]
+    if wanted > kept and max(report["photo_size"]) > kept:
+        say(f"the photos are fitted at {kept} pixels, the size at which kgs keeps them")
     request = request | {"hold_out": request["hold_out"] or 0, "scene": ".", "title": photos.resolve().name}
-    if size is not None:
-        request["downscale"] = max(1.0, max(report["size"]) / size)
-    return request, Path(report["folder"])
+    return request | {"downscale": max(1.0, kept / wanted)}, Path(report["folder"])
 
 
 def settle(out: Path) -> None:

@@ -261,7 +261,21 @@ PAPER = FitConfig(
     recipe=Recipe(lr_scales=0.005, lr_quats=0.001, opacity_decay=1.0, reset_interval=3000),
 )
 PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
-# Half the steps, a third of them on a quarter of the pixels, see docs/recipe.md.
-FAST = FitConfig(steps=1000, coarse=0.3)
+
+
+class Detail(NamedTuple):
+    """How much detail a fit is to show: the size of the photos, and the entries of `FitConfig` that suit it."""
+
+    size: int  # pixels of the longer side
+    entries: dict[str, Any]
+
+
+# Half the steps, a third of them on a quarter of the pixels; the default; and four times the pixels and Gaussians, for
+# half of the steps on a quarter of the pixels. docs/recipe.md has what each gains and costs.
+DETAILS = {
+    "low": Detail(378, {"steps": 1000, "coarse": 0.3, "init_points": 12_000}),
+    "normal": Detail(504, {}),
+    "high": Detail(1000, {"coarse": 0.5, "init_points": 80_000}),
+}
 # A fit within a minute on two cores, with the page and the film.
-DEMO = replace(FAST, steps=350, init_points=12_000, max_gaussians=16_000, evaluations=4)
+DEMO = FitConfig(steps=350, coarse=0.3, init_points=12_000, max_gaussians=16_000, evaluations=4)

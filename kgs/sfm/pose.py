@@ -51,7 +51,7 @@ from .write import (
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
 
 
-SETTINGS = 3  # grows with every change after which the same photos give other files
+SETTINGS = 4  # grows with every change after which the same photos give other files
 
 
 def pose_photos(
@@ -82,10 +82,10 @@ def pose_photos(
         say: where lines for the user go.
 
     Returns:
-        What photos.json holds: "photos" by file name, "matches" of each pair, "size" (width, height), "focal_px",
-        "focal_rise" (by what share squared errors grow where the focal length is a quarter off; None where that of the
-        Exif was held), "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates", "seconds"
-        and others; "reused": whether it is a former run's; and "folder": where the scene is.
+        What photos.json holds: "photos" by file name, "matches" of each pair, "size" (width, height), "photo_size"
+        (that of the smallest photo as it came), "focal_px", "focal_rise" (by what share squared errors grow where the
+        focal length is a quarter off; None where that of the Exif was held), "radial_distortion", "points",
+        "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others; "reused": whether it is a former run's; and "folder": where the scene is.
 
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
@@ -183,6 +183,7 @@ def find_cameras(
     say(f"cameras: {len(photos)} photos placed, {chosen.reconstruction.num_points3D()} points, {error:.2f} pixels off")
     return {
         **_lens(chosen, photos),
+        "photo_size": list(min(photo.size for photo in opened)),
         "focal_rise": None if held else chosen.focal_rise,
         "photos": {
             photo.path.name: {
