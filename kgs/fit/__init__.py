@@ -1,6 +1,6 @@
-"""Fits: turns a scene into a splat, with one call or in a loop of your own.
+"""Turns a scene into a splat, with one call or in a loop of your own.
 
-`initial_points` needs the packages of kgs alone; `Trainer`, `fit_scene` and `kgs.sfm` need the extra `app`.
+`initial_points` needs only the required packages; `Trainer` and `fit_scene` need the extra `app`.
 
 Examples:
     >>> from kgs.fit import FitConfig, Trainer, initial_points
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["InitialPoints", "FitConfig", "Trainer", "initial_points", "fit_scene"]
 
-_HOMES = {
+_MODULES = {
     "InitialPoints": "kgs.init_points",
     "Trainer": "kgs.fit.trainer",
     "initial_points": "kgs.init_points",
@@ -33,7 +33,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """The other names are loaded when they are asked for: they bring OpenCV and trimesh with them."""
-    if name not in _HOMES:
+    """Load the other names on first use: they import OpenCV and trimesh."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULES[name]), name)

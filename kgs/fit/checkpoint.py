@@ -1,7 +1,7 @@
-"""Checkpoints: safetensors files that are whole or absent and are verified on loading; the last two are kept.
+"""Checkpoints: safetensors files, written whole or not at all and verified on loading; the last two are kept.
 
-The tensors of a nested dict stand in the file under their keys joined by "/". All else is JSON in the file's metadata
-under "state", beside the format and the SHA-256 of tensors and JSON. Loading makes tensors and plain values alone.
+The tensors of a nested dict are stored under their keys joined by "/". Everything else is JSON in the file's metadata
+under "state", next to the format and the SHA-256 of tensors and JSON. Loading makes only tensors and plain values.
 """
 
 import hashlib
@@ -31,10 +31,10 @@ _FORMAT = f"checkpoint 4, {MADE_BY}"
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts, with text as keys, of tensors and of what JSON knows; the present file becomes the previous.
+    """Write nested dicts, with text as keys, of tensors and JSON values; the file at `path` becomes the previous one.
 
     Whenever the process dies, `newest_checkpoint` finds the old or the new state; after an OSError both files are as
-    they were. A state that holds something else is a TypeError, or a ValueError where a plain number is not finite.
+    they were. Any other value is a TypeError, and a plain number that is not finite a ValueError.
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
@@ -63,9 +63,9 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
-    """The newest state that verifies, that at `path` or the previous one, and what is wrong with the newer file or "".
+    """The state at `path`, or else in the previous file; and what is wrong with the file at `path`, or "".
 
-    Where neither verifies the DataError is about the file at `path`.
+    If neither can be read the DataError is about the file at `path`.
     """
     try:
         return load_checkpoint(path), ""
@@ -79,7 +79,7 @@ def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read what `save_checkpoint` wrote, with tensors on the CPU.
 
-    A DataError where the file is missing, no checkpoint or damaged, or a number is not finite.
+    A DataError if the file is missing, damaged or not a checkpoint, or if a number is not finite.
     """
     try:
         content = path.read_bytes()
@@ -108,7 +108,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def fingerprint(scene: Scene) -> dict[str, Any]:
-    """SHA-256 sums by which any change of a photo, mask, pose, intrinsics or the background is noticed and named."""
+    """SHA-256 sums of photos, masks, poses, intrinsics and background, to notice any change and to name it."""
 
     def of(views: Views) -> dict[str, Any]:
         tensors = {"photos": views.images, "masks": views.masks}
@@ -120,12 +120,12 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
 
 
 def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
-    """A KeyError, TypeError or ValueError unless a state is of this fingerprint and configuration.
+    """Raise KeyError, TypeError or ValueError unless a state has this fingerprint and configuration.
 
-    Returns what the user should know where the fit goes on for more steps than it was begun with.
+    Returns notes for the user, if a finished fit goes on for more steps.
     """
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
-    asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may go on elsewhere
+    asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may continue on another device
     asked |= {"backend": state["backend"]} if config.backend == "auto" else {}
     if steps == done < config.steps:
         asked["steps"] = steps
@@ -144,8 +144,8 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
             if before != values:
                 both = zip(scene[part]["names"], before or [], values or [], strict=False)
                 changed = ", ".join(name for name, one, other in both if one != other)
-                which = f"{what} of the {part} views: expected those that the fit was begun with, got others"
-                raise ValueError(which + f" for {changed:.200}" * bool(changed))
+                fault = f"{what} of the {part} views: expected those that the fit was begun with, got others"
+                raise ValueError(f"{fault} for {changed:.200}" if changed else fault)
     if state["scene"]["background"] != scene["background"]:
         raise ValueError("background: expected the one that the fit was begun with, got another")
     if max(state["stack"], default=0) >= len(scene["training"]["names"]):
@@ -154,7 +154,7 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
 
 
 def check_plain(state: dict[str, Any], *names: str) -> None:
-    """A KeyError or ValueError where one of these plain values of a state is missing or wrong."""
+    """Raise KeyError or ValueError if one of these plain values of a state is missing or wrong."""
     for name in names:
         expected, is_right = PLAIN[name]
         if not is_right(state[name]):
@@ -171,12 +171,12 @@ def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = 
 
 
 def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Tensor]]:
-    """Step and moments of each group by its name; an empty dict where it had no gradient yet."""
+    """Adam's step and moments of each parameter group, by its name; an empty dict if it had no gradient yet."""
     return {group["name"]: optimizer.state.get(group["params"][0], {}) for group in optimizer.param_groups}
 
 
 def load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
-    """The inverse of `moments_of`; a ValueError where shapes or signs are wrong, which torch does not check."""
+    """The inverse of `moments_of`; a ValueError if shapes or signs are wrong, which torch does not check."""
     groups, found = optimizer.state_dict()["param_groups"], {}
     for group, held in zip(groups, optimizer.param_groups, strict=True):
         shape, state = held["params"][0].shape, moments[group["name"]]
@@ -202,7 +202,7 @@ def _digest_all(text: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any:
-    """The value without its tensors, which go to `tensors`."""
+    """The value without its tensors, which are added to `tensors` under their path."""
     if not isinstance(value, dict):
         return value
     rest = {}
@@ -210,7 +210,7 @@ def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
         if not isinstance(key, str) or "/" in key:
             raise TypeError(f"state: expected text without '/' as keys, got {key!r}")
         if isinstance(item, Tensor):
-            tensors[path + key] = item.detach().to("cpu", copy=True).contiguous()  # tensors may share memory
+            tensors[path + key] = item.detach().to("cpu", copy=True).contiguous()  # safetensors refuses shared memory
         else:
             rest[key] = _take_tensors(item, tensors, f"{path}{key}/")
     return rest
@@ -228,7 +228,7 @@ def _is_point(value: Any) -> bool:
     return value.keys() == keys and all(x is None or is_number(x) for x in value.values())
 
 
-# The plain values of a fit's state, what is expected of each, and whether it is so.
+# The plain values of a fit's state: what is expected of each in words, and the check.
 PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "backend": ("one of ['torch', 'numba']", lambda v: v in ("torch", "numba")),
     "init": ("kind and number of initial points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),

@@ -1,8 +1,8 @@
-"""Every number of a fit, as frozen dataclasses; each is checked here, and only here.
+"""All settings of a fit as frozen dataclasses; values are checked here, and only here.
 
 Source: the official release of "DropGaussian" (CVPR 2025) for the recipe of the presets `paper` and `plain`, which is
-that of Kerbl et al. 2023 with another densification threshold and without pruning by size. The default leaves out the
-resets of opacities and, where the training views do not need them, harmonics; docs/recipe.md has what each part gains.
+that of Kerbl et al. 2023 with another densification threshold and without pruning by size. The default does not reset
+opacities, and has harmonics only if the training views need them; docs/recipe.md says what each part gains.
 """
 
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -14,15 +14,15 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_orig
 
 
 class _Range(NamedTuple):
-    """What a number may be; `ends` says which of the two limits belong to it, "[" and "]" that they do."""
+    """The interval of valid numbers. `ends` are its brackets: "[" and "]" include a limit, "(" and ")" exclude it."""
 
     least: float
     most: float = 1e300
     ends: str = "[]"
 
     def holds(self, value: float) -> bool:
-        is_end = (value == self.least and self.ends[0] != "[") or (value == self.most and self.ends[1] != "]")
-        return self.least <= value <= self.most and not is_end
+        is_excluded = (value == self.least and self.ends[0] != "[") or (value == self.most and self.ends[1] != "]")
+        return self.least <= value <= self.most and not is_excluded
 
     def __str__(self) -> str:
         if self.most == 1e300:
@@ -41,13 +41,13 @@ Background = Literal["black", "white"]
 
 @dataclass(frozen=True)
 class Recipe:
-    """The recipe for `steps` = 10 000; a shorter fit scales the counts and keeps the rates.
+    """The training recipe, written for `steps` steps; a fit of another length scales the counts and keeps the rates.
 
     Args:
         steps: steps of the whole recipe, counted from 1; each one renders one training view.
         lr_means: learning rate of the centres at the start, times the extent of the training cameras.
         lr_means_final: the same at the end, reached log-linearly.
-        lr_sh_dc: learning rate of the colour without direction.
+        lr_sh_dc: learning rate of the colour of degree 0, which does not depend on the direction.
         lr_sh_rest: learning rate of the higher harmonics.
         lr_opacity: learning rate of the opacity logits.
         lr_scales: learning rate of the logarithms of the scales.
@@ -57,15 +57,15 @@ class Recipe:
         dssim_weight: loss = L1 + dssim_weight (1 - SSIM).
         densify_from: no densification up to this step.
         densify_interval: steps between two densifications.
-        grad_threshold: mean gradient in normalised device coordinates from which a Gaussian is densified.
-        percent_dense: largest scale, relative to the extent, up to which it is cloned rather than split.
+        grad_threshold: least mean gradient, in normalised device coordinates, of a Gaussian that is densified.
+        percent_dense: largest scale, as a fraction of the extent, of a Gaussian that is cloned; larger ones are split.
         prune_opacity: Gaussians below this opacity are removed.
-        opacity_decay: all opacities are multiplied by it after each step, in (0, 1]; never scaled.
-        decay_from: share of the steps before that, in [0, 1].
+        opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
+        decay_from: share of the steps after which this decay begins, in [0, 1].
         reset_interval: steps between two resets of all opacities; 0: none.
-        reset_opacity: what they are lowered to.
-        reset_recovery: a reset is left out where fewer steps than this follow before the next one or the end.
-        near_plane: times the 1st percentile of the initial points' depths.
+        reset_opacity: a reset lowers larger opacities to this.
+        reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
+        near_plane: distance of the near plane, relative to the 1st percentile of the initial points' depths.
     """
 
     steps: _Steps = 10_000
@@ -97,44 +97,46 @@ class Recipe:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """What one fit is asked to do. NumPy's numbers are taken as Python's.
+    """The settings of one fit. NumPy's numbers are accepted and become Python's.
 
-    `fit_scene` and the command act on all entries. A `Trainer` takes its points as they are and does all steps: for it
-    init, init_file, init_points, draw and keep_all have no effect, and no `sh_degree` means 0.
+    `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
+    last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0.
 
     Args:
         steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
-        drop_until: share of the steps, the first ones, in which Gaussians are dropped; in [0, 1].
-        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, what the training
-            views need, which short fits find out.
-        refine_poses: move the training cameras too, for poses that are half a degree or more off: good ones lose a
-            little. What all cameras have in common stays; test cameras stay as given.
-        coarse: share of the steps, the first ones, that see the training views at half their width; in [0, 1].
-        seed: everything random derives from it: initial points, order of views, splits and masks.
-        init: initial points. dense: from depth maps of the training images, made by a plane sweep in some seconds per
-            view. sift: from matches of their keypoints. random: where at least two images see. scene: the random points
-            that Blender's layout prescribes. model-points: those of a COLMAP model, refined with the test views too.
-            file: those of a file.
+        drop_until: share of the steps, from the start, in which Gaussians are dropped; in [0, 1].
+        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, short
+            fits (probes) find out what the training views need.
+        refine_poses: optimise the poses of the training cameras too. It helps where they are half a degree or more off,
+            and accurate poses get slightly worse. The mean pose and the spread of the training cameras stay as given,
+            and so do test cameras.
+        coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1].
+        seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
+        init: initial points. dense: points of depth maps, made from the training images by a plane sweep in some
+            seconds per view. sift: points of matched keypoints. random: random points in the space that at least two
+            images see. scene: the random points that Blender's layout prescribes. model-points: points of a COLMAP
+            model, which was refined with the test views too. file: points of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
-        init_points: how many initial points random gives, and dense at most.
-        draw: how these are chosen. spread: one from each of as many even cells of the pictures. uniform: all alike.
-        training_background: random: another colour in each step, so that nothing may stay transparent, or dark, where
-            a photo is opaque. scene: that of the scene, as in test views.
-        max_gaussians: densification stops at this number; unless given 10 per step, and at least 1.5 times the first
-            points.
-        growth: share of the steps over which that limit rises evenly from the number of initial points; 0 sets it at
-            once. In [0, 1].
-        keep_all: keep Gaussians that no training view shows, and harmonics that change no picture.
-        max_bytes: bound for the working memory of a render in bytes; it changes rounding alone.
-        evaluations: how often the curve is measured, the last time at the end.
+        init_points: the number of points of the init random, and the largest number of dense.
+        draw: how dense points are chosen. spread: one from each of as many equal cells of the images. uniform: each
+            with the same probability.
+        training_background: random: another colour in each step, so that a hole in the splat cannot pass for a surface
+            of the background's colour. scene: the background of the scene, as in test views.
+        max_gaussians: densification stops at this number; unless given, 10 per step and at least 1.5 times the
+            number of initial points.
+        growth: share of the steps over which that limit rises linearly from the number of initial points; with 0 it
+            holds from the first step. In [0, 1].
+        keep_all: keep Gaussians that no training view shows, and harmonics that change no image.
+        max_bytes: bound on the working memory of a render in bytes; it changes results only by rounding.
+        evaluations: how often the PSNR curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
-        backend: numba: compiled, several times faster, on a CPU alone. auto: that where it is installed, else torch.
-        recipe: all the other numbers, a `kgs.fit.config.Recipe`.
+        backend: numba: compiled, several times faster, only on a CPU. auto: numba where it is installed, else torch.
+        recipe: all other numbers, a `kgs.fit.config.Recipe`.
 
     Raises:
-        ValueError: an entry is out of range or of another kind; the message begins with its name.
+        ValueError: an entry is out of range or of the wrong type; the message begins with its name.
     """
 
     steps: _Steps = 2000
@@ -144,7 +146,7 @@ class FitConfig:
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
     refine_poses: bool = False
     coarse: _Share = 0.0
-    seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed is one of torch's
+    seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed has to fit torch's 64 bits
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"
     init_file: Path | None = None
     init_points: Annotated[int, _Range(1, 10**9)] = 20_000
@@ -153,7 +155,7 @@ class FitConfig:
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
     growth: _Share = 0.0
     keep_all: bool = False
-    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # as of RasterOptions, which would import torch
+    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # the default of RasterOptions, which would import torch
     evaluations: _Steps = 8
     device: str = "cpu"
     backend: Backend = "auto"
@@ -166,7 +168,7 @@ class FitConfig:
             raise ValueError(f'init_file: expected {wanted} the init "file", got {self.init_file}')
 
     def to_dict(self) -> dict[str, Any]:
-        """The numbers as plain values, for JSON and checkpoints."""
+        """The entries as plain values, for JSON and checkpoints."""
         return asdict(self) | {"init_file": None if self.init_file is None else str(self.init_file)}
 
     @classmethod
@@ -179,9 +181,9 @@ class FitConfig:
 
 
 class Choice(NamedTuple):
-    """What an entry of FitConfig that is None may become."""
+    """The two values between which probes decide for an entry of FitConfig that is None."""
 
-    cheaper: Any  # also where there are too few views for probes
+    cheaper: Any  # also taken where probes are not possible
     dearer: Any
 
 
@@ -202,8 +204,8 @@ class Timetable(NamedTuple):
 def timetable(config: FitConfig) -> Timetable:
     """Scale the recipe's counts by steps / 10 000.
 
-    The interval of densification is shortened only as far as a short fit needs to densify about 20 times, and never
-    under 10 steps: on less evidence than the recipe's the number of Gaussians explodes. See `reset_recovery` too.
+    A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
+    10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.
     """
     recipe, steps = config.recipe, config.steps
     scale = steps / recipe.steps
@@ -213,30 +215,30 @@ def timetable(config: FitConfig) -> Timetable:
     return Timetable(
         sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
-        reset=tuple(s for s, then in pairwise(resets) if then - s >= recipe.reset_recovery),
+        reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
         coarse=round(config.coarse * steps),
     )
 
 
 def most_gaussians(config: FitConfig, points: int) -> int:
-    """The number at which densification stops in a fit from so many initial points."""
+    """The number of Gaussians at which densification stops, in a fit from `points` initial points."""
     return config.max_gaussians or max(10 * config.steps, 3 * points // 2)
 
 
 def _check(config: FitConfig | Recipe) -> None:
-    """Hold each entry against its annotation; NumPy's numbers and paths given as text become Python's own."""
+    """Check each entry against its annotation; NumPy's numbers become Python's, and text becomes a path."""
     hints = get_type_hints(type(config), include_extras=True)
     for entry in fields(config):
         value = getattr(config, entry.name)
-        plain, expected = _plain(value, hints[entry.name])
-        if plain is None and value is not entry.default:
+        converted, expected = _convert(value, hints[entry.name])
+        if converted is None and value is not entry.default:
             raise ValueError(f"{entry.name}: expected {expected}, got {str(value)[:60]!r}")
-        object.__setattr__(config, entry.name, plain)
+        object.__setattr__(config, entry.name, converted)
 
 
-def _plain(value: Any, hint: Any) -> tuple[Any, str]:
-    """The value as the hint has it, None where it does not fit; and what the hint expects, in words."""
+def _convert(value: Any, hint: Any) -> tuple[Any, str]:
+    """The value in the type of its annotation, None if it is not valid there; and what is expected, in words."""
     if get_origin(hint) is Literal:
         return value if isinstance(value, str) and value in get_args(hint) else None, f"one of {list(get_args(hint))}"
     if hint == Path | None:
@@ -250,7 +252,7 @@ def _plain(value: Any, hint: Any) -> tuple[Any, str]:
     return python(value) if is_number and limits.holds(value) else None, f"a {word} number {limits}"
 
 
-# The paper's rule and recipe, with its counts scaled; and the same without dropping.
+# `paper`: the paper's rule and recipe, with its counts scaled. `plain`: the same without dropping.
 PAPER = FitConfig(
     drop_until=1.0,
     sh_degree=3,
@@ -277,5 +279,5 @@ DETAILS = {
     "normal": Detail(504, {}),
     "high": Detail(1000, {"coarse": 0.5, "init_points": 80_000}),
 }
-# A fit within a minute on two cores, with the page and the film.
+# A fit, its page and its film within a minute on two cores.
 DEMO = FitConfig(steps=350, coarse=0.3, init_points=12_000, max_gaussians=16_000, evaluations=4)

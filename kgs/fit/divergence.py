@@ -1,4 +1,4 @@
-"""Where a fit leaves the finite numbers: what is wrong, and with which parameter of which Gaussian, in words."""
+"""Finds numbers of a fit that are not finite or explode, and names the parameter and the Gaussian."""
 
 import math
 
@@ -7,11 +7,11 @@ from torch import Tensor
 
 from kgs.model import GaussianModel
 
-_LARGEST = 1e6  # no scale is as many extents of the camera rig, unless the fit explodes
+_LARGEST = 1e6  # of a scale, in extents of the camera rig: a larger one means that the fit explodes
 
 
 def parameter_fault(model: GaussianModel) -> str:
-    """The first parameter that is not finite, or overflows when it is activated; "" where there is none."""
+    """Describe the first parameter that is not finite, or overflows when it is activated; "" if there is none."""
     for name, parameter in model.named_parameters():
         row = _first_row(~torch.isfinite(parameter.detach().exp() if name == "log_scales" else parameter.detach()))
         if row is not None:
@@ -20,18 +20,18 @@ def parameter_fault(model: GaussianModel) -> str:
 
 
 def step_fault(model: GaussianModel, num_nonfinite: Tensor, loss: float) -> str:
-    """What is wrong with a render that left Gaussians out because they are not finite, or with its loss, or ""."""
+    """Describe parameters that made the renderer skip Gaussians, or a loss that is not finite; "" if all is well."""
     fault = parameter_fault(model) if int(num_nonfinite) else ""
     return fault or ("" if math.isfinite(loss) else f"expected a finite loss, got {loss}")
 
 
 def gradient_fault(model: GaussianModel) -> str:
-    """The first gradient whose square, which Adam keeps, is not finite (from 1e19 on); "" where there is none."""
+    """Describe the first gradient whose square, which Adam keeps, overflows (above 1e19); "" if there is none."""
     for name, parameter in model.named_parameters():
         if parameter.grad is None:
             continue
         flat = parameter.grad.flatten()
-        if not math.isfinite(float(torch.dot(flat, flat))):  # without a tensor of squares
+        if not math.isfinite(float(torch.dot(flat, flat))):  # allocates no tensor of squares
             row = _first_row(~torch.isfinite(parameter.grad.square()))
             whose = "all Gaussians together" if row is None else f"Gaussian {row}"
             return f"expected gradients below 1e19, got others in {name} of {whose}"
@@ -39,7 +39,7 @@ def gradient_fault(model: GaussianModel) -> str:
 
 
 def scale_fault(model: GaussianModel, extent: float) -> str:
-    """The first scale above a million extents; "" where there is none."""
+    """Describe the first scale above a million extents; "" if there is none."""
     row = _first_row(model.log_scales.detach() > math.log(_LARGEST * extent))
     if row is None:
         return ""

@@ -1,4 +1,4 @@
-"""What a fit leaves for other programs beside its PLY file: the cameras, glTF, a film."""
+"""Writes the results of a fit for other programs, besides its PLY file: cameras, glTF, a film."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from .trainer import Trainer
 
 
 def write_exports(trainer: Trainer, folder: Path, roll: float = 0.0) -> None:
-    """Write `outputs.EXPORTS`; where there can be no film, the trainer's notes say why.
+    """Write `outputs.EXPORTS`; if there can be no film, a note of the trainer says why.
 
     `roll` turns the pictures of the film, and with them what is up in the glTF file, see :func:`kgs.io.cameras.rolled`.
     """

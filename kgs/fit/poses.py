@@ -19,24 +19,26 @@ from kgs.geometry import camera_centers, degrees_between
 
 from .checkpoint import load_moments, moments_of
 
-REACH = 0.004  # about the sum of Adam's steps of one camera in a whole fit, in each of the six numbers
-TRANSLATION = 0.3  # median depths; where cameras face one way, a shift and a turn look alike: rather a turn
-LAST = 0.01  # the last step, relative to the first
+# Roughly the sum of the learning rates of one camera over a whole fit: Adam moves no number much farther.
+REACH = 0.004
+# In median depths. Cameras that face one way can hardly tell a shift from a turn; a small unit favours the turn.
+TRANSLATION = 0.3
+LAST = 0.01  # the last learning rate, relative to the first
 
 
 class MovingPoses:
-    """The poses of V cameras that a fit moves; each step moves one of them a little.
+    """The poses of V cameras as a fit refines them; each step moves one of them a little.
 
     The gauge is fixed: the mean rotation, the mean centre and the spread of the centres stay as given, so that neither
     the splat nor a test camera has to follow.
 
     Args:
-        given: the world-to-camera extrinsics that the fit begins with, `(V, 4, 4)`.
-        steps: of the whole fit.
+        given: the world-to-camera extrinsics that the fit starts from, `(V, 4, 4)`.
+        steps: the number of steps of the whole fit.
 
     Attributes:
-        extrinsics: where the cameras are now, `(V, 4, 4)`, float64 on the CPU.
-        depth: the median depth of the initial points, in world units, above 0: to be set before the first step.
+        extrinsics: the current poses, `(V, 4, 4)`, float64 on the CPU.
+        depth: the median depth of the initial points, in world units, above 0. Set it before the first step.
     """
 
     def __init__(self, given: Tensor, steps: int) -> None:
@@ -49,25 +51,25 @@ class MovingPoses:
         self._seen: tuple[int, Tensor] | None = None
 
     def camera(self, camera: PinholeCamera, view: int) -> PinholeCamera:
-        """A camera of that view, in any resolution, where it is now; the next :meth:`step` uses its gradient."""
+        """The camera of a view, at any resolution, at its current pose, whose gradient the next :meth:`step` uses."""
         pose = self.extrinsics[view : view + 1].to(camera.extrinsics).requires_grad_()
         self._seen = view, pose
         return PinholeCamera(camera.intrinsics, pose, camera.height, camera.width)
 
     @torch.no_grad()
     def step(self, scene: Scene, progress: float) -> Scene:
-        """Move the camera that was seen last, if it has a finite gradient; `progress` of the fit is in (0, 1].
+        """Move the last result of :meth:`camera`, if its gradient is finite; `progress` of the fit is in (0, 1].
 
-        Returns the scene with its training cameras where they are now.
+        Returns the scene with its training cameras at their current poses.
         """
         if self._seen is None or (found := self._seen[1].grad) is None or not bool(found.isfinite().all()):
             return scene
         view = self._seen[0]
         motion, pose, units = self._motions[view], self.extrinsics[view], torch.ones(6, dtype=torch.float64)
         units[:3] = TRANSLATION * self.depth
-        slope = found[0].double().cpu() @ pose.mT  # by a matrix that the pose is multiplied with from the left
-        turn = slope[:3, :3] - slope[:3, :3].mT
-        motion.grad = units * torch.stack([*slope[:3, 3], turn[2, 1], turn[0, 2], turn[1, 0]])
+        gradient = found[0].double().cpu() @ pose.mT  # with respect to a matrix that multiplies the pose from the left
+        turn = gradient[:3, :3] - gradient[:3, :3].mT
+        motion.grad = units * torch.stack([*gradient[:3, 3], turn[2, 1], turn[0, 2], turn[1, 0]])
         for group in self._optimizer.param_groups:
             group["lr"] = decayed(self._rate, LAST * self._rate, progress)
         self._optimizer.step()
@@ -78,7 +80,7 @@ class MovingPoses:
         return place_cameras(scene, self.extrinsics)
 
     def moved(self) -> dict[str, float]:
-        """How far the cameras are from where they were: means and maxima of degrees, and of shares of the depth."""
+        """How far the cameras moved: mean and maximum, rotations in degrees, shifts as shares of the median depth."""
         degrees = degrees_between(self.extrinsics[:, :3, :3], self.given[:, :3, :3])
         shares = (camera_centers(self.extrinsics) - camera_centers(self.given)).norm(dim=1) / self.depth
         found = {"degrees": degrees.mean(), "most_degrees": degrees.max()}
@@ -86,13 +88,13 @@ class MovingPoses:
         return {name: round(float(value), 5) for name, value in found.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the motion depends on besides the given extrinsics."""
+        """All that the next steps depend on besides the arguments of the class."""
         return {"extrinsics": self.extrinsics, "depth": self.depth, "optimizer": moments_of(self._optimizer)}
 
     def restore(self, scene: Scene, state: dict[str, Any]) -> Scene:
-        """Go on from a :meth:`state_dict`; returns the scene with its training cameras where they are then.
+        """Continue from a :meth:`state_dict`; returns the scene with its training cameras at those poses.
 
-        A KeyError, TypeError or ValueError where an entry is missing or wrong.
+        A KeyError, TypeError or ValueError if an entry is missing or wrong.
         """
         found = state["extrinsics"]
         if found.shape != self.given.shape:
@@ -102,10 +104,10 @@ class MovingPoses:
         return place_cameras(scene, self.extrinsics)
 
     def _fix_gauge(self) -> None:
-        """Turn, move and scale the world so that what all cameras have in common is as given."""
+        """Turn, move and scale the world so that mean rotation, mean centre and spread of the centres are as given."""
         now, given = self.extrinsics, self.given
         left, _, right = torch.linalg.svd((now[:, :3, :3].mT @ given[:, :3, :3]).sum(dim=0))
-        turn = (left @ right).mT  # of the world, to the given one
+        turn = (left @ right).mT  # rotation of the world
         centers, wanted = camera_centers(now), camera_centers(given)
         spreads = [(places - places.mean(dim=0)).norm() for places in (centers, wanted)]
         scale = spreads[1] / spreads[0] if float(min(spreads)) > 1e-9 * self.depth else 1.0
@@ -123,5 +125,5 @@ def place_cameras(scene: Scene, extrinsics: Tensor) -> Scene:
 
 
 def decayed(first: float, last: float, progress: float) -> float:
-    """What lies between two rates, log-linearly: the first at progress 0, the last at 1."""
+    """Log-linear interpolation between two rates: `first` at progress 0, `last` at 1."""
     return math.exp((1 - progress) * math.log(first) + progress * math.log(last))

@@ -4,7 +4,7 @@ A probe is a short fit without one of the training views: its images have half t
 without that view, and its learning rates are `RATE_FACTOR` times higher. The probes of a left-out view differ in one
 option; the difference of their PSNR in that view is its gain. The more expensive value is chosen where its mean gain
 over the left-out views exceeds `MIN_GAIN` decibels and `MIN_ERRORS` standard errors, else the cheaper one. With few
-training views, small images or few steps there are no probes: the cheaper value is chosen, "by" says "rule".
+training views, small images or few steps there are no probes: the cheaper value is chosen, and "by" is "rule".
 """
 
 import math
@@ -27,7 +27,7 @@ from .trainer import Trainer
 MIN_VIEWS = 4  # training views, of which one can be left out
 MAX_VIEWS = 12  # training views of a probe
 FOLDS = 2  # views that are left out, one at a time
-SHARE = 0.25  # of the fit's steps, in all probes together
+SHARE = 0.25  # of the fit's steps, for all probes together
 MIN_GAIN, MIN_ERRORS = 0.1, 2.0
 RATE_FACTOR = 4.0
 MIN_SIDE = 24  # pixels of an image, halved

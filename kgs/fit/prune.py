@@ -1,4 +1,4 @@
-"""Removes what the training views do not need: Gaussians that contribute to no image, and unused harmonics."""
+"""Removes what the training views do not need: Gaussians that contribute next to nothing, and unused harmonics."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,17 +15,18 @@ from kgs.renderer import GaussianRenderer
 from .trainer import Trainer
 
 TOLERANCE = 0.01  # dB by which the PSNR of a training view may change
-WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)  # pixels that a Gaussian covers in all training views; -1: all
+# Limits on what a Gaussian contributes to all training views together, in pixels; -1 keeps all.
+WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)
 QUANTUM = 0.5 / 255  # a smaller change of an 8-bit image is not visible
 
 
 def prune(trainer: Trainer) -> None:
     """Show only what the training views need; the fit itself keeps everything. Does nothing with `keep_all`.
 
-    The highest limit of `WEIGHTS` is taken that changes the PSNR of no training view by more than `TOLERANCE`, then the
-    lowest degree of harmonics of which the same holds and that changes no value of the images by more than `QUANTUM`.
+    Takes the highest limit of `WEIGHTS` that changes the PSNR of no training view by more than `TOLERANCE`, then the
+    lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
 
-    It records "gaussians" in `trainer.needs`: how many were "fitted" and "kept", the limit "weight", and "sh_degree".
+    Records "gaussians" in `trainer.needs`: how many were "fitted" and "kept", the limit "weight", and "sh_degree".
     """
     if trainer.config.keep_all:
         return
@@ -33,7 +34,7 @@ def prune(trainer: Trainer) -> None:
     weights = contributions(
         model, views, trainer.near_plane, max_bytes=trainer.config.max_bytes, backend=trainer.backend
     )
-    trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # all, also where a finished fit goes on
+    trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # all, although an earlier call may have hidden some
     levels = _levels(trainer)
     for limit in WEIGHTS:
         rows = weights > limit
@@ -70,7 +71,7 @@ def _levels(trainer: Trainer) -> list[float]:
 def contributions(model: GaussianModel, views: Views, near_plane: float, **options: Any) -> Tensor:
     """The sum of each Gaussian's blending weights over the pixels of all views, `(N,)`.
 
-    It is the gradient of the sum of all images by the Gaussian's colour. `options` are those of the renderer.
+    It is the gradient of the sum of all images with respect to the Gaussian's colour. `options` go to the renderer.
     """
     renderer = GaussianRenderer(near_plane=near_plane, **options).eval()
     with torch.no_grad():
@@ -83,7 +84,7 @@ def contributions(model: GaussianModel, views: Views, near_plane: float, **optio
 
 
 def left_out(needs: dict[str, Any]) -> str:
-    """What a fit left out, for its last line; "" where that is nothing."""
+    """What a fit left out, in words for the last line of its output; "" if that is nothing."""
     parts, harmonics, gaussians = [], needs.get("sh_degree"), needs.get("gaussians")
     if harmonics and harmonics["chosen"] == 0:
         why = harmonics.get("why", "by rule")

@@ -1,4 +1,4 @@
-"""One fit from a scene to its files: trains with a progress line, evaluates, writes everything."""
+"""Runs one fit: makes initial points, trains with a progress line, evaluates, and writes all results."""
 
 import shutil
 import signal
@@ -34,7 +34,7 @@ from .prune import prune
 from .trainer import Trainer
 
 _SAVE_SECONDS = 60.0
-_STARTS = {
+_INIT_NOTES = {
     "model-points": "points seen in training views, but their positions were refined with test views",
     "scene": "initial points that come with the layout",
     "file": "initial points of a file",
@@ -51,7 +51,7 @@ class Finished(NamedTuple):
     """A fit whose results are written, but do not yet replace those of a former fit."""
 
     folder: Path  # where the new results are
-    out: Path  # where they go
+    out: Path  # where they belong
     trainer: Trainer
     metrics: dict[str, Any]  # what metrics.json holds
     settings: dict[str, Any]  # what config.json holds
@@ -68,35 +68,35 @@ def fit_scene(
     before_publish: "Callable[[Finished], None] | None" = None,
     say: Callable[[str], None] = say,
 ) -> tuple[dict[str, Any], int]:
-    """Fit a scene and write what `kgs fit` leaves but the page: splat, film, measures, test images and checkpoints.
+    """Fit a scene and write all results of `kgs fit` but the page: splat, film, metrics, test images and checkpoints.
 
-    Results in the folder stay whole until all new ones are there, in `unfinished`. A fit that a signal stopped writes
-    its results too, but leaves those of a finished one in their place.
+    New results are collected in `out/unfinished`, and replace those of a former fit only when all are there. A fit that
+    a signal stopped writes its results too, but does not replace those of a finished fit.
 
     Args:
         scene: posed training and test views.
-        config: all numbers.
-        out: the folder for the results, made if it is not there.
+        config: the settings of the fit.
+        out: the folder for the results, created if it does not exist.
         resume: continue from the folder's checkpoint, if there is one.
         lpips: the perceptual metric, or None to leave it out.
-        request: the arguments of `load_scene` by their names, "scene" for its path; without them `kgs eval` refuses the
-            folder.
+        request: the arguments of `load_scene` by name, its path as "scene", for config.json; without them `kgs eval`
+            refuses the folder.
         before_publish: called with the finished fit when all other files are written, and before they replace those
-            of a former fit; `kgs.page.fit_page.write_own_page` writes the page there, as `kgs fit` does.
-        say: where lines for the user go.
+            of a former fit; `kgs fit` passes `kgs.page.fit_page.write_own_page`, which adds the page.
+        say: called with each line for the user.
 
     Returns:
-        What metrics.json holds, and the signal that interrupted the fit or 0 (its results are valid all the same).
+        The content of metrics.json, and the signal that interrupted the fit or 0. Results are valid in both cases.
 
     Raises:
         DataError: the checkpoint is damaged or belongs to another fit, images are too small, another fit is at work in
             `out`, or `out` cannot be written to or holds files that kgs did not write and would overwrite.
-        TrainingDiverged: the training left the finite numbers; the last checkpoint is kept.
+        TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
         OSError: a result cannot be written.
-        ValueError: the device cannot be used, or the backend not on it.
-        ModuleNotFoundError: the backend is numba, and it is not installed; or the extra `app` is not.
+        ValueError: the device cannot be used, or the backend does not run on it.
+        ModuleNotFoundError: the backend is numba, which is not installed; or a package of the extra `app` is missing.
     """
-    check_tools(config.device, config.backend, "jinja2", "matplotlib")  # packages that are needed after the training
+    check_tools(config.device, config.backend, "jinja2", "matplotlib")  # even what is used only after training
     out = Path(out)
     smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
     for views in (scene.train, scene.test):
@@ -128,11 +128,12 @@ def fit_scene(
             trainer = Trainer(scene, config, points, needs)
         for note in trainer.notes:
             say(note)
-        told, is_trained = len(trainer.notes), False
+        num_said = len(trainer.notes)
+        is_trained = False
         try:
             if source != new:
                 staging.start()
-                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # initial points may have taken a minute
+                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
             settings = {"request": request or {}, "fit": trainer.config.to_dict(), "timetable": trainer.times._asdict()}
             settings |= {name: getattr(trainer, name) for name in ("max_gaussians", "near_plane", "extent")}
             write_json(new / "config.json", settings)
@@ -151,7 +152,7 @@ def fit_scene(
                 before_publish(Finished(new, out, trainer, metrics, settings))
         except BaseException:
             if is_trained:
-                for note in trainer.notes[told:]:
+                for note in trainer.notes[num_said:]:
                     say(note)
                 say(f"{printable(new)}: holds the results that could be written")
             elif not trainer.saved:
@@ -163,13 +164,13 @@ def fit_scene(
         else:
             staging.seal()
             staging.complete()
-        for note in trainer.notes[told:]:
+        for note in trainer.notes[num_said:]:
             say(note)
     return metrics, stopped_by
 
 
 def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None, Path]:
-    """The fit that was interrupted in the folder, else the one that was finished, else None; and where it lies."""
+    """Resume the interrupted fit in a results folder, else the finished one; the trainer, or None, and its folder."""
     errors = []
     for folder in (fit_staging(out).unfinished, out):
         path = folder / CHECKPOINT
@@ -184,9 +185,9 @@ def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None
 
 
 def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
-    """What metrics.json holds of one run; None stands for what was not measured."""
+    """The content of metrics.json for one fit; None stands for what was not measured."""
     scene, config = trainer.scene, trainer.config
-    start = _STARTS.get(config.init, "initial points from training views alone")
+    init_note = _INIT_NOTES.get(config.init, "initial points from training views alone")
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     if trainer.poses is not None:
         poses += ", those of the training views refined by the fit"
@@ -210,7 +211,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
             "test": list(scene.test.names),
             "image_size": list(scene.train.images.shape[-2:]),
             "background": scene.background.tolist(),
-            "init": f"{config.init}: {start}; {poses}",
+            "init": f"{config.init}: {init_note}; {poses}",
             **_CONVENTIONS,
         },
         "versions": versions(),
@@ -218,7 +219,7 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:
-    """Initial points as `config.init` asks for; a DataError where the scene, or the file, has none."""
+    """Make the initial points that `config.init` asks for; a DataError if the scene, or the file, has none."""
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
@@ -232,10 +233,10 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Ini
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
-    """Train to the end with a progress line and checkpoints, each minute and at evaluations; then :func:`prune` it.
+    """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
 
-    On Ctrl-C, SIGTERM or SIGHUP the step is finished and saved, and the signal's number returned, else 0. Where a
-    checkpoint cannot be written (a full disk) a note says so, and the next one is tried.
+    SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the number of that signal, or
+    0. If a checkpoint cannot be written (a full disk), a note says so, and training goes on.
     """
     saved = time.monotonic()
 
@@ -264,20 +265,27 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """Notes SIGINT, SIGTERM and SIGHUP in the main thread, unless ignored (nohup); a second one acts as usual."""
-    came: list[int] = []
-    names = ("SIGINT", "SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
-    handlers = {n: signal.getsignal(n) for n in (getattr(signal, name, None) for name in names) if n is not None}
-    before = {number: handler for number, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
+    """Record SIGINT, SIGTERM and SIGHUP in the list that is yielded; a second one acts as usual.
 
-    def note(number: int, _: object) -> None:
-        came.append(number)
-        signal.signal(number, before[number])
+    Ignored signals (nohup) stay ignored, and only the main thread can handle any.
+    """
+    received: list[int] = []
+    usual: dict[int, Any] = {}  # the handlers that are replaced
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            handler = None if number is None else signal.getsignal(number)
+            if number is not None and handler not in (None, signal.SIG_IGN):
+                usual[number] = handler
 
-    for number in before:
-        signal.signal(number, note)
+    def record(number: int, _: object) -> None:
+        received.append(number)
+        signal.signal(number, usual[number])
+
+    for number in usual:
+        signal.signal(number, record)
     try:
-        yield came
+        yield received
     finally:
-        for number, handler in before.items():
+        for number, handler in usual.items():
             signal.signal(number, handler)

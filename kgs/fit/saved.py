@@ -1,4 +1,4 @@
-"""A fit that is done, read again from its folder: its settings, and its Gaussians for pictures and measures."""
+"""Reads a fit from its folder: its settings, and its Gaussians for rendering and evaluation."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
     for name in ("request", "fit"):
         if not isinstance(settings.get(name), dict):
             raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
-    request = {"points": "none", "hold_out": None, **settings["request"]}  # what older folders do not say
+    request = {"points": "none", "hold_out": None, **settings["request"]}  # defaults, for folders without these entries
     for name, expected, is_right in (
         ("scene", "a path", lambda v: isinstance(v, str) and v and "\0" not in v),
         ("train_views", "a whole number above 0 or null", lambda v: v is None or is_number(v, 1, whole=True)),
@@ -49,23 +49,23 @@ def read_settings(path: Path) -> tuple[dict[str, Any], FitConfig]:
 
 
 class SavedFit(NamedTuple):
-    """A fit for pictures and measures, without what training needs."""
+    """A fit for rendering and evaluation, without the state of its training."""
 
     request: dict[str, Any]  # the arguments of `load_scene`
     config: FitConfig
     model: GaussianModel  # in the frame of the scene: world coordinates less `Scene.offset`
     near_plane: float  # in world units
-    step: int  # steps that are done
-    backend: str  # of the fit; on a GPU "auto"
-    poses: Tensor | None  # `(V, 4, 4)` of the training cameras, where the fit moved them
+    step: int  # the number of steps that are done
+    backend: str  # that of the fit; on a GPU "auto"
+    poses: Tensor | None  # `(V, 4, 4)` of the training cameras, if the fit refined them
 
     def placed(self, scene: Scene) -> Scene:
-        """The fit's scene, with the training cameras where the fit has them."""
+        """The fit's scene, with the training cameras at the poses of the fit."""
         return scene if self.poses is None else place_cameras(scene, self.poses)
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
-        """All Gaussians from one camera over the scene's background `(3,)`, `(1, 3, H, W)`; on the model's device."""
+        """Render all Gaussians from one camera over a background `(3,)`: `(1, 3, H, W)`, on the model's device."""
         device, most = self.model.means.device, self.config.max_bytes
         renderer = GaussianRenderer(near_plane=self.near_plane, max_bytes=most, backend=self.backend).eval()
         image: Tensor = renderer(self.model(), move_camera(camera, device), background.to(device)).image
@@ -73,7 +73,7 @@ class SavedFit(NamedTuple):
 
 
 def load_fit(out: Path, device: torch.device | str = "cpu") -> SavedFit:
-    """Read what a fit left in its folder; a DataError where config.json or the checkpoint is missing or damaged."""
+    """Read a fit from its folder; a DataError if config.json or the checkpoint is missing or damaged."""
     complete_stopped_move(out)
     request, config = read_settings(out / "config.json")
     path = out / CHECKPOINT

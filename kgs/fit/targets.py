@@ -1,4 +1,4 @@
-"""What a training step compares its render with: a photo, its SSIM statistics, its transparency and its border."""
+"""What a training step compares its render with: an image, its SSIM statistics, its transparency and its border."""
 
 from typing import NamedTuple
 
@@ -17,17 +17,17 @@ class Target(NamedTuple):
     camera: PinholeCamera
     image: Tensor  # (1, 3, H, W)
     moments: TargetMoments
-    clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0
-    background: Tensor  # (3,), the background in the photo
-    light: Tensor | None  # (H, W), the transmittance of a dark border; None: 1
+    clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
+    background: Tensor  # (3,), the background that `image` has
+    light: Tensor | None  # (H, W), the transmittance of a dark border; None: 1 everywhere
 
     def seen(self, render: Tensor) -> Tensor:
         """A render as the photo would show it: clamped to 1, and darkened by the border."""
         image = render.masked_fill(render > 1, 1.0)  # it is never below 0
         return image if self.light is None else image * self.light
 
-    def before(self, background: Tensor) -> tuple[Tensor, TargetMoments]:
-        """The image in front of another background, `(3,)`, and its SSIM statistics."""
+    def over(self, background: Tensor) -> tuple[Tensor, TargetMoments]:
+        """The image over another background, `(3,)`, and its SSIM statistics."""
         if self.clear is None:
             return self.image, self.moments
         image = self.image + self.clear * (background - self.background)[:, None, None]

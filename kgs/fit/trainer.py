@@ -1,7 +1,7 @@
 """The training loop: one training view per step, deterministic, resumable at every step.
 
-The random streams of views, of splits, of masks and of backgrounds never mix: fits of two drop rates see the same views
-in one order.
+Views, splits, drop masks and backgrounds have random streams of their own, so that fits with different drop rates see
+the same views in the same order.
 """
 
 import copy
@@ -47,13 +47,13 @@ from .divergence import gradient_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
 from .targets import targets
 
-# learning rates of the recipe: `lr_means` is that of the parameter `means`
+# for each parameter the name of its learning rate in the recipe, without `lr_`
 _LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
 
 
 @dataclass(frozen=True)
 class Start:
-    """What a fit begins with.
+    """The state that a fit starts from.
 
     Args:
         model: the Gaussians.
@@ -71,7 +71,7 @@ class Start:
 
     @classmethod
     def from_points(cls, scene: Scene, config: FitConfig, points: InitialPoints) -> Self:
-        """Gaussians at the initial points; a TypeError where these are something else."""
+        """Gaussians at the initial points; a TypeError if these are not `InitialPoints`."""
         check_kind("points", points, InitialPoints)
         nearest, median = typical_depths(points.points, scene.train.cameras)
         model = GaussianModel.from_points(points.points.float(), points.colors.float(), config.sh_degree or 0)
@@ -79,7 +79,7 @@ class Start:
         return cls(
             model,
             init={"kind": points.kind, "points": len(points.points)},
-            extent=max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median),  # also of a single camera
+            extent=max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median),  # a single camera has extent 0
             near_plane=config.recipe.near_plane * nearest,
             depth=median,
         )
@@ -97,31 +97,32 @@ class Start:
 
 
 class Trainer:
-    """Fits Gaussians to the training views of a scene; the test views are rendered for the curve alone.
+    """Fits Gaussians to the training views of a scene; the test views are rendered only for the curve.
 
     Args:
         scene: posed training and test views, of at least 6x6 pixels, 12x12 with `coarse`.
-        config: steps, drop rate, seed and all other numbers, see :class:`FitConfig` for those that do nothing here.
-        points: the initial points, at least 4; or a `Start`, as `resume` makes of a checkpoint.
+        config: the settings; :class:`FitConfig` names those that have no effect here.
+        points: the initial points, at least 4; or a `Start`, which `resume` reads from a checkpoint.
         needs: what was decided about the scene before the fit, see `needs` below.
 
     Raises:
-        TypeError: `scene` or `points` is of another kind.
-        ValueError: pictures are too small, points too few, or the device or backend is not there.
+        TypeError: `scene` or `points` is of another type.
+        ValueError: images are too small, points too few, or the device or backend is not available.
 
     Attributes:
         model: the Gaussians.
         renderer: with the drop layer inside; `eval()` mode renders all Gaussians.
         step, seconds: the steps that are done and the time they took, evaluations not counted.
         curve: dicts of step, seconds, test_psnr and train_psnr.
-        backend: "numba" or "torch", which a resumed fit goes on with.
+        backend: "numba" or "torch"; a resumed fit keeps it.
         notes: lines that a user should read (a capped count, for instance).
         saved: the last checkpoint that was written or read, in words; "" before the first.
-        shown: what :meth:`render` draws: the model, or after :meth:`show` a part of it.
-        needs: what was decided of the scene, for metrics.json.
-        init, extent, near_plane: kind and number of the initial points, and the scales that follow from them.
-        order, colors, stack: the random streams of views and backgrounds; views that come before `order` is asked.
-        poses: the training cameras, where the fit moves them; `scene` has them where they are now.
+        shown: the Gaussians that :meth:`render` draws: the model, or after :meth:`show` a part of it.
+        needs: what was decided about the scene, for metrics.json.
+        init, extent, near_plane: kind and number of the initial points; the scales of the scene, in world units.
+        order, colors: the random generators of the order of views and of backgrounds.
+        stack: views that are still to come before `order` shuffles all again.
+        poses: the poses of the training cameras if the fit refines them, else None; `scene` has the current ones.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class Trainer:
         self._build(points if isinstance(points, Start) else Start.from_points(scene, config, points))
 
     def _build(self, start: Start) -> None:
-        """The model, and everything that refers to its parameters."""
+        """Make the model, and everything that refers to its parameters."""
         config, recipe, seed = self.config, self.config.recipe, 10 * self.config.seed
         self.init, self.extent, self.near_plane = start.init, start.extent, start.near_plane
         self.max_gaussians = most_gaussians(config, start.init["points"])
@@ -183,11 +184,11 @@ class Trainer:
             self.poses.depth = start.depth
 
     def make_drop(self, seed: int) -> DropGaussian | None:
-        """The layer on the opacities, None without dropping. A subclass may take another one."""
+        """The layer on the opacities, None without dropping. A subclass may return another one."""
         return DropGaussian(self.config.drop, self.config.drop_schedule, seed=seed) if self.config.drop else None
 
     def before_render(self, camera: PinholeCamera) -> None:
-        """Called before each training render, for subclasses."""
+        """Called before each training render; for subclasses."""
 
     def penalty(self, gaussians: Gaussians, camera: PinholeCamera) -> Tensor | None:
         """A term that is added to the loss of a step, 0-d; for subclasses."""
@@ -223,7 +224,8 @@ class Trainer:
         start = time.perf_counter()
         if step in self.times.densify:
             self._stop_if(scale_fault(self.model, self.extent))
-            first, most, growing = self.init["points"], self.max_gaussians, self.config.growth * self.config.steps
+            first, most = self.init["points"], self.max_gaussians
+            growing = self.config.growth * self.config.steps  # steps until the limit is reached
             share = min(1.0, step / growing) if growing else 1.0
             self.densifier.max_gaussians = first + round(share * (most - first))
             capped = self.densifier.step().capped
@@ -244,11 +246,11 @@ class Trainer:
         self.needs[name] = found
 
     def show(self, rows: Tensor, sh_degree: int) -> None:
-        """Draw and measure only the Gaussians at `rows`, bool `(N,)`, until the next step; the fit keeps all."""
+        """Render only the Gaussians at `rows`, bool `(N,)`, at this degree until the next step; the fit keeps all."""
         self._part, self.shown = {"rows": rows.cpu(), "sh_degree": sh_degree}, self.model.select(rows, sh_degree)
 
     def render(self, camera: PinholeCamera) -> Tensor:
-        """All Gaussians that are shown from one camera, `(1, 3, H, W)`; what `evaluate` wants."""
+        """Render the shown Gaussians from one camera, `(1, 3, H, W)`; the function that `evaluate` takes."""
         self.renderer.eval()
         with torch.no_grad():
             image: Tensor = self.renderer(self.shown(), move_camera(camera, self.device), self._background).image
@@ -256,7 +258,7 @@ class Trainer:
         return image
 
     def median_depth(self, camera: PinholeCamera) -> Tensor:
-        """The median depth of what is shown from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
+        """The median depth of the shown Gaussians from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
         self.renderer.eval()
         with torch.no_grad():
             out = self.renderer(self.shown(), move_camera(camera, self.device), outputs=("median_depth",))
@@ -265,7 +267,7 @@ class Trainer:
         return depth
 
     def psnr(self, views: Views) -> float | None:
-        """Mean PSNR over some views in dB, clamped renders; None where there are none, or where one is infinite."""
+        """Mean PSNR of clamped renders over some views, in dB; None without views, or if one PSNR is infinite."""
         return mean_psnr(self.render, views)
 
     def state_dict(self) -> dict[str, Any]:
@@ -278,14 +280,14 @@ class Trainer:
         return copy.deepcopy(parts | {name: getattr(self, name) for name in PLAIN})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from where :meth:`state_dict` was taken, bit for bit, with its scene and configuration.
+        """Continue from a :meth:`state_dict`, bit for bit. Scene and configuration must be those of the state.
 
-        The device may be another; the backend is that of the state, on a GPU torch. Where all steps were done `steps`
-        may be larger; `notes` says what that means.
+        The device may differ; the backend is that of the state, and torch on a GPU. If all steps of the state are done,
+        `steps` may be larger; `notes` then says what that changes.
 
         Raises:
-            ValueError: they are others, or an entry is missing or wrong; the message begins with its name. The trainer
-                cannot be used any more.
+            ValueError: scene or configuration differ, or an entry is missing or wrong; the message begins with its
+                name. The trainer cannot be used any more.
         """
         with _state_errors():
             start = Start.from_state(state, self.config)
@@ -310,13 +312,13 @@ class Trainer:
                 self.scene = self.poses.restore(self.scene, state["poses"])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write :meth:`state_dict` to a file; OSError where it cannot be written, and earlier ones are untouched."""
+        """Write :meth:`state_dict` to a file; after an OSError the checkpoints that were there are untouched."""
         save_checkpoint(Path(path), self.state_dict())
         self.saved = f"{path} of step {self.step}"
 
     @classmethod
     def resume(cls, scene: Scene, config: FitConfig, path: str | PathLike[str]) -> Self:
-        """Continue from a checkpoint bit for bit; where it is damaged from the one before, and `notes` says so.
+        """Continue from a checkpoint bit for bit. If it is damaged the one before is used, and `notes` says so.
 
         Raises:
             DataError: both files are damaged, or they belong to another scene or configuration.
@@ -344,14 +346,14 @@ class Trainer:
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
         self.optimizer.param_groups[0]["lr"] = self.extent * rate
         degree = sum(self.step >= step for step in self.times.sh)
-        self.model.sh_degree = max(self.model.sh_degree, degree)  # a fit that is trained on keeps what it has
+        self.model.sh_degree = max(self.model.sh_degree, degree)  # a finished fit that goes on keeps its degree
         index, background = self._next_view(), self._background
         view = (self._halved if self.step <= self.times.coarse else self._views)[index]
         camera = view.camera if self.poses is None else self.poses.camera(view.camera, index)
         target, moments = view.image, view.moments
         if config.training_background == "random":
             background = torch.rand(3, generator=self.colors, dtype=torch.float32).to(self.device)
-            target, moments = view.before(background)
+            target, moments = view.over(background)
         if self.drop is not None:
             self.drop.progress = progress
             self.drop.train(progress <= config.drop_until)
@@ -370,7 +372,7 @@ class Trainer:
             self._stop_if(gradient_fault(self.model))
             if out.projected.means2d.grad is not None:
                 self.densifier.observe(out.projected)
-            if self.step < config.steps:  # as in the release, the last step only looks
+            if self.step < config.steps:  # as in the official release, the last step changes no parameter
                 self.optimizer.step()
                 if recipe.opacity_decay < 1.0 and progress > recipe.decay_from:
                     self.densifier.decay_opacity(recipe.opacity_decay)
@@ -392,7 +394,7 @@ class Trainer:
 
 @contextmanager
 def _state_errors() -> Iterator[None]:
-    """Every error of a state that is not whole as a ValueError that begins with the entry's name."""
+    """Turn every error about an incomplete state into a ValueError that begins with the entry's name."""
     try:
         yield
     except KeyError as error:
