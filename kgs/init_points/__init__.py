@@ -1,4 +1,4 @@
-"""Initial points of a fit, from the training views alone: test views are never used here."""
+"""Makes the initial points of a fit, from the training views only: test views are never used here."""
 
 import warnings
 from dataclasses import dataclass
@@ -33,8 +33,7 @@ __all__ = ["InitialPoints", "initial_points"]
 KINDS, DRAWS = ("dense", "sift", "random", "file"), ("uniform", "spread")
 MIN_DENSE = 1000
 MIN_SIFT = 20  # a fit from fewer SIFT points is worse than one from random points
-MAX_SPACING = 4.0  # of a point, in medians of all
-# Quantiles are NumPy's: torch.quantile refuses more than 16 million values.
+MAX_SPACING = 4.0  # of a point to its neighbours, in medians over all points; beyond that it is isolated
 
 
 @dataclass(frozen=True)
@@ -64,32 +63,33 @@ def initial_points(
     backend: str = "auto",
     draw: str = "uniform",
 ) -> InitialPoints:
-    """Find the points a fit starts from.
+    """Find the points that a fit starts from.
 
     Convention:
         Points in the frame of the views' cameras, OpenCV axes, world units.
 
     Args:
         views: the training views, and only these.
-        kind: "dense": points of depth maps that at least two views agree on, drawn at random; where fewer than 1000
-            come out, those of "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated
-            with the given poses; where fewer than 20 come out, "random" ones with a warning. "random": spread evenly
-            over the space that at least two of the views see (one, if there is only one), in the images' mean colours
-            there, at the depths of the SIFT points or else where the cameras look. "file": those of a 3DGS PLY file,
-            or of a cloud or mesh that trimesh reads, up to 1 GiB.
-        seed: of what is drawn at random.
+        kind: "dense": points of depth maps that at least two views agree on, drawn at random; if they are fewer than
+            1000, "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated with the given
+            poses; if they are fewer than 20, "random" with a warning. "random": spread evenly over the space that at
+            least two of the views see (one, if there is only one), in the images' mean colours there, at the depths of
+            the SIFT points or else where the cameras look. "file": the points of a 3DGS PLY file, or of a cloud or
+            mesh that trimesh reads, up to 1 GiB.
+        seed: of the random draws.
         count: how many points "random" gives, and "dense" at most; >= 1.
         file: the file of the kind "file".
-        origin: subtracted from the points of the file, `(3,)`: the offset of a scene whose world the file is in.
+        origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world
+            coordinates.
         stage: shows the progress: :func:`kgs.io.console.each`, or nothing.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
-        draw: of "dense" points: "uniform", or "spread" evenly over the images.
+        draw: how "dense" points are drawn: "uniform", or "spread" evenly over the images.
 
     Returns:
-        The points; their `kind` is what they are, so "random" where "sift" found too few.
+        The points. `kind` says what they are: "random" if "sift" was asked for and found too few.
 
     Raises:
-        TypeError: `views` are none, a whole scene for instance.
+        TypeError: `views` is not a `Views`; a whole scene, for instance.
         ValueError: another kind or draw, `count` below 1, or no file for "file".
         DataError: the file is missing, broken, compressed, too large, or has no points.
     """
@@ -135,20 +135,20 @@ def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera)
     _, depths = project_points(points, cameras)
     if not seen.any():
         return torch.zeros(len(points), dtype=torch.bool)
-    least, most = np.quantile(depths[seen], (0.01, 0.99)).tolist()
+    least, most = np.quantile(depths[seen], (0.01, 0.99)).tolist()  # torch.quantile takes up to 16 million values
     good: Tensor = ((depths > 0.5 * least) & (depths < 2.0 * most)) | ~seen
     return good.all(1)
 
 
 def _has_neighbours(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Rejects isolated points: their initial scale would be huge. A false match is usually isolated."""
+    """Whether a point has others near it. Isolated points would get a huge scale, and are usually false matches."""
     _, depths = project_points(points, cameras)
     spacing = log_spacing(points).exp() * (cameras.fx.double().cpu() / depths).masked_fill(~seen, 0.0).amax(1)
     return spacing < MAX_SPACING * spacing.median()
 
 
 def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
-    """The expected range of depths: from the points if there are any, else from the cameras."""
+    """The expected range of depths: from the points if there are at least two, else from the cameras."""
     if len(points) > 1:
         _, depths = project_points(points, cameras)
         least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
@@ -162,13 +162,13 @@ def _depth_range(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
 
 
 def _sweep_range(points: Tensor, views: Views) -> tuple[float, float]:
-    """The depths of the plane sweep, wider than those of all points: cutting the background off costs quality."""
+    """The depths of the plane sweep: wider than those of all points, since cutting off the background costs quality."""
     depths = depths_in_images(points, views.cameras)
     return 0.85 * float(depths.min()), 1.3 * float(depths.max())
 
 
 def _random_points(views: Views, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
-    """Points of even density in the space that at least two views see, or one where there is no such space."""
+    """Points of even density in the space that at least two views see, or one view if there is no such space."""
     size = torch.tensor([views.images.shape[-1], views.images.shape[-2]])
     found: list[Tensor] = []
     for required in [min(2, len(views))] * 50 + [1] * 50:
@@ -176,7 +176,7 @@ def _random_points(views: Views, count: int, near: float, far: float, generator:
         view = (torch.rand(4 * count, generator=generator) * len(views)).long()
         depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
         points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
-        # space that k views see is drawn from k times as often
+        # a place that k views see is drawn k times as often, so it is kept with probability required / k
         seeing = inside_images(*project_points(points, views.cameras), views.cameras, near, far).sum(1)
         found.append(points[(seeing >= required) & (draws[:, 3] * seeing < required)])
         if sum(map(len, found)) >= count:

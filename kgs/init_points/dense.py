@@ -1,4 +1,4 @@
-"""A dense first cloud: points of the training views' depth maps, where the views agree."""
+"""Dense initial points: points of the training views' depth maps on which two views agree."""
 
 import numpy as np
 import torch
@@ -11,10 +11,11 @@ from kgs.io.console import Stage, silent
 
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
-SCORE = 0.6  # a patch of a point has to match at least so well
-MOST_PIXELS, MOST_PIXELS_OF_ALL, SMALLEST = 250_000, 1_600_000, 64
-# Two views agree on a point whose depths differ by this share, or whose places by so many pixels: far away, and where
-# planes are far apart, depths are vaguer than the pictures tell.
+SCORE = 0.6  # least matching score of a point's patch
+MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000  # of one view, and of all views together
+SMALLEST = 64  # side of an image that is not halved just to need fewer planes
+# Two views agree on a point if their depths differ by less than this share, or its positions in the image by less than
+# so many pixels: where a point is far away or planes lie far apart, depths are less precise than positions.
 AGREEMENT, AGREEMENT_PIXELS = 0.01, 0.5
 
 
@@ -28,13 +29,13 @@ def dense_points(
     backend: str = "auto",
     draw: str = "uniform",
 ) -> tuple[Tensor, Tensor, int]:
-    """At most `count` points between two depths that two views agree on, drawn at random.
+    """At most `count` points on which two views agree, between the depths `near` and `far`, drawn at random.
 
     Returns the points and RGB, both `(P, 3)`, and how many they were drawn from.
 
-    The draw is "uniform", or "spread" evenly over the pictures: one point from each of about as many cells. Points
-    lie where the pixels of both views are usable. Large pictures, and many, and such as move by more pixels than a
-    sweep has planes, are swept at half the width and height, or a quarter: enough points, in bounded time and memory.
+    `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
+    where the pixels of both views are usable. To bound time and memory, images are halved until they are not too large
+    together, and move by no more pixels than a sweep has planes.
     """
     while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
         views = views.halved()
@@ -47,14 +48,14 @@ def dense_points(
     found = [_agreed(views, maps, certain, view) for view in range(len(views))]
     points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
     chosen = torch.randperm(len(points), generator=generator)
-    chosen = chosen[_one_a_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
+    chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     return points[chosen].float(), colors[chosen], len(points)
 
 
-def _one_a_cell(places: NDArray[np.int64], count: int) -> Tensor:
-    """The rows of the first place `(view, x, y)` in each of at most `count` cells, as small as that allows."""
+def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
+    """The rows of the first place `(view, x, y)` in each of at most `count` square cells, as small as that allows."""
     first, across = np.arange(len(places)), places.max(initial=0) + 1
-    least, most = 1.0, float(across)  # of the side of a cell, in pixels
+    least, most = 1.0, float(across)  # side of a cell, in pixels; found by bisection
     while len(first) > count or (len(places) > count and most - least > 1e-3):
         side = 0.5 * (least + most)
         columns, rows = (places[:, 1:] / side).astype(np.int64).T
@@ -66,7 +67,7 @@ def _one_a_cell(places: NDArray[np.int64], count: int) -> Tensor:
 
 
 def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The points of one view's certain pixels that another view's have too, their colours and places in that view."""
+    """The points of one view's certain pixels that another view confirms, their colours, and their `(view, x, y)`."""
     here, camera = maps[view].depths, views.camera(view)
     rows, columns = certain[view].nonzero().unbind(1)
     pixels = torch.stack([columns, rows], 1)
@@ -77,8 +78,9 @@ def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int
         depth = depths[:, other]
         x, y, inside = nearest_pixels(pixels[:, other], depth, *here.mT.shape)
         there = maps[other].depths[y, x].double()
-        rays = torch.stack([x, y], 1), torch.full_like(x, other)
-        back = [project_points(unproject(rays[0], z, rays[1], views.cameras), camera)[0][:, 0] for z in (there, depth)]
+        # The other view's pixel as this view sees it: at the other view's depth, and at that of the point.
+        seen, owners = torch.stack([x, y], 1), torch.full_like(x, other)
+        back = [project_points(unproject(seen, z, owners, views.cameras), camera)[0][:, 0] for z in (there, depth)]
         apart = (back[0] - back[1]).norm(dim=1)
         near = ((there / depth - 1).abs() < AGREEMENT) | (apart < AGREEMENT_PIXELS)
         agreed |= inside & near & certain[other][y, x]

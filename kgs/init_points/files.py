@@ -12,16 +12,16 @@ from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.io.ply import load_ply
 
-_MOST_BYTES, _MOST_TEXT = 2**30, 2**26  # trimesh takes some 75 times the size of a text
+_MOST_BYTES, _MOST_TEXT = 2**30, 2**26  # trimesh needs about 75 times the size of a text in memory
 _PACKED = {b"PK\3\4": "zip", b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zX": "xz", b"7z\xbc\xaf": "7z"}
 
 
 def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Positions `(P, 3)`, less `origin` `(3,)`, and RGB in [0, 1], `(P, 3)`, of a file's points or vertices; float32.
 
-    A splat has the colours of its harmonics of degree 0, and what has no colours is grey. A DataError where the file is
-    missing, broken, compressed (a small one can hold more than the memory), larger than 1 GiB (64 MiB where it is text
-    and no splat), or has no points or infinite ones.
+    Colours are those of degree 0 for a splat, and grey if the file has none. A DataError if the file is missing, broken
+    or compressed (a small one can hold more than the memory), is larger than 1 GiB (64 MiB if it is text and no splat),
+    or has no points or infinite ones.
     """
     if not path.is_file():
         raise DataError(path, "", "expected a point cloud or mesh, found no such file")
@@ -30,9 +30,9 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
     is_ply = head.startswith(b"ply")
     is_splat = is_ply and b" f_dc_0" in head
     is_text = not re.search(rb"^format binary" if is_ply else rb"\0", head, re.MULTILINE)
-    most = _MOST_TEXT if is_text and not is_splat else _MOST_BYTES
+    most, kind = (_MOST_TEXT, ", the most for a text file") if is_text and not is_splat else (_MOST_BYTES, "")
     if path.stat().st_size > most:
-        raise DataError(path, "", f"is larger than {most // 2**20} MiB{', the most for a text file' * is_text}")
+        raise DataError(path, "", f"is larger than {most // 2**20} MiB{kind}")
     for magic, name in _PACKED.items():
         if head.startswith(magic):
             raise DataError(path, "", f"expected a point cloud or mesh, got a {name} archive: unpack it first")

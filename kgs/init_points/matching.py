@@ -1,4 +1,4 @@
-"""Matches of keypoints along epipolar lines: each other's nearest in descriptors, and clearly so."""
+"""Matches keypoints along epipolar lines: mutual nearest neighbours among descriptors that pass the ratio test."""
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -9,20 +9,20 @@ from kgs.backends import takes_kernels
 MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
 CHUNK = 256  # keypoints matched at once: bounds the memory
 MAX_RATIO = 0.8  # of the best descriptor distance to the second best
-MAX_DISTANCE = 0.4  # between descriptors of length 1: a match without a rival must still be alike
+MAX_DISTANCE = 0.4  # between descriptors of length 1, for matches without a second candidate too
 
 
 def match(
     lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor, backend: str = "auto"
 ) -> tuple[Tensor, ...]:
-    """Descriptor distances, and numbers in the first and in the second view, each `(K,)`, of the K matches.
+    """Descriptor distances, and indices of the keypoints in the first and second view, each `(K,)`, of K matches.
 
     Args:
         lines: epipolar lines of the first view's keypoints in the second, normals of length 1, `(N, 3)`.
         places: of the second view's keypoints in pixels, `(M, 2)`.
         descriptors1: of length 1, `(N, F)`.
         descriptors2: `(M, F)`.
-        backend: "numba" and "auto" take kernels where they can; the pairs are the same.
+        backend: "numba" and "auto" use kernels if possible; the matches are the same.
     """
     if not takes_kernels(backend, "matching", lines):
         return _torch_matches(lines, places, descriptors1, descriptors2)
@@ -49,7 +49,7 @@ def _torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descript
 
 
 def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """For each candidate: is it the nearest of its owner, and the distance of its owner's second nearest."""
+    """For each candidate: whether it is its owner's nearest, and the distance of its owner's second nearest."""
     order = torch.arange(len(distances))
     infinite = distances.new_full((count,), torch.inf)
     ties = distances == infinite.scatter_reduce(0, owners, distances, "amin")[owners]

@@ -1,10 +1,11 @@
-"""Matches of keypoints along epipolar lines, by the rules of `kgs.init_points.matching`; what differs is rounding.
+"""Matches of keypoints along epipolar lines, by the rules of `kgs.init_points.matching`; only rounding differs.
 
     lines           (N, 3), of the first view's keypoints in the second, normals of length 1
     places          (2, M), x and y of the second view's keypoints
     descriptors     (N, F) and (M, F), of both views
 
-A distance without a candidate is infinite. Bands of rows have their own columns, so that no two threads meet.
+A distance without a candidate is infinite. Each band of rows has its own results for the columns, so that no two
+threads write to the same place.
 """
 
 import numpy as np
@@ -17,7 +18,7 @@ INFINITY = f32(np.inf)
 
 
 def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, most):
-    """Descriptor distances and numbers in both views, `(K,)`, of pairs that are each other's nearest by far."""
+    """Descriptor distances and indices in both views, `(K,)`, of mutual nearest neighbours that pass the ratio test."""
     n, m = len(lines), places.shape[1]
     near1, rival1 = np.full((2, n), INFINITY)
     near2, rival2 = np.full((2, BANDS, m), INFINITY)
@@ -37,7 +38,7 @@ def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, mo
 def find_nearest(
     begin, end, lines, places, descriptors1, descriptors2, line_distance, near1, rival1, match1, near2, rival2, match2
 ):
-    """The nearest candidate of each row and, in a band, of each column, of equal ones the first; the next distance."""
+    """The nearest candidate, of equal ones the first, and the second distance: of each row, and by band of each column."""
     (n, m), x, y = (len(lines), places.shape[1]), places[0], places[1]
     off, candidates = np.empty(m, np.float32), np.empty(m, np.int32)
     for band in range(begin, end):

@@ -18,9 +18,9 @@ from kgs.io.console import Stage, silent
 
 from .sweep_costs import sweep_costs
 
-PLANES, MOST_PLANES = 128, 256  # as many as a picture moves by pixels, in these limits
+PLANES, MOST_PLANES = 128, 256  # limits; between them one plane for each pixel by which an image moves
 NEIGHBOURS = 4  # at most
-BASELINE = 0.15  # in units of the depth, what neighbours are chosen by: depths are vague below, hidden above
+BASELINE = 0.15  # of a neighbour, in units of the depth: shorter gives vague depths, longer more occlusion
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class DepthMap:
 def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, backend: str = "auto") -> list[DepthMap]:
     """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
 
-    A view from whose place no other differs has no depths, and scores of -1.
+    If all other views are at the place of a view, its depths are unknown and its scores -1.
     """
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
@@ -55,7 +55,7 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, b
 
 
 def planes_wanted(views: Views, near: float, far: float) -> float:
-    """The number of pixels by which the middle of a view moves in a neighbour from one depth to the other: a median."""
+    """By how many pixels the middle of a view moves in a neighbour from one depth to the other: the median."""
     inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
     middle = torch.tensor([views.images.shape[-1] / 2, views.images.shape[-2] / 2, 1.0], dtype=torch.float64)
     steps = []
@@ -69,7 +69,7 @@ def planes_wanted(views: Views, near: float, far: float) -> float:
 
 
 def _neighbours(views: Views, view: int, depth: float) -> list[int]:
-    """The views to compare with, those first that stand as far apart as tells a depth without hiding it."""
+    """The views to compare with, those first whose distance is nearest to `BASELINE`."""
     centers = camera_centers(views.cameras.extrinsics)
     baselines = (centers - centers[view]).norm(dim=1) / depth
     order = (baselines / BASELINE).log().abs().argsort(stable=True).tolist()
@@ -77,7 +77,7 @@ def _neighbours(views: Views, view: int, depth: float) -> list[int]:
 
 
 def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
-    """From pixels of a view to those of another one, by planes, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
+    """From pixels of a view to those of another, for each plane, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
     intrinsics, extrinsics = camera_matrices(cameras)
     rotation = extrinsics[other, :3, :3] @ extrinsics[view, :3, :3].mT
     shift = extrinsics[other, :3, 3] - rotation @ extrinsics[view, :3, 3]
@@ -88,7 +88,7 @@ def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor
 
 
 def _refine(cost: Tensor, scores: Tensor, inverse: Tensor) -> DepthMap:
-    """The cheapest plane of each pixel, and between planes the lowest point of a parabola."""
+    """The depth of the cheapest plane of each pixel, refined by the lowest point of a parabola through three planes."""
     best = cost.argmin(0)
     inner = best.clamp(1, len(cost) - 2)
     left, middle, right = (cost.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))

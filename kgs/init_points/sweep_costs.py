@@ -1,4 +1,4 @@
-"""Costs of a plane sweep: patches are compared by normalised cross-correlation, and the costs smoothed.
+"""Costs of a plane sweep: patches are compared by normalised cross-correlation (NCC), and the costs smoothed.
 
 Source: see `plane_sweep`. Images are warped by OpenCV, whatever the backend.
 """
@@ -13,11 +13,12 @@ from torch import Tensor
 from kgs.backends import takes_kernels
 
 WINDOW = 7  # pixels, the side of the patches that are compared
-# Of the smoothing, in units of 1 - NCC: for a step by one plane, and for a jump where the image has no edge.
-STEP, JUMP, EDGE = 0.06, 0.5, 0.04
+# Prices of the smoothing, in units of 1 - NCC: of a step by one plane, and of a jump where the image has no edge.
+STEP, JUMP = 0.06, 0.5
+EDGE = 0.04  # the difference of grey values that halves the price of a jump
 LEAST_JUMP = 1.5 * STEP
-VARIANCE = 1e-5  # of a patch, in squared grey values: below, it is as flat as noise
-_AT_ONCE = 8  # planes in a call of kernels: with 16, rows of scores and of volumes drive each other out of the cache
+VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
+_AT_ONCE = 8  # planes in a call of kernels; with 16, rows of scores and of volumes no longer fit into the cache
 
 
 def sweep_costs(image: Tensor, others: Tensor, homographies: Tensor, backend: str = "auto") -> tuple[Tensor, Tensor]:
@@ -27,7 +28,7 @@ def sweep_costs(image: Tensor, others: Tensor, homographies: Tensor, backend: st
         image: grey, float32 on a CPU, `(H, W)`.
         others: images of the neighbours, `(N, H, W)`.
         homographies: from pixels of `image` to those of a neighbour, by planes, float64, `(N, D, 3, 3)`.
-        backend: "numba" and "auto" take kernels where they can.
+        backend: "numba" and "auto" use kernels if possible.
     """
     if takes_kernels(backend, "sweep", image):
         return _compiled_costs(image, others, homographies)
@@ -56,7 +57,7 @@ def _compiled_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tupl
 
 
 def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
-    """Normalised cross-correlation of patches, `(D, H, W)`; 0 where the patch leaves the other image."""
+    """NCC of the patches of each plane and pixel, `(D, H, W)`; 0 where the patch leaves the other image."""
     mean, variance = _moments(image)
     found = torch.empty(len(homographies), *image.shape)
     for plane, homography in enumerate(homographies):
@@ -68,7 +69,7 @@ def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
 
 
 def warp(image: Tensor, homography: Tensor) -> Tensor:
-    """The image at the places that pixels are mapped to, `(H, W)`; 0 outside and behind the camera."""
+    """The image at the places to which a homography maps pixels, `(H, W)`; 0 outside and behind the camera."""
     height, width = image.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = torch.from_numpy(cv2.warpPerspective(image.numpy(), homography.numpy(), (width, height), flags=flags))
@@ -89,7 +90,7 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _combine(scores: Iterator[Tensor]) -> Tensor:
-    """Of the neighbours the best, and the second best with a quarter of the weight: the others may see it hidden."""
+    """Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the place."""
     best, second = next(scores), None
     for score in scores:
         lower, best = torch.minimum(best, score), torch.maximum(best, score)
@@ -98,7 +99,7 @@ def _combine(scores: Iterator[Tensor]) -> Tensor:
 
 
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
-    """Costs `(D, H, W)` with those of smooth surfaces along eight directions added."""
+    """The sum of the costs of the cheapest paths along eight directions, `(D, H, W)`."""
     total = torch.zeros_like(cost)
     for volume, image, result in ((cost, grey, total), (cost.mT, grey.mT, total.mT)):
         for flip in (False, True):
@@ -114,11 +115,11 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
     for row in reversed(rows) if flip else rows:
         path = cost[:, row].clone()
         if last >= 0:
-            came, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
-            least = came.amin(0)
-            cheapest = torch.minimum(came, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(LEAST_JUMP))
-            cheapest[1:] = torch.minimum(cheapest[1:], came[:-1] + STEP)
-            cheapest[:-1] = torch.minimum(cheapest[:-1], came[1:] + STEP)
+            previous, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
+            least = previous.amin(0)
+            cheapest = torch.minimum(previous, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(LEAST_JUMP))
+            cheapest[1:] = torch.minimum(cheapest[1:], previous[:-1] + STEP)
+            cheapest[:-1] = torch.minimum(cheapest[:-1], previous[1:] + STEP)
             more = cheapest - least
             if slant:
                 more[:, 0 if slant > 0 else -1] = 0.0  # paths begin at the border

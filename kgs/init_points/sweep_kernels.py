@@ -1,13 +1,13 @@
-"""Costs of a plane sweep, by the formulas of `kgs.init_points.sweep_costs`; planes are the lanes, so they come last.
+"""Costs of a plane sweep, by the formulas of `kgs.init_points.sweep_costs`; planes come last, they are the SIMD lanes.
 
     image, mean, variance   (H, W), the latter two over the window around a pixel
-    warped                  (P, 2, H, W), another view's image by P planes of the sweep, and ones warped alike
-    prices                  float32: for a step by one plane; of a jump, where the image has no edge times the next;
-                            the difference of grey values that halves it; the least price of a jump
-    best, second            (H, W, D), the two highest scores of a pixel at a plane, of those added so far
-    cost, total             (H, W, D), what paths are added from, and to
+    warped                  (P, 2, H, W), another view's image warped by P planes of the sweep, and its mask of ones
+    prices                  float32: of a step by one plane; of a jump without an edge, times the next; the difference
+                            of grey values that halves the price of a jump; the least price of a jump
+    best, second            (H, W, D), the two highest scores of a pixel at a plane so far
+    cost, total             (H, W, D), the costs of planes, and the sum of the costs of paths
 
-Sums over windows are in float64, and all else rounds as written: the results are torch's but for a few last bits.
+Sums over windows are in float64, and all else rounds as written: results differ from torch's in a few last bits.
 """
 
 import numpy as np
@@ -15,21 +15,22 @@ import numpy as np
 from kgs.backends.cpu.kernel import ONE, ZERO, exact, f32, inline
 from kgs.backends.cpu.threads import over
 
-HALO, BAND = 3, 16  # of the window; rows of a band
-PATHS = 8  # side by side
-LANES = 16  # numbers of planes are made up to a multiple
+HALO = 3  # pixels of a window on each side of its centre
+BAND = 16  # rows that one task computes
+PATHS = 8  # that one task follows side by side
+LANES = 16  # the number of planes is padded to a multiple of this
 INFINITY = f32(np.inf)
 DIRECTIONS = [(dy, dx) for dy in (1, -1) for dx in (-1, 0, 1)] + [(0, 1), (0, -1)]  # rows and columns of a step
 
 
 def add_scores(threads, image, mean, variance, flat, warped, plane, best, second):
-    """Enter the scores of planes `plane`, `plane + 1`, ...; `flat`: added to variances."""
+    """Enter the scores of planes `plane`, `plane + 1`, ... into `best` and `second`; `flat` is added to variances."""
     bands = -(-image.shape[0] // BAND)
     over(threads, bands, enter_scores, image, mean, variance, flat, warped, plane, best, second, pieces=bands)
 
 
 def semi_global(threads, cost, grey, prices, total):
-    """Costs with those of smooth surfaces along eight directions added."""
+    """Sum the costs of the cheapest paths along eight directions into `total`."""
     total[:] = ZERO
     for dy, dx in DIRECTIONS:
         groups = -(-(cost.shape[1] if dy else cost.shape[0]) // PATHS)
@@ -52,7 +53,7 @@ def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, s
     for band in range(begin, end):
         sums[:] = 0.0
         for y in range(band * BAND - 2 * HALO - 1, min((band + 1) * BAND, height)):
-            # What comes in at the lower end of the window, and from the first row of the band, what goes out.
+            # The row that enters the window below and, once the window is full, the one that leaves it above.
             below, above = min(max(y + HALO, 0), height - 1), min(max(y - HALO - 1, 0), height - 1)
             kept = 1.0 if y >= band * BAND else 0.0
             for p in range(planes):
@@ -104,7 +105,7 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
                     y, x = (i if dy > 0 else height - 1 - i), (group * PATHS + k + dx * i) % width
                 else:
                     y, x = group * PATHS + k, (i if dx > 0 else width - 1 - i)
-                came, path, here, out = before[k], after[k], cost[y, x], total[y, x]
+                previous, path, here, out = before[k], after[k], cost[y, x], total[y, x]
                 if i == 0 or not 0 <= x - dx < width:
                     for d in range(planes):
                         path[1 + d] = here[d]
@@ -113,8 +114,8 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
                     least, price = lowest[k], ONE / (edge + slope) * jump
                     anywhere = least + (price if price > least_jump else least_jump)
                     for d in range(planes):
-                        cheapest = came[1 + d] if came[1 + d] < anywhere else anywhere
-                        left, right = came[d] + step, came[2 + d] + step
+                        cheapest = previous[1 + d] if previous[1 + d] < anywhere else anywhere
+                        left, right = previous[d] + step, previous[2 + d] + step
                         cheapest = left if left < cheapest else cheapest
                         cheapest = right if right < cheapest else cheapest
                         path[1 + d] = here[d] + (cheapest - least)

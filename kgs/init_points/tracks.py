@@ -1,4 +1,4 @@
-"""Feature tracks of posed images: SIFT keypoints, matched along the epipolar lines, joined over the views.
+"""Feature tracks of posed images: SIFT keypoints, matched along epipolar lines and joined over the views.
 
 Source: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004 (the ratio test).
 """
@@ -31,16 +31,16 @@ class Tracks:
     seen: Tensor  # `(T, V)`: whether a view sees a point
 
     def select(self, rows: Tensor) -> Self:
-        """Some of the points, by a mask or by numbers."""
+        """Some of the points, by a mask or by indices."""
         return type(self)(self.pixels[rows], self.seen[rows])
 
 
 def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> Tracks:
-    """Find points that at least two of the views see, where their pixels are usable.
+    """Find points that at least two of the views see, at usable pixels.
 
     Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
-    poses), clearly nearer than the second nearest, and alike in itself. The best matches are joined first; one that
-    would give a track two places in one view is left out. Nothing is random: the same images give the same bits.
+    poses), clearly nearer than the second nearest, and near enough in itself. The best matches are joined first; one
+    that would give a track two places in one view is left out. Nothing is random: equal images give equal bits.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
     limit = min(max(48_000 // len(views), 1500), 12_000)
@@ -74,7 +74,7 @@ def detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
 
 
 def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
-    """The epipolar lines of places in the first view, in the second, `(N, 3)` float32; normals of length 1."""
+    """The epipolar lines in the second view of places in the first, `(N, 3)` float32, with normals of length 1."""
     fundamental = fundamental_from_projections(projection1[None], projection2[None])[0]
     lines = convert_points_to_homogeneous(places) @ fundamental.T
     unit: Tensor = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
@@ -82,7 +82,10 @@ def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
 
 
 def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
-    """Numbers by keypoint, places and views by number; SIFT repeats a keypoint for each orientation: one place."""
+    """For each view the number of each keypoint's place; then all distinct places, and their views, by number.
+
+    SIFT repeats a keypoint for each of its orientations: these share one place.
+    """
     numbers, distinct, owners = list[Tensor](), list[Tensor](), list[int]()
     for view, all_places in enumerate(places):
         unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)

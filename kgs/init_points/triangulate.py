@@ -1,4 +1,4 @@
-"""Points from tracks in known cameras, and how certain their depth is.
+"""Triangulates tracks in known cameras, and keeps the points whose depth is certain.
 
 Source: R. Hartley and A. Zisserman, Multiple View Geometry, section 12.2 (the direct linear transformation).
 """
@@ -17,9 +17,9 @@ MIN_ANGLE = 1.0  # degrees between the two most different rays of a point
 
 
 def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
-    """The points `(T, 3)`, float64, of tracks in two views or more; not finite, or behind, where rays do not meet."""
+    """The points `(T, 3)`, float64, of tracks in two views or more; not finite or behind if rays do not meet."""
     intrinsics, extrinsics = camera_matrices(cameras)
-    # Unit focal lengths and an origin amid the cameras keep the equations well conditioned.
+    # Unit focal lengths and an origin in the middle of the cameras keep the equations well conditioned.
     origin = camera_centers(cameras.extrinsics).mean(0)
     rotations, translations = extrinsics[:, :3, :3], extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]
     projections = torch.cat([rotations, translations[..., None]], dim=-1)
@@ -31,10 +31,11 @@ def triangulate(tracks: Tracks, cameras: PinholeCamera) -> Tensor:
 
 
 def triangulate_certain(tracks: Tracks, cameras: PinholeCamera) -> tuple[Tensor, Tracks]:
-    """Triangulate, leave out what contradicts it, and keep the points whose depth is certain, with their tracks.
+    """Triangulate twice, and keep the points whose depth is certain, with their tracks.
 
-    Observations go that are behind their camera, or twice `MAX_ERROR` or more away from their pixel; points then found
-    once more go with an observation `MAX_ERROR` away, with fewer than two views, or with rays all within `MIN_ANGLE`.
+    The first time, observations are dropped that see the point behind the camera, or `2 * MAX_ERROR` or more from its
+    pixel. The second time, points are dropped that have an observation with an error of `MAX_ERROR` or more, fewer than
+    two views, or no two rays with an angle of `MIN_ANGLE`.
     """
     for limit in (2.0 * MAX_ERROR, MAX_ERROR):
         points = triangulate(tracks, cameras)

@@ -8,7 +8,7 @@ from typing import Any, TextIO
 
 from kgs.errors import printable
 
-VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a next step
+VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a step to suggest
 Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
 
@@ -20,7 +20,7 @@ def say(line: str, file: TextIO | None = None) -> None:
     """
     stream = sys.stdout if file is None else file
     line = "\n".join(map(printable, line.split("\n")))
-    with suppress(OSError, ValueError, AttributeError):  # closed by the reader, closed by the program, none at all
+    with suppress(OSError, ValueError, AttributeError):  # a stream that its reader or the program closed, or None
         encoding = stream.encoding or "utf-8"
         print(line.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 

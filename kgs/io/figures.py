@@ -1,4 +1,4 @@
-"""Figures of a fit: renders beside their photos, and the curve of the training. The caller's pyplot is left alone."""
+"""Figures of a fit: renders beside their photos, and the training curve. The caller's pyplot is left alone."""
 
 from io import BytesIO
 from pathlib import Path
@@ -14,7 +14,7 @@ from .ownership import MADE_BY
 
 
 def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:
-    """Write a PNG of some views, a row each: the photo, then, by their titles, columns of renders `(3, H, W)`."""
+    """Write a PNG of some views, a row each: the photo, then columns of renders `(3, H, W)` under their titles."""
     height, width = views.images.shape[-2:]
     pictures = {"photo, not used in training": list(views.images), **columns}
     figure = _figure(3 * len(pictures), 3 * height / width * len(indices) + 0.3)

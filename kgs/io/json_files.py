@@ -1,4 +1,4 @@
-"""JSON from files of unknown origin (finite numbers, a limit on the size, one kind of error), and whole files."""
+"""Reads JSON from files of unknown origin (finite numbers, limited size, one kind of error); writes files whole."""
 
 import json
 import math
@@ -15,7 +15,7 @@ _MOST_BYTES = 64 * 2**20
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; a DataError where the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
+    """Read a JSON object; a DataError if the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
@@ -30,14 +30,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGuard[float]:
-    """Whether a value of JSON is a number of that size, and no bool; its integers have no limit of their own."""
+    """Whether a JSON value is a number from `least` to a fixed limit, and no bool; JSON itself has no limit."""
     return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all; a ValueError where a number is not finite.
+    """Write JSON whole or not at all; a ValueError if a number is not finite.
 
-    An object says first who wrote it, under "generator".
+    An object gets the mark of kgs as its first entry, "generator".
     """
     if isinstance(value, dict):
         value = {"generator": MADE_BY} | value

@@ -1,4 +1,4 @@
-"""What a command leaves behind: JSON and PNGs, whole or not at all, and never in place of a user's file."""
+"""Checks the folder of a command's results, and writes PNGs; a user's file is never overwritten."""
 
 import hashlib
 import os
@@ -23,15 +23,15 @@ from .ownership import MARK, is_own
 FILM = "turntable.webm"
 EXPORTS = ("cameras.json", "splat.glb", FILM)  # for other programs
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
-_ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name, that of a hidden file is none
+_ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name
 
 
 def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, make: bool = True) -> None:
-    """Make the folder for results, once it is sure that this command can write there and overwrites no user's file.
+    """Create the folder for results, after checking that it can be written to and that no user's file is in the way.
 
-    `files`, relative to `out`, are what it is going to write; `scene` is a folder whose own photos it must not write
-    beside. With `make` False it only looks. A folder that will not do is a DataError.
+    `files`, relative to `out`, are the files that will be written; nothing is written next to the photos of the folder
+    `scene`. With `make` False the folder is only checked. A folder that cannot be used is a DataError.
     """
     advice = "choose another folder"
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
@@ -41,7 +41,7 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
     has_photos = inside and there == out and not all(map(is_own, list_images(out)))
-    of_photos = ("sparse",) if is_own(out / CAMERAS_REPORT) else ()  # cameras that a former run found
+    of_photos = ("sparse",) if is_own(out / CAMERAS_REPORT) else ()  # kgs wrote it: cameras that a former run found
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):
@@ -52,9 +52,9 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
 
 
 def png_names(views: Iterable[str]) -> dict[str, str]:
-    """A file name of its own, in UTF-8, for a render of each view: folders become part of it, the ending becomes .png.
+    """A unique file name for a render of each view: folders become part of the name, the ending becomes .png.
 
-    Where two views would have the same (capitals do not count), or one is too long, a hash of the view's name is added.
+    If two views would have the same name (ignoring case), or a name is too long, a hash of the view's name is added.
     """
     plain = {view: re.sub(r"[\\/\x00-\x1f\ud800-\udfff]", "_", re.sub(_ENDING, "", view)) for view in views}
     folded = {view: unicodedata.normalize("NFC", stem).casefold() for view, stem in plain.items()}
@@ -69,9 +69,9 @@ def png_names(views: Iterable[str]) -> dict[str, str]:
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs.
+    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as made by kgs.
 
-    As PNG has it alpha is straight: the colours are not multiplied by it.
+    Alpha is straight, as PNG has it: the colours are not multiplied by it.
     """
     ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:

@@ -130,7 +130,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
 
 
 def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
-    """Three finite numbers in float64; else a ValueError with the argument's name."""
+    """Three finite numbers in float64; a ValueError with the argument's name if they are not."""
     vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
     if vector.shape != (3,):
         raise ValueError(f"{name}: expected shape (3,), got {vector.shape}")
@@ -150,17 +150,17 @@ def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[A
 class _Element:
     name: str
     count: int
-    codes: dict[str, str] = field(default_factory=dict)  # of each property numpy's code, O for a list
+    codes: dict[str, str] = field(default_factory=dict)  # NumPy's type code of each property, O for a list
 
 
 def _splat_names(rest: int) -> list[str]:
-    """The properties after the position and normal, with so many of f_rest."""
+    """The names of the properties after position and normal, with `rest` of them f_rest."""
     colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
-    """The byte order, the elements in order, and the active degree (3 where none is written down)."""
+    """The byte order, the elements in order, and the active degree (3 if the header has none)."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
         raise DataError(path, "", "not a PLY file: expected 'ply' in the first line")
     order, elements, degree = None, list[_Element](), 3
@@ -194,7 +194,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
 def _read_columns(
     path: Path, order: str, elements: list[_Element], place: int, file: BinaryIO
 ) -> dict[str, NDArray[np.generic]]:
-    """The properties of the element in that place; binary data are read after the file is known to be long enough."""
+    """The properties of the element at `place`; binary data are read only if the file is long enough."""
     vertex, is_text, begin = elements[place], order == "ascii", file.tell()
     dtypes = [np.dtype([(name, BYTE_ORDERS[order] + code) for name, code in e.codes.items()]) for e in elements]
     if any(dtype.hasobject for dtype in dtypes[: place + 1]):

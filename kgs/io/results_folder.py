@@ -1,4 +1,4 @@
-"""The folder of a fit: which files it has, one fit at a time, and when it is finished."""
+"""The results folder of a fit: its files, its lock, and whether the fit is finished."""
 
 import sys
 from collections.abc import Iterator
@@ -18,20 +18,20 @@ _OPTIONAL = (PREVIOUS, FILM)
 
 
 def fit_staging(out: Path) -> Staging:
-    """How the results of a fit get to their folder."""
+    """The staging folders of a fit's results."""
     return Staging(out, optional=_OPTIONAL, merged=("test",))
 
 
 @contextmanager
 def held(path: Path) -> Iterator[bool]:
-    """Hold a file, made if it is not there, until the block or the process ends; False where another one has it."""
+    """Lock a file, created if missing, until the block or the process ends; yields False if it is locked already."""
     with open(path, "ab") as file:
         ours = True
         try:
             if sys.platform == "win32":
                 import msvcrt
 
-                file.seek(2**30)  # behind its end: what is locked cannot be read
+                file.seek(2**30)  # beyond its end, because Windows forbids to read locked bytes
                 msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
             else:
                 import fcntl
@@ -46,7 +46,7 @@ def held(path: Path) -> Iterator[bool]:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Keep other fits out of a folder until the block or the process ends; DataError where one is at work there."""
+    """Keep other fits out of a folder until the block or the process ends; DataError if one is at work there."""
     with held(out / ".lock") as ours:
         if not ours:
             raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another folder")
@@ -54,7 +54,10 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def replaced_files(out: Path) -> list[str]:
-    """What a fit replaces or removes in its folder; checkpoints, which may be damaged, only where there is no fit."""
+    """The files that a fit replaces or removes in its folder, for `check_folder`.
+
+    In the folder of a fit checkpoints are left out: a damaged one may lack the mark of kgs.
+    """
     staging = fit_staging(out)
     names = [*RESULTS, staging.unfinished.name, staging.finished.name]
     return names if is_own(out / "config.json") else [*names, CHECKPOINT, *_OPTIONAL]

@@ -1,8 +1,8 @@
-"""New results that replace former ones all at once, whenever the process is killed.
+"""Replaces former results by new ones all at once, whenever the process is killed.
 
 Results are written to a folder of their own, `unfinished`. When all are there, `seal` lists the files and renames the
-folder to `finished`; from then on they are whole. `complete` moves them to their places, and removes what the former
-results had and these have not. Whoever opens the folder after a kill in between calls `complete` first.
+folder to `finished`; from then on they are whole. `complete` moves them to their places, and removes what only
+the former results had. Code that opens the folder calls `complete` first, in case a kill came in between.
 """
 
 import os
@@ -20,11 +20,11 @@ _LIST = "files.json"
 
 @dataclass(frozen=True)
 class Staging:
-    """The two folders through which results of one kind go.
+    """The two folders through which results of one kind pass.
 
     Args:
         out: where the results belong.
-        kind: told apart by the suffix of the folders' names; "" for none.
+        kind: suffix of the folders' names, which tells kinds of results apart; "" for a fit.
         optional: files of former results that are removed unless the new ones have them.
         replaced: subfolders that are replaced as wholes.
         merged: subfolders of images where only images that kgs wrote are removed.
@@ -43,12 +43,12 @@ class Staging:
 
     @property
     def finished(self) -> Path:
-        """Where they are whole and wait for their place."""
+        """Where whole results wait until they are moved to `out`."""
         return self.out / f"finished{self.kind}"
 
     @property
     def is_waiting(self) -> bool:
-        """Whether whole results wait, of which none has been moved yet."""
+        """Whether whole results wait, none of which has been moved yet."""
         try:
             return all((self.finished / name).exists() for name in self._listed())
         except DataError:
@@ -59,16 +59,16 @@ class Staging:
         make_own_folder(self.unfinished)
 
     def seal(self) -> None:
-        """Declare that all new results are there."""
+        """Declare the new results whole."""
         write_json(self.unfinished / _LIST, {"files": _files(self.unfinished)})
         shutil.rmtree(self.finished, ignore_errors=True)
         os.replace(self.unfinished, self.finished)
 
     def complete(self) -> None:
-        """Move results that are whole to their places; does nothing where there are none."""
+        """Move whole results to their places; does nothing if there are none."""
         if not (is_own(self.finished) and (self.finished / _LIST).exists()):
             return
-        names = self._listed()  # those that were moved before a kill, too
+        names = self._listed()  # includes files that were moved before a kill
         for name in set(self.optional) - set(names):
             (self.out / name).unlink(missing_ok=True)
         for name in self.replaced:
@@ -83,7 +83,7 @@ class Staging:
         shutil.rmtree(self.finished)
 
     def discard(self) -> None:
-        """Remove results that wait."""
+        """Remove whole results that wait."""
         shutil.rmtree(self.finished, ignore_errors=True)
 
     def _listed(self) -> list[str]:
@@ -91,6 +91,6 @@ class Staging:
 
 
 def _files(folder: Path) -> list[str]:
-    """The files of a folder and its subfolders, without what a kill left half written."""
+    """The files of a folder and its subfolders, without those that a kill left half written."""
     whole = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
     return [path.relative_to(folder).as_posix() for path in whole if path.name[0] != "." and path.name != _LIST]

@@ -1,6 +1,6 @@
 """PSNR of held-out views, separately where at least two training views show the scene and elsewhere.
 
-One training view gives no measured depth, and what none shows is guessed: a mean over both says little.
+A single training view does not determine depth, and what no view shows is a guess: a mean over all pixels says little.
 """
 
 import math
@@ -37,7 +37,7 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
 
     Returns:
         "share" of the test pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the
-        views that have such pixels; None where there are none, or where the error is 0. None without test views.
+        views that have such pixels; None if no view has, or if the error is 0. None without test views.
     """
     train, test = scene.train, scene.test
     if not len(test):

@@ -1,7 +1,7 @@
-"""Measures of held-out views: PSNR, SSIM with both borders, LPIPS.
+"""Measures renders against photos: PSNR, SSIM with both borders, LPIPS.
 
-Float renders clamped to [0, 1] are compared, never 8-bit files, over all pixels and channels (masks are not used);
-the photos' dark border, if any, is applied to the renders first.
+Compared are float renders, clamped to [0, 1], never 8-bit files, over all pixels and channels (masks are not used). The
+photos' dark border, if any, is applied to the renders first.
 
 Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
 Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.
@@ -25,7 +25,7 @@ from kgs.errors import DataError
 from .lpips import Lpips
 
 MEASURES = ("psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled")
-BEST = 200.0  # decibels in place of an infinite PSNR where numbers are compared
+BEST = 200.0  # decibels that stand for an infinite PSNR in comparisons
 _WINDOW = 11
 
 
@@ -38,7 +38,7 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 
     Returns:
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
-        published tables), "lpips_vgg" (images in [-1, 1], as the network is meant) and "lpips_vgg_unscaled" (in [0, 1],
+        published tables), "lpips_vgg" (images in [-1, 1], as in its training) and "lpips_vgg_unscaled" (in [0, 1],
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
         what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one).
     """
@@ -68,7 +68,7 @@ def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float 
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
-    """The metrics of a metrics.json, measured again; without `lpips` the old LPIPS stays. DataError for other views."""
+    """The content of a metrics.json, measured again; without `lpips` its LPIPS stays. DataError if views differ."""
     fresh: dict[str, Any] = {}
     for part, views in (("test", scene.test), ("train", scene.train)):
         old = metrics.get(part) or {"views": []}

@@ -1,7 +1,7 @@
-"""Cameras of unposed photos: read, keypoints, match, map, gates, write, in this order, run by `pose`.
+"""Finds the cameras of unposed photos. `pose` runs the parts: find, read, keypoints, match, map, gates, write.
 
-Photos as a phone wrote them go in; a scene that kgs and other programs read comes out. Two solvers have to agree, and
-gates refuse cameras that cannot be believed: see :mod:`kgs.sfm.gates`.
+The input is a folder of photos as a phone wrote them, the output a scene that kgs and other programs read. Two solvers
+have to agree, and gates refuse cameras that cannot be trusted: see :mod:`kgs.sfm.gates`.
 """
 
 from .pose import pose_photos

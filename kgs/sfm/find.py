@@ -1,4 +1,4 @@
-"""The photos of a user's folder, or what the folder holds instead and what to do about it."""
+"""Finds the photos in a user's folder; errors say what it holds instead, and what to do about it."""
 
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """The files that are photos and can be read, sorted by name; HEIC among them where pi-heif is there."""
+    """The photos of a folder that can be read, sorted by name; with HEIC if pi-heif is installed."""
     return [path for path in list_images(folder, _readable()) if path.is_file()]
 
 

@@ -1,8 +1,8 @@
-"""Whether cameras can be believed, and what to tell who took the photos where they cannot.
+"""Decides whether cameras can be trusted, and if not tells the user what to photograph next.
 
-A low reprojection error proves nothing: few matches fit wrong cameras as well. So the focal length has to be one that
-lenses have, and the photos have to tell it unless their Exif does; each photo has to see many points; and a second
-solver, from other keypoints, has to find the same.
+A low reprojection error proves nothing: a few matches fit wrong cameras as well. So the focal length has to be in the
+range of real lenses, and either the photos or their Exif have to determine it; each photo has to see many points; and a
+second solver, which uses other keypoints, has to find the same cameras.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,19 +20,19 @@ FOCAL_RANGE = 0.4, 3.0  # of the longer side
 FEWEST_POINTS = 50  # that each photo sees
 MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
 MOST_RATIO = 1.15  # of their focal lengths
-LEAST_RISE = 0.03  # of the squared errors where the focal length is a quarter off
+LEAST_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
 _SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
-_PLANAR = 0.97  # share of matches that one homography explains; of a scene with depth in some pair fewer
+_PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
 _WITHOUT = "A fit without some photos: take them out of the folder"
 Pairs = Mapping[tuple[str, str], int]  # verified matches of each pair
 
 
 def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> list[str]:
-    """What speaks against one solver's cameras, a sentence each; none if nothing does.
+    """The reasons to refuse one solver's cameras, a sentence each; empty if there are none.
 
     Args:
         cameras: what the solver found.
-        names: of all photos.
+        names: the names of all photos.
         longest: the longer side of the photos in pixels.
     """
     if cameras is None:
@@ -51,7 +51,7 @@ def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> l
 def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str]]:
     """The largest angle, in degrees, between two solvers' relative rotations of a pair, and that pair.
 
-    Of photos that one of them did not place it is 180.
+    It is 180 for a pair of which one solver did not place both photos.
     """
     worst = (0.0, ("", ""))
     for pair in combinations(sorted({*first.rotations, *second.rotations}), 2):
@@ -62,7 +62,7 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
 
 
 def focal_doubt(found: Sequence[Cameras]) -> str:
-    """Why the photos of no solver determine the focal length; "" if those of one do."""
+    """Why neither solution determines the focal length; "" if one does."""
     rise = max(0.0, *(cameras.focal_rise for cameras in found))
     if rise >= LEAST_RISE:
         return ""
@@ -70,7 +70,7 @@ def focal_doubt(found: Sequence[Cameras]) -> str:
 
 
 def focal_difference(found: Sequence[Cameras]) -> str:
-    """How far the solvers' focal lengths are apart, where that is too far; "" if it is not."""
+    """How far the solvers' focal lengths are apart, if that is too far; "" if it is not."""
     ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
     if ratio <= MOST_RATIO:
         return ""
@@ -80,15 +80,15 @@ def focal_difference(found: Sequence[Cameras]) -> str:
 def judge(
     folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs
 ) -> tuple[Cameras, float]:
-    """The cameras that pass the gates, and how far the two solvers are apart in degrees; a DataError if none do.
+    """The cameras that pass the gates, and the solvers' largest difference in degrees; a DataError if none pass.
 
     If both pass, those whose worst photo sees more points are taken.
     """
-    against = [objections(cameras, names, longest) for cameras in found]
-    good = [cameras for cameras, reasons in zip(found, against, strict=True) if cameras and not reasons]
+    reasons = [objections(cameras, names, longest) for cameras in found]
+    good = [cameras for cameras, against in zip(found, reasons, strict=True) if cameras and not against]
     if not good:
-        raise DataError(folder, "", refusal(against[0], names, pairs))
-    for cameras in found:  # what one of them did not place nothing confirms
+        raise DataError(folder, "", refusal(reasons[0], names, pairs))
+    for cameras in found:  # nothing confirms a photo that only one solver placed
         if missing := [name for name in names if cameras is None or name not in cameras.points]:
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
             raise DataError(folder, "", refusal([reason], names, pairs))
@@ -108,7 +108,7 @@ def judge(
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
-    """The photos in groups that overlap with each other, in the order of their names, the largest first."""
+    """Groups of photos that overlapping pairs connect, the largest first, each in the order of `names`."""
     groups = [{name} for name in names]
     for pair, count in pairs.items():
         if count >= FEWEST_MATCHES:
@@ -138,10 +138,10 @@ def table(names: Sequence[str], pairs: Pairs) -> str:
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """What to say of photos whose matches can give no cameras, and what to photograph next; "" of others.
+    """Why matches cannot give cameras, and what to photograph next, as an error message; "" if they can.
 
     Args:
-        names: of all photos.
+        names: the names of all photos.
         pairs: verified matches of each pair.
         geometries: what the matches of each overlapping pair say about depth.
     """
@@ -169,7 +169,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
 
 
 def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
-    """What to say of photos of which neither they nor their Exif tell the focal length; `doubt` says why."""
+    """The error message if neither the photos nor their Exif determine the focal length; `doubt` says why."""
     return (
         "no cameras that can be trusted: the photos do not tell the focal length, as a rule because they are close "
         f"together, and their Exif does not say it: {doubt}, and the depth of the scene is as unsure. What helps: "
@@ -179,7 +179,7 @@ def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
 
 
 def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs) -> str:
-    """What to say of cameras that cannot be believed, and what to photograph next."""
+    """The error message for cameras that cannot be trusted: the reasons, and what to photograph next."""
     between = " and ".join(weakest_link(names, pairs))
     return (
         f"no cameras that can be trusted: {'; '.join(reasons)}. What helps most: photos from places between {between}, "
@@ -195,6 +195,6 @@ def _row(name: str, names: Sequence[str], pairs: Pairs, width: int) -> str:
 
 
 def _angle(first: Cameras, second: Cameras, pair: tuple[str, str]) -> float:
-    """Between two solvers' rotations from one camera to another, in degrees."""
+    """The angle between two solvers' rotations from one camera to another, in degrees."""
     both = [cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T for cameras in (first, second)]
     return float(degrees_between(*map(torch.from_numpy, both)))

@@ -1,4 +1,4 @@
-"""Keypoints with RootSIFT descriptors, of small pictures too.
+"""SIFT keypoints with RootSIFT descriptors; small images can be enlarged first.
 
 Sources: D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004; R. Arandjelovic and
 A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012 (RootSIFT).
@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 class Keypoints(NamedTuple):
-    """N keypoints of one picture."""
+    """N keypoints of one image."""
 
     places: Tensor  # `(N, 2)` float64, pixels; the first pixel's centre is (0, 0)
     sizes: Tensor  # `(N,)` float64, pixels
@@ -25,14 +25,14 @@ class Keypoints(NamedTuple):
 def root_sift(
     grey: NDArray[Any], most: int, factor: int = 1, mask: NDArray[np.uint8] | None = None, **rules: Any
 ) -> Keypoints:
-    """The strongest SIFT keypoints of a picture, up to `most`; nothing is random.
+    """The strongest SIFT keypoints of an image, up to `most`; nothing is random.
 
     Args:
         grey: `(H, W)`, 8 bits.
-        most: so many at the most.
-        factor: the picture is enlarged by this whole number first.
+        most: the largest number of keypoints.
+        factor: the image is enlarged by this whole number first.
         mask: `(H, W)`, keypoints lie where it is not 0; None: everywhere.
-        rules: thresholds, as `cv2.SIFT_create` names them.
+        rules: thresholds, as keyword arguments of `cv2.SIFT_create`.
     """
     if factor > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
@@ -41,6 +41,6 @@ def root_sift(
     sift = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True, **rules)  # type: ignore[attr-defined]  # no stub
     found, descriptors = sift.detectAndCompute(grey, mask)
     rows = torch.tensor([(*point.pt, point.size, point.angle) for point in found], dtype=torch.float64).reshape(-1, 4)
-    numbers = torch.zeros(0, 128) if descriptors is None else torch.from_numpy(descriptors)
-    unit = torch.nn.functional.normalize(numbers, p=1.0, dim=1).sqrt()
+    vectors = torch.zeros(0, 128) if descriptors is None else torch.from_numpy(descriptors)
+    unit = torch.nn.functional.normalize(vectors, p=1.0, dim=1).sqrt()
     return Keypoints((rows[:, :2] + 0.5) / factor - 0.5, rows[:, 2] / factor, rows[:, 3], unit)

@@ -66,15 +66,15 @@ def quiet_pycolmap() -> Iterator[Any]:
 
 
 def verify(database: Path, seed: int, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
-    """Verify the matches of each pair: those that one motion of the camera explains.
+    """Verify the matches of each pair: keep those that one motion of the camera explains.
 
     Args:
         database: with matches.
-        seed: of what is drawn.
-        names: what each image of the database is called.
+        seed: of RANSAC.
+        names: the photos' names by those of the images in the database.
 
     Returns:
-        How many there are, by the names of every pair.
+        The number of verified matches by the names of the pair, for every pair.
     """
     with quiet_pycolmap() as pycolmap:
         verifier = pycolmap.GeometricVerifierOptions()
@@ -87,7 +87,7 @@ def verify(database: Path, seed: int, names: Mapping[str, str]) -> dict[tuple[st
 
 
 def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], PairGeometry]:
-    """That of the verified matches of each pair that overlaps, by the names of the pair in `names`."""
+    """What the verified matches of each overlapping pair say about depth, by the names of the pair in `names`."""
     found = {}
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         images = {image.image_id: names[image.name] for image in file.read_all_images()}
@@ -102,14 +102,14 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
     return found
 
 
-def write_own_matches(database: Path, images: Path, names: list[str], lens: Any, seed: int) -> None:
+def write_colmap_matches(database: Path, images: Path, names: list[str], lens: Any, seed: int) -> None:
     """Make a second database of the same photos, with COLMAP's own keypoints and matches, verified.
 
     Args:
         database: the file to write.
         images: the folder of the photos.
-        names: of the photos in it.
-        lens: what is known of their lens, pycolmap's.
+        names: the names of their files there.
+        lens: a first guess of their lens, a camera of pycolmap.
         seed: of the verification.
     """
     with quiet_pycolmap() as pycolmap:
@@ -138,18 +138,18 @@ def write_own_matches(database: Path, images: Path, names: list[str], lens: Any,
 def solve(
     database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str], focal: float | None = None
 ) -> Cameras | None:
-    """Cameras and points from verified matches, of as many photos as can be placed; None where no pair can be.
+    """Cameras and points from verified matches, of as many photos as can be placed; None if no pair can be.
 
     The lens is held while photos are placed, because two photos do not determine it, and adjusted to all of them after
     that. This is repeated with the lens that came out until it no longer changes.
 
     Args:
-        database: with verified matches, and a first guess of the lens, which is replaced by what comes out.
+        database: with verified matches, and a first guess of the lens, which the result replaces.
         images: the folder of the photos.
         work: a folder for what the mapper writes.
         seed: of its random choices.
-        names: what each image of the database is called.
-        focal: the focal length in pixels, where it is known; adjusted if None.
+        names: the photos' names by those of the images in the database.
+        focal: the focal length in pixels if it is known; None: it is adjusted.
     """
     best, error = None, 0.0
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
@@ -168,7 +168,7 @@ def solve(
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
-    """The cameras of a reconstruction by the names that `names` gives its images, in their order there."""
+    """The cameras of a reconstruction by the photos' names, in the order of `names`."""
     images = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     placed = {name: images[image] for image, name in names.items() if image in images}
     poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
@@ -183,9 +183,9 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
 
 
 def _map(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, free: bool) -> Any:
-    """The reconstruction of most photos with the lens of the database; None where no pair can be placed.
+    """The reconstruction of most photos with the lens of the database; None if no pair can be placed.
 
-    If `free`, the second attempt adjusts the focal length on the way.
+    If `free`, the second attempt adjusts the focal length while it places photos.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -210,7 +210,7 @@ def _map(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, fre
 
 
 def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any) -> Any:
-    """The reconstruction that places most photos; None where the mapper finds none."""
+    """The reconstruction that places most photos; None if the mapper finds none."""
     try:
         found = pycolmap.incremental_mapping(database, images, work, options)
     except (RuntimeError, ValueError):  # the mapper gives up
@@ -219,7 +219,7 @@ def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options
 
 
 def _is_worse(found: Any, best: Any) -> bool:
-    """Whether a reconstruction has fewer photos than a former one, or less than half of its points."""
+    """Whether a reconstruction has fewer photos than the best one so far, or less than half of its points."""
     return bool(found.num_reg_images() < best.num_reg_images() or 2 * found.num_points3D() < best.num_points3D())
 
 
@@ -238,12 +238,12 @@ def _adjust(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
 
 
 def _bundle_adjust(reconstruction: Any, distortion: float | None, focal: float | None) -> tuple[Any, float]:
-    """A copy, adjusted until nothing improves, and half its sum of squared errors in pixels.
+    """A copy, adjusted until it converges, and half its sum of squared errors in pixels.
 
     Args:
         reconstruction: pycolmap's.
-        distortion: that of the lens, held; adjusted if None.
-        focal: its focal length in pixels, held; adjusted if None.
+        distortion: radial distortion at which the lens is held; None: it is adjusted.
+        focal: focal length in pixels at which the lens is held; None: it is adjusted.
     """
     scene = copy.deepcopy(reconstruction)
     with quiet_pycolmap() as pycolmap:
@@ -285,7 +285,7 @@ def _two_view_options(pycolmap: Any, seed: int) -> Any:
 
 
 def _inliers(file: Any, i: int, j: int) -> NDArray[np.int64]:
-    """Numbers of keypoints `(M, 2)` of the verified matches of two images."""
+    """Indices of the keypoints of two images in their verified matches, `(M, 2)`."""
     if not file.exists_two_view_geometry(i, j):
         return np.zeros((0, 2), np.int64)
     return np.asarray(file.read_two_view_geometry(i, j).inlier_matches, np.int64)

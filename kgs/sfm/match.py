@@ -1,6 +1,6 @@
-"""Keypoints of photos and their matches, written into a COLMAP database and verified there.
+"""Finds keypoints of photos, matches them in pairs, and writes both into a COLMAP database.
 
-Source: L. Cavalli et al., AdaLAM, ECCV 2020 (matches that agree with their neighbours).
+Source: L. Cavalli et al., AdaLAM, ECCV 2020 (keeps matches that agree with their neighbours).
 """
 
 from itertools import combinations
@@ -18,14 +18,15 @@ from .keypoints import root_sift
 from .read import Photo
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size
-KEYPOINTS = 4096, 8192, 24_576  # of one photo at least and at most; of all photos together
+FEWEST_KEYPOINTS, MOST_KEYPOINTS = 4096, 8192  # of one photo
+ALL_KEYPOINTS = 24_576  # of all photos together, if that leaves each one `FEWEST_KEYPOINTS`
 _CONTRAST = 0.01
 _CHUNK = 512  # keypoints compared at once: bounds the memory
-_FEWEST = 8  # matches of a pair that are worth verifying
-DEFAULT_FOCAL = 0.8  # of the longer side, where the files do not say it: as of phones (0.7 to 0.8)
+_FEWEST_MATCHES = 8  # matches of a pair that are worth verifying
+DEFAULT_FOCAL = 0.8  # of the longer side, if Exif does not say it; phones have 0.7 to 0.8
 
 
-class Framed(NamedTuple):
+class PhotoKeypoints(NamedTuple):
     """Keypoints of one photo, as COLMAP and Kornia take them."""
 
     places: Tensor  # `(N, 2)` float32, the first pixel's centre is (0.5, 0.5)
@@ -33,13 +34,13 @@ class Framed(NamedTuple):
     frames: Tensor  # `(1, N, 2, 3)`, Kornia's local affine frames
 
 
-def find_keypoints(photo: Photo, most: int) -> Framed:
+def find_keypoints(photo: Photo, most: int) -> PhotoKeypoints:
     """The strongest SIFT keypoints of a photo, up to `most`; nothing is random."""
     factor = 2 if max(photo.size) < SMALL else 1
     found = root_sift(photo.grey(), most, factor, contrastThreshold=_CONTRAST)
     places, sizes, angles = (found.places + 0.5).float(), found.sizes.float(), found.angles.float()
     frames = laf_from_center_scale_ori(places[None], sizes[None, :, None, None], angles[None, :, None])
-    return Framed(places, found.descriptors, frames)
+    return PhotoKeypoints(places, found.descriptors, frames)
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], stage: Stage) -> None:
@@ -51,8 +52,8 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], stage: 
         names: their names in the database.
         stage: shows how far the work is.
     """
-    fewest, most, total = KEYPOINTS  # the cost of matching grows with the squares of both counts
-    most = min(most, max(fewest, total // len(photos)))
+    # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
+    most = min(MOST_KEYPOINTS, max(FEWEST_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
     found = [find_keypoints(photo, most) for photo in stage(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
     with _open(database) as file:
@@ -61,13 +62,13 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], stage: 
             file.write_keypoints(image_id, keypoints.places.numpy())
         for i, j in stage(list(combinations(range(len(photos)), 2)), "matches", "pair"):
             pairs = _match(found[i], found[j], area)
-            if len(pairs) >= _FEWEST:
+            if len(pairs) >= _FEWEST_MATCHES:
                 file.write_matches(ids[i], ids[j], pairs.numpy().astype("uint32"))
 
 
-def _match(first: Framed, second: Framed, area: tuple[int, ...]) -> Tensor:
-    """Numbers of keypoints that match, `(M, 2)`: each other's nearest in descriptors, as AdaLAM finds them to agree."""
-    if min(len(first.places), len(second.places)) < _FEWEST:
+def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...]) -> Tensor:
+    """Indices of matching keypoints, `(M, 2)`: mutual nearest neighbours among descriptors that pass AdaLAM."""
+    if min(len(first.places), len(second.places)) < _FEWEST_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
     nearest1, best2, nearest2 = [], torch.full((len(second.places),), -1.0), torch.zeros(len(second.places)).long()
     for start in range(0, len(first.places), _CHUNK):
@@ -79,7 +80,7 @@ def _match(first: Framed, second: Framed, area: tuple[int, ...]) -> Tensor:
     columns = torch.cat(nearest1)
     rows = (nearest2[columns] == torch.arange(len(columns))).nonzero()[:, 0]
     columns = columns[rows]
-    if len(rows) < _FEWEST:
+    if len(rows) < _FEWEST_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
     (_, descriptors1, frames1), (_, descriptors2, frames2) = first, second
     arguments = (descriptors1[rows], descriptors2[columns], frames1[:, rows], frames2[:, columns])
@@ -94,13 +95,13 @@ def _open(database: Path) -> Any:
 
 
 def exif_focal(photos: list[Photo]) -> float | None:
-    """The focal length in pixels as the files say, None where none does."""
+    """The median focal length in pixels that the photos' Exif gives, None if none does."""
     known = [photo.focal for photo in photos if photo.focal]
     return median_high(known) if known else None
 
 
 def lens_of(photos: list[Photo]) -> Any:
-    """What is known of the one lens of all photos, as pycolmap has it."""
+    """A first guess of the one lens of all photos, as a camera of pycolmap."""
     import pycolmap
 
     width, height = photos[0].size

@@ -1,4 +1,4 @@
-"""From photos to cameras that two solvers agree on: the folder they go to, and the report about them."""
+"""Finds the cameras of a folder of photos, checks that two solvers agree, and writes the scene and a report."""
 
 import shutil
 import time
@@ -33,7 +33,7 @@ from .gates import (
     judge,
     why_no_cameras,
 )
-from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verify, write_own_matches
+from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verify, write_colmap_matches
 from .match import exif_focal, lens_of, write_matches
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .write import (
@@ -41,7 +41,7 @@ from .write import (
     MODEL,
     REPORT,
     check_place,
-    is_kept,
+    is_reusable,
     level_and_scale,
     photo_staging,
     write_images,
@@ -49,9 +49,7 @@ from .write import (
 )
 
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
-
-
-SETTINGS = 4  # grows with every change after which the same photos give other files
+SETTINGS = 4  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
@@ -66,8 +64,8 @@ def pose_photos(
     """Find the cameras of unposed photos, and write a scene that `kgs.datasets.load_scene` reads.
 
     The folder `out` gets `images` (upright PNGs of one size, at most 1600 pixels long, without metadata), `sparse/0`
-    (COLMAP's binary model: one SIMPLE_RADIAL lens, poses, points with tracks) and `photos.json` (the report). If the
-    photos are those of a former run, what is there is used again.
+    (COLMAP's binary model: one SIMPLE_RADIAL lens, poses, points with tracks) and `photos.json` (the report). If a
+    former run had the same photos and seed, its results are used again.
 
     Convention:
         COLMAP's: world-to-camera poses with OpenCV axes, the first pixel's centre at (0.5, 0.5). Up in the world is
@@ -75,39 +73,40 @@ def pose_photos(
 
     Args:
         folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into.
-        out: the folder for the results, made if it is not there.
-        seed: of what the solvers draw. The same photos and seed give the same files, but for the times in photos.json.
-        wait: leave new files in `out/finished-photos` where `out` holds a fit, which belongs to the former cameras.
+        out: the folder for the results, created if it does not exist.
+        seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
+        wait: leave new files in `out/finished-photos` if `out` holds a fit, which belongs to the former cameras.
         stage: shows how far each part is, as `kgs.io.console.each` does.
-        say: where lines for the user go.
+        say: called with each line for the user.
 
     Returns:
-        What photos.json holds: "photos" by file name, "matches" of each pair, "size" (width, height), "photo_size"
-        (that of the smallest photo as it came), "focal_px", "focal_rise" (by what share squared errors grow where the
-        focal length is a quarter off; None where that of the Exif was held), "radial_distortion", "points",
-        "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others; "reused": whether it is a former run's; and "folder": where the scene is.
+        The content of photos.json: "photos" by file name, "matches" of each pair, "size" (width, height), "photo_size"
+        (that of the smallest photo before it was reduced), "focal_px", "focal_rise" (by what share squared errors grow
+        if the focal length is a quarter off; None if it was held at that of the Exif), "radial_distortion", "points",
+        "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others; "reused": whether a former run wrote it; and "folder": where the scene is.
 
     Raises:
-        DataError: the folder holds no photos that fit together, or their cameras cannot be believed; the message says
+        DataError: the folder holds no photos that fit together, or their cameras cannot be trusted; the message says
             what to do, with the number of matches of each pair.
         ModuleNotFoundError: pycolmap or Pillow is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    import_module("PIL")  # a missing package is told before any work
+    # a missing package is an error before any work
+    import_module("PIL")
     with quiet_pycolmap():
         pass
     paths = find_photos(folder)
     check_place(out, folder)
     opened = open_photos(paths)
-    same = {"settings": SETTINGS, "seed": seed, "sha256": {photo.path.name: photo.sha256 for photo in opened}}
+    inputs = {"settings": SETTINGS, "seed": seed, "sha256": {photo.path.name: photo.sha256 for photo in opened}}
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         staging = photo_staging(out)
         waiting = staging.finished
         if not (wait and staging.is_waiting):
             staging.complete()
-        place = next((place for place in (waiting, out) if is_kept(place, same)), None)
+        place = next((place for place in (waiting, out) if is_reusable(place, inputs)), None)
         if place is not None:
             say(f"cameras: those in {place} are of the same {len(paths)} photos and are used again")
         if place == out:
@@ -117,7 +116,7 @@ def pose_photos(
             staging.start()
             try:
                 report = find_cameras(opened, new, seed % 2**31, stage, say)
-                write_json(new / REPORT, same | report)
+                write_json(new / REPORT, inputs | report)
                 staging.seal()
             finally:
                 shutil.rmtree(new, ignore_errors=True)
@@ -133,7 +132,7 @@ def find_cameras(
     """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
 
     Raises:
-        DataError: the photos do not fit together, or their cameras cannot be believed.
+        DataError: the photos do not fit together, or their cameras cannot be trusted.
     """
     seconds, lap = dict[str, float](), _clock()
     folder, names = opened[0].path.parent, [photo.path.name for photo in opened]
@@ -150,8 +149,8 @@ def find_cameras(
         write_images(images, photos, image_names)
         seconds["photos"] = lap()
         first, second = work / "first.db", work / "second.db"
-        with quiet_pycolmap(), ThreadPoolExecutor(1) as beside:
-            second_matches = beside.submit(write_own_matches, second, images, image_names, lens_of(photos), seed)
+        with quiet_pycolmap(), ThreadPoolExecutor(1) as executor:
+            second_matches = executor.submit(write_colmap_matches, second, images, image_names, lens_of(photos), seed)
             write_matches(first, photos, image_names, stage)
             pairs = verify(first, seed, photo_names)
             seconds["matches"] = lap()
@@ -162,7 +161,7 @@ def find_cameras(
                 second_matches.result()
                 return solve(second, images, work / "second", seed, photo_names)
 
-            second_cameras = beside.submit(solve_second)
+            second_cameras = executor.submit(solve_second)
             found = [solve(first, images, work / "first", seed, photo_names)]
             seconds["cameras"] = lap()
             found.append(second_cameras.result())
@@ -213,7 +212,7 @@ def find_cameras(
 
 
 def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
-    """What the report says of size and lens."""
+    """What the report says about image size and lens."""
     width, height = photos[0].size
     film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
     return {
@@ -239,7 +238,7 @@ def _clock() -> Callable[[], float]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """One thread for torch and OpenCV: sums of several are rounded in another order."""
+    """One thread for torch and OpenCV: with several, sums are rounded in another order."""
     threads, cores = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""Photos as a phone wrote them, made ready: decoded, turned upright, of one size, and what is known of the lens."""
+"""Reads photos as a phone wrote them: decodes them, turns them upright, gives them one size; reads Exif of the lens."""
 
 import hashlib
 import math
@@ -25,12 +25,12 @@ FILM_DIAGONAL = math.hypot(36, 24)  # mm
 _ORIENTATION, _FOCAL, _FOCAL_35 = 0x0112, 0x920A, 0xA405
 _PIXELS_X, _DENSITY, _DENSITY_UNIT = 0xA002, 0xA20E, 0xA210
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
-_SAME_ZOOM = 1.1  # ratio of focal lengths that one lens may have
-_BLURRED = 0.5  # of the median sharpness
+_SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
+_BLURRED = 0.5  # a photo below this share of the median sharpness is blurred
 
 
 class Exif(NamedTuple):
-    """How a photo is turned, and what its file says about the focal length; None where it says nothing.
+    """What a photo's Exif says about orientation and focal length; None where it says nothing.
 
     Sources: Exif 2.32 (CIPA DC-008, 4.6); CIPA DCG-001 for the length on 35 mm film, which compares diagonals.
     """
@@ -41,7 +41,7 @@ class Exif(NamedTuple):
 
     @classmethod
     def of(cls, tags: Mapping[int, Any]) -> Self:
-        """That of an image's tags; a damaged one counts as one that is not there."""
+        """Read it from an image's tags; a damaged tag counts as missing."""
         orientation = int(_number(tags, _ORIENTATION))
         film, focal, density = (_number(tags, tag) for tag in (_FOCAL_35, _FOCAL, _DENSITY))
         width, unit = _number(tags, _PIXELS_X), _UNITS.get(int(_number(tags, _DENSITY_UNIT) or 2), 0.0)
@@ -49,20 +49,20 @@ class Exif(NamedTuple):
         return cls(orientation if 1 <= orientation <= 8 else 1, film or None, ratio or None)
 
     @property
-    def is_lying(self) -> bool:
-        """Whether the stored image has the upright one's width as its height."""
+    def is_sideways(self) -> bool:
+        """Whether the upright photo is the stored image turned by 90 degrees, so that width and height swap."""
         return self.orientation > 4
 
     def focal_ratio(self, width: int, height: int) -> float | None:
         """The focal length over the longer side of a photo of this shape, or None."""
         if self.focal_35mm:
             return self.focal_35mm / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
-        stored = height if self.is_lying else width
+        stored = height if self.is_sideways else width
         return self.focal_over_width * stored / max(width, height) if self.focal_over_width else None
 
 
 def _number(tags: Mapping[int, Any], tag: int) -> float:
-    """A tag's number, the first if there are several; 0 where there is none above 0."""
+    """A tag's number, the first if there are several; 0 if there is none above 0."""
     value = tags.get(tag)
     try:
         number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]  # None is a TypeError
@@ -97,7 +97,7 @@ class Photo:
 
     @property
     def focal(self) -> float | None:
-        """The focal length in pixels as the file says, None where it does not."""
+        """The focal length in pixels that Exif gives, None if it does not."""
         ratio = self.exif.focal_ratio(*self.size)
         return ratio * max(self.size) if ratio else None
 
@@ -133,7 +133,7 @@ def _open(path: Path) -> OpenPhoto:
         raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
     exif = Exif.of(image.metadata.tags)
     width, height = image.size
-    size = (height, width) if exif.is_lying else (width, height)
+    size = (height, width) if exif.is_sideways else (width, height)
     return OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image)
 
 
@@ -153,7 +153,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     photos = []
     for photo in stage(opened, "photos", "photo"):
         pixels = photo.image.read()
-        stored = size[::-1] if photo.exif.is_lying else size
+        stored = size[::-1] if photo.exif.is_sideways else size
         if pixels.shape[1::-1] != stored:
             pixels = np.asarray(cv2.resize(pixels, stored, interpolation=cv2.INTER_AREA), np.float32)
         upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
@@ -168,7 +168,7 @@ def blurred(photos: list[Photo]) -> list[Photo]:
 
 
 def _sharpness(grey: NDArray[np.uint8]) -> float:
-    """How much of the contrast is between neighbouring pixels: standard deviations of Laplacian over brightness."""
+    """How much of the contrast is fine: standard deviation of the Laplacian over that of the smoothed brightness."""
     values = grey.astype(np.float32)
     return float(cv2.Laplacian(values, cv2.CV_32F).std() / (cv2.GaussianBlur(values, (0, 0), 4.0).std() + 1.0))
 

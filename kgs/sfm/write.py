@@ -1,7 +1,7 @@
-"""Photos and cameras in a folder, as COLMAP has them: `images`, `sparse/0` and `photos.json`, all three or none.
+"""Writes photos and cameras in COLMAP's layout: `images`, `sparse/0` and `photos.json`, all three or none.
 
-New ones go through `unfinished-photos` and `finished-photos`, see `kgs.io.staging`. Beside a fit, which belongs to the
-former cameras, they wait in the second folder until the new fit is there.
+New ones go through `unfinished-photos` and `finished-photos`, see `kgs.io.staging`. If the folder holds a fit, which
+belongs to the former cameras, they wait in `finished-photos` until the new fit is there.
 """
 
 import os
@@ -26,19 +26,19 @@ REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
 
 
 def photo_staging(out: Path) -> Staging:
-    """How photos and cameras get to their folder."""
+    """The staging folders of photos and cameras."""
     return Staging(out, "-photos", replaced=(IMAGES, "sparse"))
 
 
 def check_place(out: Path, folder: Path) -> None:
-    """A DataError where the results would lie among the user's photos or in place of files of another program."""
+    """Raise DataError if results would lie among the user's photos, or overwrite files of another program."""
     advice, photos = "choose another folder", folder.resolve()
     staging = photo_staging(out)
     replaced = [out / IMAGES, out / "sparse", staging.unfinished, staging.finished]
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
         raise DataError(out, "", f"holds the photos themselves: {advice}")
     for path in filter(os.path.lexists, replaced):
-        if not (_is_own_model(out) if path.name == "sparse" else _has_own_pictures(path)):
+        if not (_is_own_model(out) if path.name == "sparse" else _has_only_own_images(path)):
             raise DataError(path, "", f"holds files of a scene that kgs did not write: {advice}")
 
 
@@ -47,27 +47,27 @@ def _is_own_model(out: Path) -> bool:
     return is_own(out / REPORT) and {path.suffix for path in files} <= {".bin"}
 
 
-def _has_own_pictures(folder: Path) -> bool:
-    """Whether all of a folder is kgs's own; hidden files do not count."""
+def _has_only_own_images(folder: Path) -> bool:
+    """Whether kgs wrote all files of a folder; hidden files do not count."""
     if not folder.is_dir() or folder.is_symlink():
         return False
     return is_own(folder) or all(is_own(path) for path in folder.iterdir() if path.name[0] != ".")
 
 
-def is_kept(out: Path, same: dict[str, Any]) -> bool:
-    """Whether a former run's report has the same values, and all of its files are there."""
+def is_reusable(out: Path, inputs: dict[str, Any]) -> bool:
+    """Whether the report of a former run has the same inputs, and all of its files are there."""
     try:
         report = read_json(out / REPORT)
         images = [out / IMAGES / str(photo["image"]) for photo in report["photos"].values()]
     except (DataError, KeyError, TypeError, AttributeError):
         return False
     files = [*images, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]
-    unchanged = all(report.get(key) == value for key, value in same.items())
+    unchanged = all(report.get(key) == value for key, value in inputs.items())
     return unchanged and all(path.is_file() for path in files)
 
 
 def write_images(folder: Path, photos: list[Photo], names: list[str]) -> None:
-    """Write the photos as PNGs without metadata: what was decoded once is not compressed with loss again."""
+    """Write the photos as PNGs without metadata: another JPEG compression would lose detail."""
     for photo, name in zip(photos, names, strict=True):
         write_png(folder / name, torch.from_numpy(photo.pixels).permute(2, 0, 1) / 255)
 
@@ -104,7 +104,7 @@ def _depths(scene: Any, image: Any) -> NDArray[np.float64]:
 
 
 def _onto(vector: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The least rotation that turns a vector into the direction of a unit vector; none where they are opposite or 0."""
+    """The smallest rotation of a vector onto a unit vector; the identity if the vector is opposite to it, or 0."""
     length = float(np.linalg.norm(vector))
     cosine = float(vector @ target) / length if length else -1.0
     if cosine < -0.99:
