@@ -6,23 +6,23 @@ from torch.nn.functional import avg_pool1d
 
 WIDEST = 0.02  # of the side, at least `FEWEST_LINES` pixels
 FEWEST_LINES = 3
-DARK, CLEAR = 0.8, 0.9  # shares of the light farther inside: what a border leaves is below, the scene above
-SEEN = 0.05  # brightness inside, below which nothing can be told
-ALONG = 0.1  # of the side: the part of a line over which the border is taken to be alike
+DARK, CLEAR = 0.8, 0.9  # of the brightness farther inside: an edge below the first is a border, up to the second
+SEEN = 0.05  # brightness next to a border; where it is darker a border cannot be told from the scene
+ALONG = 0.1  # of the side: how far the brightness is averaged along it
 
 
 def border_light(images: Tensor) -> Tensor | None:
-    """How much of the scene's light each pixel of these photos lets through, `(H, W)`: below 1 in a dark border.
+    """The transmittance of each pixel of these photos, `(H, W)`: below 1 in a dark border.
 
     A border lies at the same place in all photos, whatever they show, and ends within 2 % of the width or height; its
-    thickness may vary along a side. What is darker towards an edge in some photos alone is the scene, and so is a dark
+    thickness may vary along a side. An edge that is dark in only some photos belongs to the scene, and so does a dark
     edge that is wider, or whose surroundings are dark too.
 
     Args:
         images: at least two photos of one camera, `(V, 3, H, W)` in [0, 1].
 
     Returns:
-        Values in [0, 1], None if there is no border. A reduced photo has pixels that the border covers in part.
+        Values in [0, 1], None if there is no border. In reduced photos a border covers some pixels in part.
     """
     if len(images) < 2:
         return None
@@ -36,7 +36,7 @@ def border_light(images: Tensor) -> Tensor | None:
 
 
 def _from_top(bright: Tensor) -> Tensor:
-    """The light of the first rows of photos `(V, H, W)`, `(K, W)`; K is 0 without a border there."""
+    """The transmittance `(K, W)` of the first rows of photos `(V, H, W)`; K is 0 without a border there."""
     height, width = bright.shape[1:]
     most = max(FEWEST_LINES, round(WIDEST * height))
     if height <= 2 * most:

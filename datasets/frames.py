@@ -1,4 +1,4 @@
-"""What every layout's files say about a scene: photos with lenses and poses, and how they are split."""
+"""What the files of a layout say about a scene: photos with lenses and poses, and how they are split."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One photo with its lens and its pose, its pixels not read yet; numbers that no camera has are a DataError."""
+    """One photo with its lens and pose, its pixels not read yet; numbers that no camera has are a DataError."""
 
     source: Path  # the file that gives lens and pose; errors name it
     name: str  # unique within the scene
@@ -65,11 +65,11 @@ NO_POINTS = PointCloud(torch.zeros(0, 3, dtype=torch.float64, device="cpu"), tor
 
 @dataclass(frozen=True, eq=False)
 class FrameSet:
-    """All that a layout's files say."""
+    """Everything that a layout's files say about a scene."""
 
-    frames: Sequence[Frame]  # all, or, where the files hold some out, those to choose training views from
-    test: Sequence[Frame] | None = None  # those that the files hold out; None: every eighth by name
-    published: Sequence[int] = ()  # positions of the published training views, taken when just as many are asked for
+    frames: Sequence[Frame]  # those to choose training views from; all of them if `test` is None
+    test: Sequence[Frame] | None = None  # those that the files hold out; None: every eighth by name is held out
+    published: Sequence[int] = ()  # positions of the published training views, taken if as many are asked for
     points: PointCloud = NO_POINTS  # initial points that the layout always gives
     # the points of the scene's COLMAP model, if there is one, that at least two of the given frames see
     model_points: Callable[[Sequence[Frame]], PointCloud] | None = None
@@ -77,7 +77,7 @@ class FrameSet:
 
 
 def path_inside(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:
-    """The path of a file that `source` names, relative to `folder` or `root`; a DataError where it leads out."""
+    """The path of a file that `source` names, relative to `folder` or `root`; a DataError if it leads out."""
     wrong = partial(DataError, source, repr(name[:200]))
     given = PureWindowsPath(name)  # knows both separators and drives; a file may have backslashes in its name, too
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:

@@ -1,8 +1,8 @@
 """An image on disk: opened once, decoded once. Pillow reads its header and metadata, OpenCV decodes its pixels.
 
 libjpeg-turbo (kornia_rs) decodes JPEG, because OpenCV only prints what is wrong with one and gives wrong colours.
-Pillow decodes HEIC (with pi-heif) and TIFFs with alpha of 8 bits, which OpenCV would multiply the colours by.
-Without Pillow sizes are those of the decoded images, which no bound holds for then, and TIFF is refused.
+Pillow decodes HEIC (with pi-heif) and 8-bit TIFFs with alpha, whose colours OpenCV would multiply by alpha.
+Without Pillow an image has to be decoded to know its size, so that no bound on the size holds, and TIFF is refused.
 """
 
 import io
@@ -40,20 +40,20 @@ _MULTIPLIED_ALPHA, _ALPHA = 1, 2  # values of `_EXTRA_SAMPLES`
 
 
 class Metadata(NamedTuple):
-    """What an image's file says beside its pixels."""
+    """What an image file says besides its pixels."""
 
     size: tuple[int, int]  # width and height of the stored pixels
-    tags: dict[int, Any]  # of the image and its Exif directory, as Pillow gives them; empty where damaged
+    tags: dict[int, Any]  # of the image and its Exif directory, as Pillow gives them; empty if damaged
 
 
 class ImageFile:
-    """A PNG, JPEG, WebP, BMP, TIFF or HEIC file. The file is opened when something of it is asked for first.
+    """A PNG, JPEG, WebP, BMP, TIFF or HEIC file. The file is opened on first use.
 
     Args:
         path: of the file.
 
     Raises:
-        DataError: by every method: the file cannot be read, is of another kind, damaged, cut short, or claims more
+        DataError: in every method, if the file cannot be read, is of another kind, damaged, cut short, or claims more
             pixels than its bytes can hold (a decompression bomb).
     """
 
@@ -125,7 +125,7 @@ def read_size(path: Path) -> tuple[int, int]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """A whole file, or a DataError where it cannot be read."""
+    """The bytes of a whole file; a DataError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -150,7 +150,7 @@ def is_heic(data: bytes) -> bool:
 
 
 def _kind(path: Path, head: bytes) -> str:
-    """The format of a file that begins with these bytes; a DataError about `path` where it cannot be read."""
+    """The format of a file that begins with these bytes; a DataError about `path` if it cannot be read."""
     if is_heic(head) and has_heic():
         return "HEIC"
     for signature, kind in _KINDS.items():
@@ -192,9 +192,9 @@ def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
 
 
 def _open(kind: str, file: IO[bytes]) -> "Opened":
-    """An image that Pillow has read the header of.
+    """An image whose header Pillow has read.
 
-    The classes are called rather than `PIL.Image.open`, whose bound on pixels does not depend on the file's bytes.
+    Not by `PIL.Image.open`, because its bound on pixels does not depend on the number of bytes in the file.
     """
     from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
@@ -214,7 +214,7 @@ def _open(kind: str, file: IO[bytes]) -> "Opened":
 
 
 def _tags(image: "Opened") -> dict[int, Any]:
-    """The tags of an image and of its Exif directory; none where they are damaged."""
+    """The tags of an image and of its Exif directory; none if they are damaged."""
     from PIL.Image import Exif
 
     try:
@@ -231,17 +231,17 @@ def _tags(image: "Opened") -> dict[int, Any]:
 
 
 def check_size(path: Path, width: int, height: int, size: int) -> None:
-    """A DataError about `path`, a file of `size` bytes, where so many pixels should not be decoded."""
+    """Raise DataError about `path` if so many pixels should not be decoded from a file of `size` bytes."""
     if width < 1 or height < 1:
         raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
-    # Photos have fewer than 20 pixels per byte, a plain PNG 1032. Any file may have 2^21 (48 MiB while decoded), plain
-    # images 2^24 (384 MiB); more, up to 2^28, need a byte for every 32.
+    # Photos have fewer than 20 pixels per byte, a PNG of one colour 1032. Any file may have 2^21 pixels (48 MiB while
+    # decoded); images of one colour may have 2^24 (384 MiB). More, up to 2^28, need a byte for every 32.
     if width * height > min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size)):
         raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
 
 
 def _decode(kind: str, data: bytes) -> Image:
-    """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
+    """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError if it cannot be decoded."""
     if kind == "TIFF" and not has_pillow():
         raise ValueError('TIFF is read with Pillow, which is not installed: pip install pillow, or the extra "app"')
     try:
@@ -252,7 +252,7 @@ def _decode(kind: str, data: bytes) -> Image:
         if kind == "HEIC":
             return _to_float(np.array(_open(kind, io.BytesIO(data)).convert("RGB")))
         if kind == "PNG" and has_pillow():
-            _open(kind, io.BytesIO(data)).verify()  # OpenCV takes memory for chunks that are not in the file
+            _open(kind, io.BytesIO(data)).verify()  # OpenCV allocates memory for chunks that the file does not have
         return _to_float(_decode_with_opencv(data))
     except (ValueError, MemoryError):
         raise
@@ -261,12 +261,12 @@ def _decode(kind: str, data: bytes) -> Image:
 
 
 def _to_float(pixels: NDArray[np.uint8 | np.uint16]) -> Image:
-    """Values in [0, 1] of 8 or 16 bit integers."""
+    """Values in [0, 1] from 8 or 16 bit integers."""
     return np.asarray(pixels / np.float32(255.0 if pixels.dtype == np.uint8 else 65535.0), dtype=np.float32)
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
-    """RGB or RGBA, as OpenCV turns it."""
+    """RGB or RGBA, upright if OpenCV applies the orientation of the file."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
@@ -282,7 +282,7 @@ def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
         file = io.BytesIO(data)
         image = _open("JPEG", file)
         end = file.tell()  # of the header of the first scan
-        # Only progressive images need its last three bytes. Some phones leave them 0 in others, which decoders warn of.
+        # Only progressive images use its last three bytes. In others some phones leave them 0, and decoders warn of it.
         if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
             data = data[: end - 3] + b"\0\x3f\0" + data[end:]
     return np.asarray(kornia_io.decode_image_jpegturbo(data, "rgb"))
@@ -301,7 +301,7 @@ def _decode_tiff(data: bytes) -> Image:
         pixels = _to_float(_decode_with_opencv(data))
     if samples == 4 and alpha == _MULTIPLIED_ALPHA:
         pixels[..., :3] = np.minimum(pixels[..., :3] / np.maximum(pixels[..., 3:], 1 / 65535), 1)
-    # Both decoders turn the image upright; to turn 6 and 8 back is to turn as the other.
+    # Both decoders turned the image upright: turn it back. 6 and 8 undo each other, all others undo themselves.
     return np.ascontiguousarray(turn(pixels, {6: 8, 8: 6}.get(orientation, orientation)))
 
 

@@ -1,4 +1,4 @@
-"""Photos as arrays: removing the lens's distortion, reducing, and the intrinsics that result; folders of photos."""
+"""Removes lens distortion from photos and reduces them, with the intrinsics that result; lists folders of photos."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,7 +60,7 @@ def image_folder(root: Path) -> Path | None:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """The photos of a folder, sorted by name; hidden files and other kinds of files are passed over."""
+    """The photos of a folder, sorted by name; hidden files and other kinds of files are skipped."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     return sorted(files, key=lambda p: p.name)
 
@@ -74,18 +74,18 @@ def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tup
 
 
 def remap(image: Image, maps: Maps | None) -> Image:
-    """Take each pixel from where the maps say; the image itself where there are none."""
+    """Take each pixel from the place that the maps give; without maps the image itself."""
     if maps is None:
         return image
     return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
 
 
 def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
-    """The pinhole with the principal point of a lens, and where its pixels lie in the lens's image.
+    """The pinhole camera that replaces a lens, and the places of its pixels in the lens's image.
 
-    The focal length stays too, unless that would leave pixels blank (pincushion distortion): then it grows, the same
-    on both axes, until every pixel is covered by the image. The x and y of the pixels are `(H, W)` each, None without
-    distortion. Coefficients that fold the image, and an image too long for OpenCV, are a ValueError.
+    The principal point stays. The focal length stays too, unless that would leave pixels blank (pincushion distortion):
+    then it grows, by one factor on both axes, until the image covers every pixel. The places are x and y, `(H, W)`
+    each, or None without distortion. A ValueError if coefficients fold the image, or it is too long for OpenCV.
     """
     if not intrinsics.fisheye and not any(intrinsics.distortion):
         return replace(intrinsics, distortion=()), None
@@ -104,7 +104,7 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
 
 
 def _covering_zoom(intrinsics: Intrinsics) -> float:
-    """The least factor from 1 to 2 on the focal length with which the pinhole's border falls inside the image."""
+    """The smallest factor on the focal length, from 1 to 2, with which the pinhole's border lies inside the image."""
     width, height, matrix = intrinsics.width, intrinsics.height, intrinsics.matrix()
     project = cv2.fisheye.projectPoints if intrinsics.fisheye else cv2.projectPoints
     rows = [(x, y) for x in range(width) for y in (0, height - 1)]

@@ -27,7 +27,7 @@ from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 _BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
 _BORDER = "the photos have a dark border, left by undistortion: it is taken for part of the lens, not of the scene"
-_FINE_PIXELS = 1_000_000  # of the images for the initial points: twice the width and height halves the error of depths
+_FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
 def load_scene(
@@ -42,9 +42,9 @@ def load_scene(
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
-    The layout is told by what the folder holds, in this order: `poses_bounds.npy` (LLFF), `sparse/0` or `sparse`
+    The layout follows from the files in the folder, in this order: `poses_bounds.npy` (LLFF), `sparse/0` or `sparse`
     (COLMAP), `transforms_train.json` (Blender), `transforms.json` (nerfstudio, instant-ngp). What the files say is
-    used, refused, or, where it cannot change a picture, named in `Scene.notes`.
+    used, refused, or, if it cannot change an image, named in `Scene.notes`.
 
     Convention:
         Kornia's in the result, see `Views`: world-to-camera extrinsics with OpenCV axes, integer pixel centres. The
@@ -53,15 +53,15 @@ def load_scene(
     Args:
         path: the scene's folder.
         train_views: how many views to train on, spread evenly over those that are not held out; None takes all.
-        downscale: how many times smaller the images shall be than those that are read (`images/`, else the largest
-            `images_k/`), >= 1; None leaves them as they are.
+        downscale: factor by which the photos (of `images/`, else of the largest `images_k/`) are reduced, >= 1; None
+            leaves them as they are.
         hold_out: N >= 2 holds out every Nth photo by name, the first included, whatever the files say; 0 none, and
-            `Scene.test` is empty. None holds out the test views that the files name, or else every eighth photo. Where
+            `Scene.test` is empty. None holds out the test views that the files name, or else every eighth photo. If
             kgs found the cameras (photos.json), the two photos at the ends of the row of cameras are for training.
-        background: "black" or "white", put behind images with an alpha channel.
+        background: "black" or "white", the colour behind images with an alpha channel.
         points: "none", or "model-points" for the points of a COLMAP model that at least two training views observe.
             Their positions were refined with the test views too.
-        photos: False reads the photos' sizes only: cameras, names and sizes are the same, `images` have no pixels
+        photos: False reads only the sizes of the photos: cameras, names and sizes are the same, `images` have no pixels
             (they are on torch's "meta" device), `masks` and `finer` are None.
 
     Raises:
@@ -84,7 +84,8 @@ def load_scene(
     if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
         raise ValueError(f"hold_out: expected None, 0 or a whole number of at least 2, got {hold_out!r}")
     root = Path(path)
-    with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):  # which costs time
+    # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
+    with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
         found = find_layout(root)
         train, test = _split(root, found, train_views, hold_out)
         cloud = found.points
@@ -99,7 +100,7 @@ def load_scene(
             listed += f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else ""
             raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {listed}")
         color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
-        offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; no test view enters it
+        offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; without the test views
         scales = [_Scale.of(train[0], downscale or 1.0)]
         height, width = scales[0].size
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
@@ -115,7 +116,7 @@ def load_scene(
 
 
 def _behind_border(train: Views) -> Views:
-    """The training views with the dark border that their photos have, if they are opaque and have one."""
+    """The training views with the dark border of their photos, if these are opaque and have one."""
     known = train.images.device.type != "meta" and train.masks is None
     return replace(train, light=border_light(train.images)) if known else train
 
@@ -125,11 +126,11 @@ def _split(
 ) -> tuple[list[Frame], list[Frame]]:
     """The frames to train on and those to test on, no photo in both."""
     frames, test_frames = found.frames, list(found.test or ())
-    times = Counter(frame.path for frame in (*frames, *test_frames))
+    counts = Counter(frame.path for frame in (*frames, *test_frames))
     for frame in (*frames, *test_frames):
-        if times[frame.path] > 1:
-            both = {frame.path} <= {f.path for f in frames} & {f.path for f in test_frames}
-            where = "in the training and in the test views" if both else "several times"
+        if counts[frame.path] > 1:
+            in_both = all(frame.path in {f.path for f in part} for part in (frames, test_frames))
+            where = "in the training and in the test views" if in_both else "several times"
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
     if found.test is None or hold_out is not None:
         frames, every = [*frames, *test_frames], TEST_EVERY if hold_out is None else hold_out
@@ -150,15 +151,15 @@ def _split(
 
 @dataclass(frozen=True)
 class _Scale:
-    """By how much all photos are reduced, and the size that they have then."""
+    """By how much all photos are reduced, and the size that results."""
 
     factor: float
     size: tuple[int, int]  # (height, width)
-    first: str  # width and height of the photo whose size counts, for messages
+    first: str  # width and height of the photo that sets this size, for messages
 
     @classmethod
     def of(cls, frame: Frame, factor: float) -> Self:
-        """That of all photos which are as large as this one."""
+        """The scale of this photo, and of all others, which have to be as large."""
         frame.image.load()
         width, height = frame.image.size
         return cls(factor, _reduced(width, height, factor), f"{width}x{height}")

@@ -33,8 +33,8 @@ class Views:
             that was loaded with `photos=False`.
         names: file names, unique, in the order of the images.
         masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
-        light: `(H, W)` in [0, 1], how much of the scene's light each pixel of all images lets through, or None: all.
-            It is below 1 in the dark border that removing a lens's distortion can leave.
+        light: `(H, W)` in [0, 1], the transmittance of each pixel, the same in all images, or None: 1 everywhere. It is
+            below 1 in the dark border that removing a lens's distortion can leave.
 
     Raises:
         TypeError: the images are not a tensor of floating point numbers.
@@ -77,7 +77,7 @@ class Views:
         return len(self.names)
 
     def __getitem__(self, index: SupportsIndex) -> dict[str, Tensor | int | str]:
-        """One view as a dict, which `torch.utils.data.DataLoader` collates; an IndexError where there is none.
+        """One view as a dict, which `torch.utils.data.DataLoader` collates; an IndexError if there is none.
 
         Returns:
             image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.pinhole_cameras` and
@@ -113,7 +113,7 @@ class Views:
         return replace(self, cameras=self.camera(rows), images=self.images[rows], names=names, masks=masks)
 
     def as_photo(self, render: Tensor) -> Tensor:
-        """A render `(..., H, W)` as these views' photos show it: in [0, 1], behind the border that they may have."""
+        """A render `(..., H, W)` as these views' photos would show it: clamped to [0, 1], behind their dark border."""
         image = render.clamp(0, 1)
         return image if self.light is None else image * self.light.to(image)
 
@@ -143,18 +143,18 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Training and test views in one world frame, with what the layout itself says about initial points.
+    """Training and test views in one world frame, with initial points if the layout has any.
 
     Args:
         train: the views to fit. Nothing of a fit may depend on `test`.
-        test: the views that are held out.
+        test: the held-out views.
         points: `(P, 3)` float32, P may be 0.
         point_colors: `(P, 3)` in [0, 1].
         init_kind: where `points` come from: "none", "random" or "model-points".
         offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
         background: `(3,)`, the colour behind the scene, in [0, 1].
         root: the folder the scene was read from.
-        finer: the training views in more pixels, to find initial points in; None where `train` is as fine as that.
+        finer: the training views at a higher resolution, to find initial points in; None if `train` is as fine.
         notes: what the files say that is not used, one sentence each, to be shown to the user.
     """
 

@@ -1,4 +1,4 @@
-"""Which views are for training: the splits of the sparse-view tables (RegNeRF, FSGS, DropGaussian's release)."""
+"""Splits views into training and test views, as published for sparse views (RegNeRF, FSGS, DropGaussian's release)."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ def split_by_name(
     """Hold out each `every`-th name for testing (0: none) and choose training views evenly among the others.
 
     Names are sorted by code point ("img10" before "img2"), as the published splits were; the first one is a test view.
-    Positions in `names` of the training and of the test views come back, both in the order of the sorted names.
+    Returns the positions in `names` of the training and of the test views, both in the order of the sorted names.
     """
     order = sorted(range(len(names)), key=lambda i: names[i])
     test = order[::every] if every else []
@@ -26,7 +26,7 @@ def split_by_name(
 def split_between_ends(
     names: Sequence[str], centers: NDArray[np.float64], train_views: int | None = None, every: int = TEST_EVERY
 ) -> tuple[list[int], list[int]]:
-    """As `split_by_name`, but hold out no photo at an end of the row of cameras: beyond it nothing was seen.
+    """As `split_by_name`, but hold out no photo at an end of the row of cameras: no other one shows what is beyond it.
 
     The ends are the two cameras that lie farthest apart along the main direction in which the centres `(V, 3)` spread.
     At least one photo is held out, of at least three.

@@ -25,7 +25,7 @@ _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
 def find_layout(root: Path) -> FrameSet:
-    """What the files of a scene's folder say; DataError where it is not a scene: what it is instead, and what to do."""
+    """What the files of a scene's folder say. If it is no scene, a DataError says what it is, and what to do."""
     if not root.is_dir():
         raise DataError(root, "", _about_file(root))
     for is_there, load in _LAYOUTS:
@@ -39,9 +39,9 @@ def _is_scene(folder: Path) -> bool:
 
 
 def nearest_scene(root: Path) -> Path | None:
-    """The folder with camera poses that is meant by a folder: itself, or one up to two levels below or above it.
+    """The scene that a user means by a folder: itself, or else one up to two levels below or above it; None if none is.
 
-    One whose cameras kgs found (beside `CAMERAS_REPORT`) is not meant by its photos. None: there is none.
+    A scene whose cameras kgs found (it has a `CAMERAS_REPORT`) is meant only by itself, not by a folder of photos.
     """
     if _is_scene(root):
         return root

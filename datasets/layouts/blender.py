@@ -16,10 +16,10 @@ _RANDOM_POINTS = 10_000
 
 
 def load_blender(root: Path) -> FrameSet:
-    """Read the two json files, see :func:`read_transforms`, as NeRF's scenes and your own have them.
+    """Read the two JSON files of a scene in the layout of NeRF's, see :func:`read_transforms`.
 
-    All frames of the test file are test views. Eight training views are the published ones, positions in the file.
-    Initial points are random in [-1, 1]^3, which holds the objects, the same ones each time.
+    All frames of the test file are test views. If eight training views are asked for, they are the published ones, by
+    their positions in the file. Initial points are random in [-1, 1]^3, where the objects are, and always the same.
     """
     train, _, notes = read_transforms(root, "transforms_train.json")
     test, _, more = read_transforms(root, "transforms_test.json")

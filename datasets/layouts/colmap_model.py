@@ -1,7 +1,7 @@
 """COLMAP's sparse models, binary and text, as plain numbers.
 
 Source: https://colmap.github.io/format.html. The rigs and frames of newer versions repeat what images.* says and are
-not read. Every count is held against the file's length before memory of that size is taken.
+not read. Every count is checked against the file's length before memory is allocated for it.
 """
 
 import struct
@@ -42,7 +42,7 @@ class ColmapImage(NamedTuple):
 
 
 def find_model(root: Path) -> Path | None:
-    """The folder of a scene that holds a COLMAP model, `sparse/0` or `sparse`; None where there is none."""
+    """The folder of a scene that holds a COLMAP model, `sparse/0` or `sparse`; None if there is none."""
     files = (root / f"{folder}/images.{suffix}" for folder in ("sparse/0", "sparse") for suffix in ("bin", "txt"))
     return next((file.parent for file in files if file.is_file()), None)
 
@@ -83,7 +83,7 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
         for _ in data.items("number of images", 73):
             image_id, *pose, camera_id = data.take("<I7dI", "image")
             name = data.string(f"image {image_id}")
-            data.take(f"{24 * data.count(f'observations of {name}', 24)}x", "observations")  # passed over
+            data.take(f"{24 * data.count(f'observations of {name}', 24)}x", "observations")  # skipped
             _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
     else:
         may_be_observations = False
@@ -103,7 +103,7 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")
-    if any(not 0 <= value <= 255 for row in rows for value in row[3:]):  # integers of a text have no limit
+    if any(not 0 <= value <= 255 for row in rows for value in row[3:]):  # integers in a text file have no limit
         raise DataError(path, "", "expected colours from 0 to 255, got others")
     return points, np.array([row[3:] for row in rows], np.uint8).reshape(-1, 3)
 
@@ -122,7 +122,7 @@ def _tracks(path: Path) -> Iterator[tuple[list[Any], tuple[int, ...]]]:
 
 
 class _Binary:
-    """A file's bytes with a position that cannot leave them."""
+    """A file's bytes, read in order; reading beyond their end is a DataError."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._data, self._at = path, read_bytes(path), 0
@@ -134,13 +134,13 @@ class _Binary:
         return struct.unpack_from(form, self._data, at)
 
     def count(self, what: str, least_bytes: int) -> int:
-        """The next 64 bit count, of things that take at least that many bytes each."""
+        """The next 64-bit count, of things that take at least `least_bytes` each."""
         (number,) = self.take("<Q", what)
         self._need(number * least_bytes, what)
         return int(number)
 
     def items(self, what: str, least_bytes: int) -> Iterator[int]:
-        """As many numbers as the next count says; nothing may be left of the file behind the last."""
+        """Loop as often as the next count says; after the last item the file has to end."""
         yield from range(self.count(what, least_bytes))
         if self._at != len(self._data):
             raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")

@@ -38,7 +38,7 @@ def load_llff(root: Path) -> FrameSet:
 
 
 def _read_rows(path: Path) -> NDArray[np.float64]:
-    """The rows `(N, 17)`; mapping the file checks its size before anything of that size is made."""
+    """The rows `(N, 17)`; the file is memory-mapped first, which checks its size before anything is allocated."""
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy parses the header as Python source: damaged bytes raise whatever that raises
@@ -63,7 +63,7 @@ def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
 
 
 def _model_points(folder: Path, frames: Sequence[Frame], train: Sequence[Frame]) -> PointCloud:
-    """The points of the COLMAP model that the poses were made from; its images pair with ours in order of name."""
+    """The points of the COLMAP model that the poses were made from; its images and the photos pair in order of name."""
     images = sorted(read_images(model_file(folder, "images")).items(), key=lambda item: item[1].name)
     if len(images) == len(frames):
         given = torch.stack([frame.pose for frame in frames])

@@ -22,18 +22,21 @@ from kgs.errors import DataError
 from kgs.io.json_files import is_number, read_json
 
 Object = dict[str, Any]
-Said = ChainMap[str, Any]  # what holds for a frame: its own object, then the whole file's
+Values = ChainMap[str, Any]  # what holds for a frame: its own entries, then those of the whole file
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
-_BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")  # in OpenCV's order
+# The distortion coefficients of Brown-Conrady and of Kannala-Brandt lenses, in OpenCV's order.
+_BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
 _COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
-# What is used; then how tools sort, frame or normalise a scene and what they did to the world, which stays the file's.
+# Keys that are used; then keys for sorting, framing and normalising a scene, and for what a tool did to the world.
+# The latter change nothing: the world stays that of the file.
 _KNOWN = """
     frames file_path transform_matrix
     camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
     aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
     applied_transform applied_scale orientation_override auto_scale_poses_override
 """
+# Other keys that may bear on lenses or poses; they are refused, since ignoring them could give wrong cameras.
 _GEOMETRY = re.compile(
     r"(?i)angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
     r"camera|fisheye|ftheta|latlong|equirect|panoram|spheric|ortho|omni|projection|skew|shear|aspect|rolling|shutter|"
@@ -62,7 +65,7 @@ def load_nerfstudio(root: Path) -> FrameSet:
 
 
 def _listed(root: Path, data: Object, key: str, frames: list[Frame]) -> list[Frame]:
-    """The frames that a list of file names names, sorted by name."""
+    """The frames in the file's list `key` of file names, sorted by name."""
     source, names = root / "transforms.json", data.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise DataError(source, key, "expected a list of file names")
@@ -77,11 +80,11 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     """The frames of such a file, at least one; the whole object; notes about what is not used.
 
     Convention:
-        `transform_matrix` is camera-to-world with OpenGL axes (x right, y up, z backward). A lens's numbers stand in
-        the frame or, for all frames, at the top; `camera_angle_x` and `_y` are fields of view, used where there is no
-        `fl_x` or `fl_y`. Without them pixels are square, the lens is centred and has the first photo's size.
+        `transform_matrix` is camera-to-world with OpenGL axes (x right, y up, z backward). A lens's numbers are in
+        the frame or, for all frames, at the top level; `camera_angle_x` and `_y` are fields of view, used if there is
+        no `fl_x` or `fl_y`. By default pixels are square, the lens is centred, and its size is the first photo's.
 
-    A file that cannot be read, lacks a field, or says of lenses or poses what cannot be used is a DataError.
+    A DataError if the file cannot be read, lacks a field, or has entries about lenses or poses that cannot be used.
     """
     data = read_json(source := root / name)
     entries = data.get("frames")
@@ -92,7 +95,7 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
     images = [ImageFile(path_inside(source, root, name)) for name in names]
     size = (1, 1)
-    if not all("w" in said and "h" in said for said in (ChainMap(entry, data) for entry in entries)):
+    if not all("w" in values and "h" in values for values in (ChainMap(entry, data) for entry in entries)):
         size = _first_size(images)
     frames = [
         Frame(source, name, image, _lens(source, ChainMap(entry, data), size), _opencv_pose(source, entry))
@@ -102,7 +105,7 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
 
 
 def _first_size(images: list[ImageFile]) -> tuple[int, int]:
-    """Width and height of the first image that is there; 1x1 where none is, which `load_scene` refuses."""
+    """Width and height of the first image that exists; 1x1 if none does, which `load_scene` refuses."""
     for image in images:
         if image.path.is_file():
             image.load()  # its pixels will be decoded later: the file is not opened again for them
@@ -119,10 +122,10 @@ def _find_photo(source: Path, root: Path, name: str) -> str:
 
 
 def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
-    """Refuse what bears on lenses and poses and is not known; a note on the rest that is not known."""
+    """Refuse unknown keys that bear on lenses or poses; returns a note about the other unknown keys."""
     known, unused = set(_KNOWN.split()), set()
     for key, value in chain.from_iterable(item.items() for item in objects):
-        if key in known or _says_nothing(value):
+        if key in known or _is_empty(value):
             continue
         if _GEOMETRY.search(key) or key.endswith("_filenames"):
             raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
@@ -130,34 +133,34 @@ def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
 
 
-def _says_nothing(value: Any) -> bool:
-    return all(map(_says_nothing, value)) if isinstance(value, list) else not value
+def _is_empty(value: Any) -> bool:
+    return all(map(_is_empty, value)) if isinstance(value, list) else not value
 
 
-def _lens(source: Path, said: Said, size: tuple[int, ...]) -> Intrinsics:
-    """A frame's lens; where the file does not tell the image size, it is that of the first photo."""
-    fisheye = _is_fisheye(source, said)
-    width, height = _number(source, "w", said, size[0]), _number(source, "h", said, size[1])
+def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
+    """A frame's lens; `size` is the image size if the file does not give it."""
+    fisheye = _is_fisheye(source, values)
+    width, height = _number(source, "w", values, size[0]), _number(source, "h", values, size[1])
     if not (width.is_integer() and height.is_integer()):
         raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
-    fx, fy = _focal(source, "x", said, width), _focal(source, "y", said, height)
+    fx, fy = _focal(source, "x", values, width), _focal(source, "y", values, height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
-    used, frame = _KANNALA if fisheye else _BROWN, said.maps[0]
-    of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else said
+    used, frame = _KANNALA if fisheye else _BROWN, values.maps[0]
+    of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else values
     for key in _COEFFICIENTS:
         if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
             raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
-    distortion = tuple(_number(source, key, said, 0.0) for key in used)
-    cx, cy = _number(source, "cx", said, width / 2), _number(source, "cy", said, height / 2)
+    distortion = tuple(_number(source, key, values, 0.0) for key in used)
+    cx, cy = _number(source, "cx", values, width / 2), _number(source, "cy", values, height / 2)
     return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
 
 
-def _is_fisheye(source: Path, said: Said) -> bool:
-    """Whether it is one: nerfstudio names the model; instant-ngp says `is_fisheye`."""
-    model, flag, known = _text(source, "camera_model", said, ""), said.get("is_fisheye"), (*_PERSPECTIVE, _FISHEYE)
+def _is_fisheye(source: Path, values: Values) -> bool:
+    """Whether the lens is a fisheye: nerfstudio names the model in `camera_model`, instant-ngp has `is_fisheye`."""
+    model, flag, known = _text(source, "camera_model", values, ""), values.get("is_fisheye"), (*_PERSPECTIVE, _FISHEYE)
     if model not in ("", *known):
         raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {', '.join(known)}")
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
@@ -167,9 +170,9 @@ def _is_fisheye(source: Path, said: Said) -> bool:
     return bool(flag) or model == _FISHEYE
 
 
-def _focal(source: Path, axis: str, said: Said, length: float) -> float | None:
-    """The focal length in pixels along an axis, from `fl_` or else the field of view over a length; None without."""
-    for item in said.maps:
+def _focal(source: Path, axis: str, values: Values, length: float) -> float | None:
+    """The focal length in pixels along an axis, from `fl_` or else from the field of view over `length`; or None."""
+    for item in values.maps:
         if f"fl_{axis}" in item:
             return _number(source, f"fl_{axis}", item, None)
         if (key := f"camera_angle_{axis}") in item:
@@ -180,14 +183,14 @@ def _focal(source: Path, axis: str, said: Said, length: float) -> float | None:
     return None
 
 
-def _number(path: Path, key: str, said: Mapping[str, Any], default: float | None) -> float:
-    if not is_number(value := said.get(key, default)):
+def _number(path: Path, key: str, values: Mapping[str, Any], default: float | None) -> float:
+    if not is_number(value := values.get(key, default)):
         raise DataError(path, key, f"expected a finite number, got {_shown(value)}")
     return float(value)
 
 
-def _text(path: Path, key: str, said: Mapping[str, Any], default: str | None) -> str:
-    if not isinstance(value := said.get(key, default), str):
+def _text(path: Path, key: str, values: Mapping[str, Any], default: str | None) -> str:
+    if not isinstance(value := values.get(key, default), str):
         raise DataError(path, key, f"expected a text, got {_shown(value)}")
     return value
 

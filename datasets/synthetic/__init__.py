@@ -27,11 +27,11 @@ KINDS = ("room", "orbit")
 SUPERSAMPLING = 2  # rays along each side of a pixel
 
 
-class _Stage(NamedTuple):
+class _Setup(NamedTuple):
     """A world, and how it is photographed."""
 
     world: World
-    place: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # eyes of so many training and test cameras
+    place: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # places of so many training and test cameras
     center: Array  # (3,), what they look at
     focal: float  # focal length over the longer side of the image
 
@@ -64,10 +64,10 @@ def synthetic_scene(
     ):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}")
-    stage = _stage(kind, seed)
-    train_eyes, test_eyes = stage.place(train_views, test_views, np.random.default_rng([seed, 1]))
+    setup = _setup(kind, seed)
+    train_eyes, test_eyes = setup.place(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
-        train, test = (_views(stage, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
+        train, test = (_views(setup, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
         none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
         return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
 
@@ -75,16 +75,16 @@ def synthetic_scene(
 def synthetic_views(
     eyes: NDArray[np.float64], kind: str = "room", size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Views:
-    """Pictures of the synthetic scene from places of one's own: all of its middle, upright.
+    """Images of the synthetic scene from given places; all cameras are upright and look at the middle of the scene.
 
     Args:
-        eyes: where the cameras are, `(V, 3)`, from the middle of the scene; y points down.
+        eyes: places of the cameras relative to the middle of the scene, `(V, 3)`; y points down.
         kind: as given to `synthetic_scene`.
         size: as given to `synthetic_scene`.
         seed: as given to `synthetic_scene`.
     """
-    stage = _stage(kind, seed)
-    return _views(stage, stage.center + eyes, size, "photo")
+    setup = _setup(kind, seed)
+    return _views(setup, setup.center + eyes, size, "photo")
 
 
 def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) -> Tensor:
@@ -107,51 +107,51 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) 
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
-    size, triangles = sizes.pop(), _stage(kind, seed).world.triangles
+    size, triangles = sizes.pop(), _setup(kind, seed).world.triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
     return torch.from_numpy(np.stack(depths)[:, None])
 
 
-def _stage(kind: str, seed: int) -> _Stage:
+def _setup(kind: str, seed: int) -> _Setup:
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
-    return _make_stage(kind, seed)
+    return _make_setup(kind, seed)
 
 
 @lru_cache(maxsize=2)
-def _make_stage(kind: str, seed: int) -> _Stage:
+def _make_setup(kind: str, seed: int) -> _Setup:
     if kind == "room":
-        return _Stage(room.make_room(seed), _patch_eyes, room.CENTER, room.FOCAL)
-    return _Stage(garden.make_garden(seed), _orbit_eyes, garden.CENTER, garden.FOCAL)
+        return _Setup(room.make_room(seed), _patch_eyes, room.CENTER, room.FOCAL)
+    return _Setup(garden.make_garden(seed), _orbit_eyes, garden.CENTER, garden.FOCAL)
 
 
-def _views(stage: _Stage, eyes: Array, size: tuple[int, int], split: str) -> Views:
+def _views(setup: _Setup, eyes: Array, size: tuple[int, int], split: str) -> Views:
     (height, width), count = size, len(eyes)
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = stage.focal * max(size)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = setup.focal * max(size)
     intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
     extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
     images = np.zeros((count, 3, height, width), dtype=np.float32)
     for i, eye in enumerate(eyes):
-        # rounded to float32 first and then drawn: the images show exactly what the cameras say
-        extrinsics[i] = torch.from_numpy(_look_at(eye, stage.center))
-        images[i] = _render(stage, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
+        # poses are rounded to float32 before rendering, so that the images are exactly those of the cameras
+        extrinsics[i] = torch.from_numpy(_look_at(eye, setup.center))
+        images[i] = _render(setup, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
     names = tuple(f"{split}_{i:02d}" for i in range(count))
     return Views(pinholes(intrinsics, extrinsics, size), torch.from_numpy(images), names)
 
 
-def _render(stage: _Stage, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
     s, fine = SUPERSAMPLING, intrinsics[:3, :3].copy()
     fine[:2] *= s
     fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
-    depths, faces = raycast(stage.world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
+    depths, faces = raycast(setup.world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
     v, u = np.nonzero(faces >= 0)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(fine).T
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
-    colors[v, u] = stage.world.shade(points, faces[v, u])
+    colors[v, u] = setup.world.shade(points, faces[v, u])
     return np.asarray(colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1))
 
 

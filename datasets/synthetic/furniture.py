@@ -1,6 +1,6 @@
-"""Furniture of the synthetic room: trimesh's meshes with the colour of every point of them.
+"""Furniture of the synthetic room: meshes of trimesh, and a colour for each point on them.
 
-Each thing stands on z = 0 in a frame of its own: x to the right, y away from the viewer, z up, in metres.
+Each thing stands on z = 0 in its own frame: x to the right, y away from the viewer, z up, in metres.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def plain(color: Color) -> Texture:
 
 
 def wood(rng: np.random.Generator, color: Color, along: int = 0, plank: float = np.inf) -> Texture:
-    """Grain along one axis; planks of so many metres, each of its own shade, where a width is given."""
+    """Wood with its grain along one axis; in planks `plank` metres wide, each of its own shade, if a width is given."""
     grain, cloud, shades = field(rng, 0.02, 0.09), field(rng, 0.2, 0.6), rng.normal(size=64)
     stretch = np.where(np.arange(3) == along, 0.08, 1.0).astype(np.float32)
 
@@ -51,7 +51,7 @@ def wood(rng: np.random.Generator, color: Color, along: int = 0, plank: float = 
 
 
 def printed(picture: Picture, width: float, height: float, axes: Sequence[int] = (0, 2)) -> Texture:
-    """A picture over a rectangle around the origin of two axes; its border goes on beyond it."""
+    """A picture on a rectangle around the origin, spanned by two axes; beyond it the picture's border is repeated."""
     image = torch.from_numpy(np.ascontiguousarray(picture[::-1].transpose(2, 0, 1)))[None] / 255
     half = np.array([width, height], dtype=np.float32) / 2
 
@@ -89,7 +89,7 @@ def table(rng: np.random.Generator, width: float, depth: float, height: float) -
 
 
 def book(title: str, length: float, depth: float, thickness: float, cover: Color, ink: Color) -> list[Part]:
-    """A book that lies on its back cover, its spine towards the viewer, pages of paper at the other three sides."""
+    """A book that lies on its back cover, its spine towards the viewer, its pages on the other three sides."""
     back = printed(spine(title, length, thickness, cover, ink), length, thickness)
     size = (length, depth, thickness)
     half = np.array(size) / 2
@@ -182,7 +182,7 @@ def framed(picture: Picture, width: float, height: float, border: Texture, rim: 
 
 
 def bars(width: float, height: float, color: Color) -> list[Part]:
-    """The cross of a window of that size."""
+    """The crossed bars of a window."""
     upright, level = (0.025, 0.025, height), (width, 0.025, 0.025)
     return [Part(box(size, (0, -0.0125, 0)), plain(color)) for size in (upright, level)]
 

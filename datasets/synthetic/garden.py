@@ -1,7 +1,7 @@
 """The garden of the synthetic scene: the room's table on a paved lawn under a sky, to be photographed from all around.
 
-A terrace of slabs lies around the table, grass beyond it; the sky is a dome with hills and clouds, which shines by
-itself. The ground is y = 0.
+A terrace of slabs lies around the table, grass beyond it; the sky is a dome with hills and clouds, not lit by the sun.
+The ground is y = 0.
 """
 
 import numpy as np

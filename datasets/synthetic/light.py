@@ -13,11 +13,11 @@ from .raycast import Array, raycast
 
 MAP_SIZE = 288  # pixels along each side of a depth map
 DISTANCE = 30.0  # m from the middle of the casters to each lamp
-LIFT = 0.012  # m off its surface from where a point looks at the lamps: over the steps of the depth maps
+LIFT = 0.012  # m above its surface at which a point looks for lamps: higher than the steps of the depth maps
 AMBIENT = np.float32(0.16)  # what reaches every point
 NUM_SUN, NUM_SKY = 6, 18  # lamps
 SUN_COLOR, SKY_COLOR = (0.74, 0.68, 0.58), (0.5, 0.54, 0.6)
-CHUNK = 4096  # points at a time, so that their numbers stay in the cache
+CHUNK = 4096  # points at a time, so that all arrays stay in the cache
 
 
 class Lights(NamedTuple):
@@ -53,7 +53,7 @@ def daylight(casters: Array, sun: Array, sky: Array) -> Lights:
 
 
 def received(lights: Lights, points: Array, normals: Array) -> NDArray[np.float32]:
-    """The light `(n, 3)` on points `(n, 3)` with unit normals `(n, 3)`: Lambert's cosine of each lamp in sight."""
+    """The light `(n, 3)` on points `(n, 3)` with unit normals `(n, 3)`: Lambert's cosine, over all lamps in sight."""
     lifted = np.concatenate([points + LIFT * normals, np.ones((len(points), 1))], axis=1).astype(np.float32)
     normals, light = normals.astype(np.float32), np.empty(points.shape, np.float32)
     size, first = lights.depths.shape[1], np.arange(len(lights.depths)) * lights.depths[0].size

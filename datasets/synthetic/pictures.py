@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
 Color = tuple[float, float, float]
-DENSITY = 700.0  # pixels of a picture per metre: three to four of them to one of the default photo
+DENSITY = 700.0  # pixels of a picture per metre: three to four for each pixel of a default photo
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
 def blank(width: float, height: float, color: Color) -> Picture:
-    """A picture of so many metres, in one colour."""
+    """A picture in one colour, its size in metres."""
     return np.full((round(height * DENSITY), round(width * DENSITY), 3), color, dtype=np.uint8)
 
 
@@ -94,7 +94,7 @@ def _fade(width: float, height: float, top: Color, bottom: Color) -> Picture:
 
 
 def _ridge(picture: Picture, rng: np.random.Generator, base: float, swing: float, color: Color) -> None:
-    """Fill all that lies under a line of hills, `base` and `swing` in parts of the height from the top."""
+    """Fill the picture below a line of hills; `base` and `swing` are shares of the height, from the top."""
     rows, columns = picture.shape[:2]
     x = np.linspace(0.0, 1.0, columns)
     waves = sum(np.sin(2 * np.pi * (k * x + rng.uniform())) / k for k in (1.3, 2.9, 5.7))

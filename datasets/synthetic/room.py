@@ -49,7 +49,7 @@ def _shell(rng: np.random.Generator) -> list[Placed]:
 
 
 def things(rng: np.random.Generator) -> list[Placed]:
-    """The table with what stands on it, and a ball under it; near the places named here."""
+    """The table with what stands on it, and a ball under it, each a little off the place that is given here."""
     placed = put(make.table(rng, 1.7, 0.62, TABLE), 0.0, 1.75)
     titles = rng.permutation(TITLES)
     covers = [tone(hue, rng.uniform(0.65, 0.8), rng.uniform(0.5, 0.75)) for hue in rng.permutation(HUES)]
@@ -64,14 +64,14 @@ def things(rng: np.random.Generator) -> list[Placed]:
             placed += put(book, 0.22, 1.72, z, rng.uniform(-0.15, 0.15))
             z += thickness
     sectors = [(217, 51, 41), (247, 204, 64), (41, 115, 178), (242, 237, 224)] * 2
-    things = [
+    items = [
         (make.mug(tone(rng.choice([0.55, 0.0, 0.45]), 0.65, 0.75)), 0.2, 1.7, z, 0.4),
         (make.lamp((252, 219, 153)), -0.66, 1.8, TABLE, 0.0),
         (make.plant(rng), 0.62, 1.7, TABLE, 3.0),
         (make.ball(0.042, [(204, 31, 26)]), -0.12, 1.53, TABLE, 0.0),
         (make.ball(0.14, sectors), 0.42, 1.6, 0.01, 0.4),
     ]
-    for parts, x, y, z, turn in things:
+    for parts, x, y, z, turn in items:
         shift = rng.uniform(-0.025, 0.025, size=2)
         placed += put(parts, x + shift[0], y + shift[1], z, rng.uniform(-turn, turn))
     return placed

@@ -1,4 +1,4 @@
-"""Random fields for procedural solid textures, limited in band so that a camera can resolve them.
+"""Random fields for procedural solid textures, band-limited so that a camera can resolve them.
 
 A texture is a function of the point alone. Detail comes from sums of cosine waves with random directions and phases,
 the spectral form of a stationary Gaussian field.

@@ -1,4 +1,4 @@
-"""Placed meshes with their colours and the daylight on them.
+"""Places meshes in a world, and computes their colours in daylight.
 
 Things are made with z up; frames turn them into OpenCV's axes: x right, y down, z away from the viewer. Lengths are
 metres.
@@ -33,21 +33,21 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """F triangles that belong to some parts, each of which has a frame and a texture of its own."""
+    """F triangles that belong to some parts, each with its own frame and texture."""
 
     triangles: Array  # (F, 3, 3)
     normals: Array  # (F, 3, 3), unit, at the corners
     owners: Index  # (F,), the part a triangle belongs to
     frames: tuple[Array, ...]  # a (4, 4) rigid matrix for each part, from its own frame to the world
     textures: tuple[Texture, ...]
-    shell: int  # so many of the first triangles, those of ground, walls or sky, cast no shadow
+    shell: int  # the first `shell` triangles (ground, walls, sky) cast no shadow
     sun: Array  # (3,), towards the sun
     sky: Array  # (3,), towards the middle of the sky
-    unlit: int  # so many of the first triangles shine by themselves: their colours are their textures'
+    unlit: int  # the first `unlit` triangles are not lit: their colours are those of their textures
 
     @cached_property
     def lights(self) -> Lights:
-        """The lamps: made when a picture is."""
+        """The lamps, made for the first image."""
         sun, sky = (axis / np.linalg.norm(axis) for axis in (self.sun, self.sky))
         return daylight(self.triangles[self.shell :], sun, sky)
 
@@ -65,7 +65,7 @@ class World:
 def make_world(
     shell: Sequence[Placed], things: Sequence[Placed], sun: Array, sky: Array, unlit: Sequence[Placed] = ()
 ) -> World:
-    """A world of things in a shell, which casts no shadow, and of what shines by itself, which casts none either."""
+    """A world of things in a shell, which casts no shadow, and of unlit parts, which cast none either."""
     placed = [*unlit, *shell, *things]
     meshes, frames, textures = zip(*placed, strict=True)
     triangles = [mesh.triangles @ frame[:3, :3].T + frame[:3, 3] for mesh, frame in zip(meshes, frames, strict=True)]
@@ -87,7 +87,7 @@ def make_world(
 def put(
     parts: Sequence[Part], x: float, y: float, z: float = 0.0, turn: float = 0.0, upright: bool = False
 ) -> list[Placed]:
-    """A thing at a place, turned about the vertical; upright: what is to its right as it lies is then its top."""
+    """A thing at a place, turned about the vertical; if `upright`, it stands with its right side on top instead."""
     frame = euler_matrix(0.0, -np.pi / 2, 0.0) if upright else euler_matrix(0.0, 0.0, turn)
     frame[:3, 3] = x, y, z
     return [Placed(mesh, UPRIGHT @ frame, texture) for mesh, texture in parts]
@@ -100,7 +100,7 @@ def _normals(mesh: trimesh.Trimesh) -> Array:
     first = np.searchsorted(corners[order], np.arange(len(mesh.vertices) + 1))
     slots = first[corners][:, None] + np.arange(np.diff(first).max())
     there = slots < first[corners + 1][:, None]
-    around = order[np.where(there, slots, 0)] // 3  # (3F, most faces around a vertex)
+    around = order[np.where(there, slots, 0)] // 3  # (3F, K) for at most K faces around a vertex
     own = np.repeat(mesh.face_normals, 3, axis=0)[:, None]
     weights = mesh.area_faces[around] * there * ((mesh.face_normals[around] * own).sum(-1) > CREASE)
     sums = (weights[..., None] * mesh.face_normals[around]).sum(axis=1)

@@ -38,7 +38,7 @@ def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, mo
 def find_nearest(
     begin, end, lines, places, descriptors1, descriptors2, line_distance, near1, rival1, match1, near2, rival2, match2
 ):
-    """The nearest candidate, of equal ones the first, and the second distance: of each row, and by band of each column."""
+    """The nearest candidate (the first of equal ones) and the second distance of each row and, by band, each column."""
     (n, m), x, y = (len(lines), places.shape[1]), places[0], places[1]
     off, candidates = np.empty(m, np.float32), np.empty(m, np.int32)
     for band in range(begin, end):
