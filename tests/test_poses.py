@@ -11,10 +11,11 @@ from tiny_scenes import write_llff
 
 from kgs.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
+from kgs.errors import DataError
 from kgs.fit import FitConfig, Trainer, fit_scene
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
-from kgs.fit.saved import load_fit
+from kgs.fit.saved import SavedFit, load_fit
 from kgs.geometry import camera_centers
 from kgs.page.fit_page import write_own_page
 
@@ -169,6 +170,15 @@ def test_files_are_about_the_moved_cameras(tmp_path):
     again = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert again["train"]["psnr"] == pytest.approx(metrics["train"]["psnr"], abs=1e-6)
     assert "moved the training cameras by" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_poses_of_other_photos_are_refused(room):
+    """A photo was added to the scene, or removed, after the fit that refined its poses."""
+    poses = room.train.cameras.extrinsics[1:]
+    saved = SavedFit({}, CONFIG, None, near_plane=0.1, step=6, backend="torch", poses=poses)
+    expected = f"has {len(room.train)} training views, but the fit has poses of {len(poses)}: fit again"
+    with pytest.raises(DataError, match=expected):
+        saved.placed(room)
 
 
 def test_decayed():

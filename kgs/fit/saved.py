@@ -60,8 +60,13 @@ class SavedFit(NamedTuple):
     poses: Tensor | None  # `(V, 4, 4)` of the training cameras, if the fit refined them
 
     def placed(self, scene: Scene) -> Scene:
-        """The fit's scene, with the training cameras at the poses of the fit."""
-        return scene if self.poses is None else place_cameras(scene, self.poses)
+        """The fit's scene, with the training cameras at the poses of the fit; a DataError if it has another number."""
+        if self.poses is None:
+            return scene
+        if len(self.poses) != len(scene.train):
+            reason = f"has {len(scene.train)} training views, but the fit has poses of {len(self.poses)}: fit again"
+            raise DataError(scene.root, "train", reason)
+        return place_cameras(scene, self.poses)
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera, background: Tensor) -> Tensor:
