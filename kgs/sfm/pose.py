@@ -83,7 +83,8 @@ def pose_photos(
         The content of photos.json: "photos" by file name, "matches" of each pair, "size" (width, height), "photo_size"
         (that of the smallest photo before it was reduced), "focal_px", "focal_rise" (by what share squared errors grow
         if the focal length is a quarter off; None if it was held at that of the Exif), "radial_distortion", "points",
-        "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others; "reused": whether a former run wrote it; and "folder": where the scene is.
+        "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others; "reused": whether a former run
+        wrote it; and "folder": where the scene is.
 
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be trusted; the message says
