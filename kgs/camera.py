@@ -31,6 +31,7 @@ from .types import check_tensor
 
 MARGIN = 0.15
 Pixels = Callable[[Tensor], Tensor]
+Frame = tuple[float, float, float, float]  # left, top, right and bottom, in pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,19 +167,22 @@ def times(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (vectors[..., None, :] * matrix).sum(-1)
 
 
-def lenses(cameras: Cameras, size: tuple[int, int] | None = None) -> list[Lens]:
-    """The cameras of a batch, one by one; `size` is (height, width) of their images, where it is known."""
-    size = size or image_size(cameras)
+def lenses(cameras: Cameras, size: tuple[int, int] | None = None, frame: Frame | None = None) -> list[Lens]:
+    """The cameras of a batch, one by one.
+
+    `size` is (height, width) of their images if it is known, `frame` that of :class:`kgs.RasterOptions`.
+    """
+    frame = frame or whole_frame(size or image_size(cameras))
     if isinstance(cameras, PinholeCamera):
-        return [_pinhole(cameras, c, size) for c in range(cameras.batch_size)]
-    return [_modelled(cameras, c) for c in range(cameras.extrinsics.shape[0])]
+        return [_pinhole(cameras, c, frame) for c in range(cameras.batch_size)]
+    return [_modelled(cameras, c, frame) for c in range(cameras.extrinsics.shape[0])]
 
 
-def _pinhole(cameras: PinholeCamera, c: int, size: tuple[int, int]) -> Lens:
+def _pinhole(cameras: PinholeCamera, c: int, frame: Frame) -> Lens:
     with torch.inference_mode(False):  # autograd refuses tensors made in inference mode; clones are fine
         both = [x.clone() if x.is_inference() else x for x in (cameras.intrinsics, cameras.extrinsics)]
     matrix, pose = (x[c] for x in both)
-    limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], *size)
+    limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], frame)
 
     def pixels(points: Tensor) -> Tensor:
         found: Tensor = convert_points_from_homogeneous(times(matrix[:3, :3], points))
@@ -190,7 +194,7 @@ def _pinhole(cameras: PinholeCamera, c: int, size: tuple[int, int]) -> Lens:
     return Lens(pose, pixels, jacobian)
 
 
-def _modelled(cameras: PosedCamera, c: int) -> Lens:
+def _modelled(cameras: PosedCamera, c: int, frame: Frame) -> Lens:
     model = cameras.model
     with torch.inference_mode(False):  # autograd refuses tensors made in inference mode; clones are fine
         params, poses = (x.clone() if x.is_inference() else x for x in (model.params, cameras.extrinsics))
@@ -199,7 +203,7 @@ def _modelled(cameras: PosedCamera, c: int) -> Lens:
     height, width = int(model.height), int(model.width)
     one = CameraModelBase(model.distortion, model.projection, ImageSize(height, width), params)
     k = torch.diag(params[:2])
-    limits = tangent_limits(params[:2], params[2:4], height, width)
+    limits = tangent_limits(params[:2], params[2:4], frame)
     parallel = isinstance(model.projection, OrthographicProjection)
     plain = parallel or isinstance(model.distortion, AffineTransform)
     brown_conrady = isinstance(model.distortion, BrownConradyTransform)
@@ -244,10 +248,17 @@ def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor],
     return None if angle >= math.pi / 2 else lambda points: points[:, :2].norm(dim=1) < math.tan(angle) * points[:, 2]
 
 
-def tangent_limits(focal: Tensor, centre: Tensor, height: int, width: int) -> Tensor:
+def whole_frame(size: tuple[int, int]) -> Frame:
+    """The borders of an image of (height, width) pixels, whose first pixel has its centre at (0, 0)."""
+    return -0.5, -0.5, size[1] - 0.5, size[0] - 0.5
+
+
+def tangent_limits(focal: Tensor, centre: Tensor, frame: Frame) -> Tensor:
     """Limits of x/z and y/z as rows (lower, upper), `(2, 2)`, without gradient; focal lengths may be negative."""
-    focal, centre, size = focal.detach(), centre.detach(), focal.new_tensor([width, height])
-    first, last = -(centre + 0.5 + MARGIN * size) / focal, (size - 0.5 - centre + MARGIN * size) / focal
+    focal, centre = focal.detach(), centre.detach()
+    begin, end = focal.new_tensor([frame[:2], frame[2:]])
+    margin = MARGIN * (end - begin)
+    first, last = -(centre - begin + margin) / focal, (end - centre + margin) / focal
     return torch.stack([torch.minimum(first, last), torch.maximum(first, last)], 1)
 
 

@@ -23,7 +23,8 @@ def project_torch(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`kgs.project` in torch, for every camera, device and dtype; does not check its arguments."""
-    device, views, finite = gaussians.means.device, lenses(cameras, size), finite_gaussians(gaussians)
+    device, finite = gaussians.means.device, finite_gaussians(gaussians)
+    views = lenses(cameras, size, options.frame)
     cutoff = seen_within(gaussians.opacities.detach().masked_fill(~finite, 0.0), options.alpha_threshold)
     touches, near = partial(_touches_image, size, options.eps2d, cutoff), options.near_plane
     parts = [_project_one(gaussians, c, lens, finite, touches, near, colors) for c, lens in enumerate(views)]

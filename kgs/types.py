@@ -32,6 +32,10 @@ class RasterOptions:
         transmittance_stop: transmittance below it counts as 0, in [0, 1); the error is at most this value.
         max_bytes: bound for the working memory of one call in bytes, without what is kept per Gaussian and per pixel.
             An image that needs more is rendered in row slices, which the backward pass computes again.
+        frame: (left, top, right, bottom) in pixels of the image; None for the whole image. Footprints are linearised no
+            farther than 15 % of the frame's size beyond its borders. A render that is wider than the images which the
+            Gaussians were fitted to shows the same inside their frame if it is given: else Gaussians that lie far
+            beside it cover it like a veil.
 
     Raises:
         ValueError: an option is out of range.
@@ -43,6 +47,7 @@ class RasterOptions:
     alpha_threshold: float = 1 / 255
     transmittance_stop: float = 1e-4
     max_bytes: int = 2**30
+    frame: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("tile_size", "max_bytes"):
@@ -56,6 +61,16 @@ class RasterOptions:
             value = getattr(self, name)
             if not isinstance(value, Real) or not 0.0 <= float(value) < most:
                 raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
+        if self.frame is not None and not _is_frame(self.frame):
+            raise ValueError(f"frame: expected (left, top, right, bottom) with a positive size, got {self.frame!r}")
+
+
+def _is_frame(frame: Any) -> bool:
+    if not isinstance(frame, tuple) or len(frame) != 4:
+        return False
+    if not all(isinstance(edge, Real) and math.isfinite(edge) for edge in frame):
+        return False
+    return bool(frame[0] < frame[2] and frame[1] < frame[3])
 
 
 class RasterFields(TypedDict, total=False):
@@ -67,6 +82,7 @@ class RasterFields(TypedDict, total=False):
     alpha_threshold: float
     transmittance_stop: float
     max_bytes: int
+    frame: tuple[float, float, float, float] | None
 
 
 def raster_options(options: RasterOptions | None, fields: RasterFields) -> RasterOptions:

@@ -64,6 +64,37 @@ def test_many_tiles_keep_their_numbers(size, views, exactly):
     assert not image[..., dark].any()
 
 
+@pytest.mark.parametrize("kind", [None, CameraModelType.PINHOLE, CameraModelType.BROWN_CONRADY])
+def test_a_wide_render_shows_a_frame_as_a_render_of_the_frame_does(kind):
+    """Gaussians far beside the frame would veil it otherwise: their footprints are linearised farther out."""
+    height, width, wide = 24, 30, 120
+    left = (wide - width) // 2
+    gaussians = random_gaussians(60, 0, torch.float64, 0)
+    gaussians.means[:20, 0] = torch.linspace(2.0, 4.0, 20, dtype=torch.float64) * gaussians.means[:20, 2]
+    gaussians.scales[:20] = torch.tensor([0.05, 0.05, 2.0], dtype=torch.float64)
+    gaussians.quats[:20] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+    def camera(columns, shift):
+        centre = ((width - 1) / 2 + shift, (height - 1) / 2)
+        if kind is None:
+            return pinhole(height, columns, 40.0, centre)
+        distortion = [0.05, -0.02, 0.01, 0.005, 0, 0, 0, 0] if kind is CameraModelType.BROWN_CONRADY else []
+        return posed(kind, [40.0, 40.0, *centre, *distortion], size=(height, columns))
+
+    frame = (left - 0.5, -0.5, left + width - 0.5, height - 0.5)
+    expected = GaussianRenderer()(gaussians, camera(width, 0)).image
+    inside = slice(left, left + width)
+    framed = GaussianRenderer(frame=frame)(gaussians, camera(wide, left)).image[..., inside]
+    assert largest(framed, expected) < 1e-12
+    assert largest(GaussianRenderer()(gaussians, camera(wide, left)).image[..., inside], expected) > 1e-3
+    if kind is None:  # in float32, on the compiled backend too
+        values = {name: value.float() for name, value in vars(gaussians).items()}
+        single = camera(wide, left)
+        single = PinholeCamera(single.intrinsics.float(), single.extrinsics.float(), single.height, single.width)
+        image = GaussianRenderer(frame=frame)(Gaussians(**values), single).image[..., inside]
+        assert largest(image.double(), expected) < 1e-4
+
+
 def test_orthographic_camera_is_the_marginal_of_each_gaussian():
     # B2: parallel rays integrate along z, so the footprint is the upper left block of R Sigma R^T, scaled
     gaussians = dataclasses.replace(

@@ -190,6 +190,9 @@ def test_features_of_any_width_are_colours():
         ("eps2d", float("inf")),
         ("alpha_threshold", 1.0),
         ("transmittance_stop", "0"),
+        ("frame", (0, 0, 4)),
+        ("frame", (4.0, 0.0, 4.0, 8.0)),
+        ("frame", (0.0, 0.0, float("inf"), 8.0)),
     ],
 )
 def test_options_are_checked_in_one_place(name, value):

@@ -9,7 +9,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.camera import MARGIN, Cameras
+from kgs.camera import MARGIN, Cameras, Frame, whole_frame
 from kgs.memory import empty
 from kgs.projection import finite_gaussians, project_torch, seen_within
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
@@ -32,7 +32,7 @@ def project(
     cutoff = float(seen_within(opacities, options.alpha_threshold))
     rules = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, cutoff))
     harmonics = colors and gaussians.colors.ndim == 3
-    views = _views(cameras, size)
+    views = _views(cameras, options.frame or whole_frame(size))
     inputs = *vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics
     fields = _Projection.apply(*inputs, views, rules, harmonics)
     means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, broken = fields
@@ -121,12 +121,14 @@ def _is_turn(matrix: Array) -> bool:
     return bool((np.abs(matrix @ matrix.T - np.eye(3, dtype=matrix.dtype)) <= 1e-3).all())
 
 
-def _views(cameras: PinholeCamera, size: tuple[int, int]) -> list[tuple[Array, ...]]:
+def _views(cameras: PinholeCamera, frame: Frame) -> list[tuple[Array, ...]]:
     """The cameras as the kernels take them; in NumPy, which is faster for so few numbers."""
     views = list[tuple[Array, ...]]()
     for matrix, pose in zip(*arrays(cameras.intrinsics, cameras.extrinsics), strict=True):
-        focal, centre, extent = matrix.diagonal()[:2], matrix[:2, 2], np.array(size[::-1], matrix.dtype)
-        first, last = -(centre + 0.5 + MARGIN * extent) / focal, (extent - 0.5 - centre + MARGIN * extent) / focal
+        focal, centre = matrix.diagonal()[:2], matrix[:2, 2]
+        begin, end = np.array([frame[:2], frame[2:]], matrix.dtype)
+        margin = MARGIN * (end - begin)
+        first, last = -(centre - begin + margin) / focal, (end - centre + margin) / focal
         limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
         rotation = pose[:3, :3]
         inverse = rotation.T if _is_turn(rotation) else np.linalg.inv(rotation)
