@@ -3,6 +3,7 @@
 import os
 import re
 import subprocess
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -11,8 +12,10 @@ import pytest
 import torch
 from factories import random_views
 
+from kgs.bench.study.plots import STYLES
+from kgs.bench.study.presets import AUTO, OFF
 from kgs.datasets.scene import Views
-from kgs.io.figures import write_curve, write_sheet
+from kgs.io.figures import DEFAULT, WITHOUT, write_curve, write_sheet
 from kgs.machine import check_device, peak_rss_mb, revision, versions
 
 CURVE = [{"step": k, "seconds": 0.1 * k, "test_psnr": 20.0 + k, "train_psnr": None} for k in range(3)]
@@ -35,11 +38,15 @@ def test_the_callers_backend_stays(tmp_path):
     assert cv2.imread(str(tmp_path / "curve.png")).shape == (480, 720, 3)
 
 
-def test_a_curve_has_a_colour_for_each_run(tmp_path):
-    write_curve(tmp_path / "curve.png", {"one": CURVE, "two": [{**point, "test_psnr": 18.0} for point in CURVE]})
+def test_each_method_has_one_colour_in_every_figure(tmp_path):
+    without = [{**point, "test_psnr": 18.0} for point in CURVE]
+    write_curve(tmp_path / "curve.png", {"with DropGaussian": CURVE, "without DropGaussian": without})
     pixels = cv2.imread(str(tmp_path / "curve.png")).reshape(-1, 3)
-    for color in ((180, 119, 31), (14, 127, 255)):  # matplotlib's first two, blue first
-        assert int((pixels == color).all(1).sum()) > 50
+    counts = [int((pixels == color).all(1).sum()) for color in ((167, 121, 204), (0, 0, 0))]  # blue first
+    assert min(counts) > 50
+    style = files("kgs.page").joinpath("viewer.css").read_text()
+    assert f".default {{ stroke: {DEFAULT.lower()}" in style
+    assert (STYLES[AUTO][0], STYLES[OFF][0]) == (DEFAULT, WITHOUT)
 
 
 def test_a_sheet_shows_the_photo_and_each_render(tmp_path):

@@ -12,6 +12,10 @@ from kgs.datasets.scene import Views
 from .json_files import write_whole
 from .ownership import MADE_BY
 
+# One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The
+# study has more of them (kgs/bench/study/plots.py); pages show black as the colour of their text.
+DEFAULT, WITHOUT = "#CC79A7", "#000000"
+
 
 def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:
     """Write a PNG of some views, a row each: the photo, then columns of renders `(3, H, W)` under their titles."""
@@ -28,15 +32,16 @@ def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indi
 
 
 def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
-    """Plot test and training PSNR against seconds of training, one colour per run."""
+    """Plot test and training PSNR against seconds of training; the run "without" has the colour of no dropping."""
     figure = _figure(6, 4)
     axes = figure.subplots()
-    for k, (name, curve) in enumerate(runs.items()):
+    for name, curve in runs.items():
+        color = WITHOUT if name.startswith("without") else DEFAULT
         seconds = [point["seconds"] for point in curve]
         for part, style in (("test", "-o"), ("train", ":")):
             values = np.array([point[f"{part}_psnr"] for point in curve], float)  # None is NaN, a gap
             if np.isfinite(values).any():
-                axes.plot(seconds, values, style, color=f"C{k}", markersize=3, label=f"{name} {part}".strip())
+                axes.plot(seconds, values, style, color=color, markersize=3, label=f"{name} {part}".strip())
     axes.set(xlabel="seconds of training", ylabel="PSNR [dB]")
     axes.grid(alpha=0.3)
     if axes.lines:

@@ -29,7 +29,7 @@ _WIDTH, _HEIGHT = 640, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 620, 12, 230
 
 Runs = Mapping[str, Mapping[str, Any]]  # the content of metrics.json by the name of the run; "" if there is only one
-Curve = tuple[int, str, str, list[tuple[float, float]]]  # number of the run, key of the part, label, (seconds, PSNR)
+Curve = tuple[str, str, str, list[tuple[float, float]]]  # run, key of the part, label, (seconds, PSNR)
 
 
 def without_folders(value: Any) -> str:
@@ -102,12 +102,12 @@ def measure_table(runs: Runs) -> tuple[list[str], list[list[str]]]:
 def psnr_plot(runs: Runs) -> dict[str, Any] | None:
     """PSNR over the seconds of training in the coordinates of an SVG; None if no curve has two points."""
     curves = list[Curve]()
-    for number, (run, metrics) in enumerate(runs.items()):
+    for run, metrics in runs.items():
         for part in ("test", "train"):
             curve = [(point["seconds"], point[f"{part}_psnr"]) for point in metrics.get("curve") or []]
             points = [(seconds, psnr) for seconds, psnr in curve if psnr is not None]
             if len(points) > 1:
-                curves.append((number, part, _with_run(PARTS[part], run), points))
+                curves.append((run, part, _with_run(PARTS[part], run), points))
     if not curves:
         return None
     seconds = _ticks(point[0] for *_, points in curves for point in points)
@@ -130,12 +130,12 @@ def psnr_plot(runs: Runs) -> dict[str, Any] | None:
         "y_ticks": [(y(value), f"{value:g}") for value in levels],
         "lines": [
             {
-                "series": number,
+                "method": "without" if run.startswith("without") else "default",
                 "dotted": part == "train",
                 "label": label,
                 "points": " ".join(f"{x(a)},{y(b)}" for a, b in points),
             }
-            for number, part, label, points in curves
+            for run, part, label, points in curves
         ],
     }
 

@@ -8,12 +8,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from kgs.io.figures import DEFAULT, WITHOUT
+
 from .pairs import KEYS, STARTS, difference, grouped, main_cells
 from .presets import AUTO, FAMILIES, FIXED, MAIN, OFF, PAPER
 
 # Colours of Okabe and Ito, told apart by colour-blind people too; those that share one differ in the marker.
-STYLES = {OFF: ("#000000", "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
-for _color, _names in zip(("#CC79A7", "#E69F00", "#F0E442", "#009E73"), FAMILIES.values(), strict=True):
+STYLES = {OFF: (WITHOUT, "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
+for _color, _names in zip((DEFAULT, "#E69F00", "#F0E442", "#009E73"), FAMILIES.values(), strict=True):
     STYLES = {**{name: (_color, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
 _FILLS = dict(zip(STARTS, ("none", "left", "bottom", "top", "full", "right"), strict=True))  # of a start's markers
 DPI = 110
