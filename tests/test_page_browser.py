@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ from factories import batch, random_camera, random_gaussians, with_camera
 import kgs
 from kgs import Gaussians
 from kgs.datasets.scene import Views
+from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
+from kgs.fit.config import DEMO
+from kgs.fit.run import choose_points
+from kgs.fit.trainer import Trainer
+from kgs.geometry import nearest_pixels, project_points, unproject
 from kgs.io import film as films
 from kgs.page import Picture, write_page
 
@@ -191,6 +197,49 @@ def test_what_no_photo_shows_fades_until_it_is_switched_off(browser: Browser, pa
     assert browser.run(f"[viewer.isFading, {switch}.getAttribute('aria-pressed')]") == [True, "true"]
     browser.run(f"{switch}.click()")
     assert browser.run(f"[viewer.isFading, {switch}.getAttribute('aria-pressed')]") == [False, "false"]
+
+
+@pytest.mark.slow
+def test_surfaces_of_the_room_that_no_photo_shows_fade(browser: Browser, tmp_path: Path) -> None:
+    """In a fit of the room, whose surfaces are known, from 40 degrees beside the photos."""
+    room = synthetic_scene("room", 3, 0, (189, 252), seed=0)
+    config = replace(DEMO, steps=200)
+    trainer = Trainer(room, config, choose_points(room, config))
+    trainer.fit()
+    with torch.no_grad():
+        gaussians = trainer.model()
+    path, cameras = tmp_path / "index.html", room.train.cameras
+    rules: dict[str, Any] = {"near_plane": trainer.near_plane, "background": torch.zeros(3)}
+    write_page(path, "room", gaussians, cameras, ["a", "b", "c"], ["training"] * 3, **rules)
+    browser.size(1000, 800)
+    browser.open(path, READY)
+    browser.run("viewer.isRoaming = true")
+    for index in range(3):
+        assert psnr(show(browser, index, 252, 189, True), show(browser, index, 252, 189)) >= 45
+    true_depths = synthetic_depths(cameras, "room")[:, 0]
+    for yaw in (40, -40):
+        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({math.radians(yaw)}, 0)")
+        black, white = [
+            (browser.run(f"viewer.renderer.settings.background = {ground}"), show(browser, None, 252, 189, True))[1]
+            for ground in ([0, 0, 0], [1, 1, 1])
+        ]
+        browser.run("viewer.renderer.settings.background = [0, 0, 0]")
+        alpha = 1 - (white - black).mean(axis=2)
+        rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
+        pose = torch.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+        eye = with_camera(room.train.camera(0), extrinsics=pose)
+        depth = synthetic_depths(eye, "room")[0, 0]
+        pixels = torch.ones_like(depth).nonzero().flip(1)
+        points = unproject(pixels, depth.flatten(), torch.zeros(len(pixels), dtype=torch.int64), eye)
+        places, distances = project_points(points, cameras)
+        shown = torch.zeros(len(pixels), dtype=torch.bool)
+        for view, there in enumerate(true_depths):
+            x, y, inside = nearest_pixels(places[:, view], distances[:, view], 252, 189)
+            shown |= inside & (distances[:, view] <= 1.02 * there[y, x])
+        hidden = ~shown.reshape(depth.shape).numpy()
+        assert alpha[hidden].mean() < 0.2
+        assert alpha[~hidden].mean() > 2 * alpha[hidden].mean()
 
 
 def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:

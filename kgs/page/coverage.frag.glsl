@@ -21,9 +21,9 @@ out vec4 result;
 
 const float LEAST_ALPHA = 0.05;  // of a pixel that shows something
 const float BEHIND = 0.02;       // share of the depth by which a surface may lie behind the depths of a cell
-const float BEFORE = 0.08;       // likewise before them: splats have some fog in front of surfaces
-const float FULL_ANGLE = radians(15.0);  // between the directions from the surface to the eye and to the camera
-const float LAST_ANGLE = radians(55.0);
+const float BEFORE = 0.1;        // likewise before them: splats have some fog in front of surfaces
+const float FULL_ANGLE = radians(18.0);  // between the directions from the surface to the eye and to the camera
+const float LAST_ANGLE = radians(62.0);
 
 float shownBy(int photo, vec3 point) {
   vec3 seen;

@@ -211,7 +211,7 @@ class Target {
 }
 
 // Texture units.
-const GEOMETRY = 0, HARMONICS = 1, PICTURE = 2, DEPTH = 3, SEEN = 4, LENSES = 5, COVERAGE = 6, CLOSED = 7;
+const GEOMETRY = 0, HARMONICS = 1, PICTURE = 2, DEPTH = 3, SEEN = 4, LENSES = 5, COVERAGE = 6, SMOOTH = 7;
 
 class SplatRenderer {
   // `shaders` holds the sources by name. `settings` has nearPlane (world units), lowPass (variance in square pixels of
@@ -230,10 +230,10 @@ class SplatRenderer {
     if (this.canFade) {
       this.depthProgram = new Program(gl, shaders.splatVertex, shaders.depthFragment);
       this.coverageProgram = new Program(gl, shaders.screenVertex, shaders.coverageFragment);
-      this.closingProgram = new Program(gl, shaders.screenVertex, shaders.closingFragment);
+      this.smoothingProgram = new Program(gl, shaders.screenVertex, shaders.smoothingFragment);
       this.depth = new Target(gl, DEPTH, half, gl.NEAREST);
       this.coverage = new Target(gl, COVERAGE, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.NEAREST);
-      this.closed = new Target(gl, CLOSED, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.LINEAR);
+      this.smooth = new Target(gl, SMOOTH, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.LINEAR);
       this.uploadSeen();
     }
     this.upload(GEOMETRY, gl.RGBA32F, TEXELS_PER_ROW, splat.geometry);
@@ -289,7 +289,7 @@ class SplatRenderer {
     this.picture.resize(width, height);
     if (!this.canFade) return;
     const fewer = [width, height].map((side) => Math.ceil(side / COVERAGE_PIXELS));
-    for (const target of [this.depth, this.coverage, this.closed]) target.resize(...fewer);
+    for (const target of [this.depth, this.coverage, this.smooth]) target.resize(...fewer);
   }
 
   // Smallest and largest x/z and y/z at which footprints are linearised: those of the photo's frame and a margin around
@@ -330,7 +330,7 @@ class SplatRenderer {
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, canvas.width, canvas.height);
-    this.screenProgram.use({ picture: PICTURE, coverage: CLOSED }, {
+    this.screenProgram.use({ picture: PICTURE, coverage: SMOOTH }, {
       ground: settings.background, fades: Number(fades && this.canFade),
     });
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
@@ -356,8 +356,8 @@ class SplatRenderer {
       ...eye, cell, depthCode: [low, step], photoSize: this.seen.photoSize,
     });
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
-    this.closed.begin(0, 0, 0, 0);
-    this.closingProgram.use({ coverage: COVERAGE }, {});
+    this.smooth.begin(0, 0, 0, 0);
+    this.smoothingProgram.use({ coverage: COVERAGE }, {});
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
 }

@@ -18,7 +18,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import max_pool2d, pad
 
 from kgs.camera import image_size
 from kgs.datasets.splits import select_evenly
@@ -74,8 +74,14 @@ def _camera(cameras: PinholeCamera, view: int, device: torch.device) -> PinholeC
 
 
 def _largest_in_cells(image: Tensor, cell: int) -> Tensor:
-    """`(1, 1, H, W)` to `(1, H / cell, W / cell)`, rounded up."""
-    return max_pool2d(image, cell, ceil_mode=True)[:, 0]
+    """The largest value in each cell and next to it: `(1, 1, H, W)` to `(1, H / cell, W / cell)`, rounded up.
+
+    The viewer draws between pixels, too.
+    """
+    height, width = image.shape[-2:]
+    rest = [-width % cell, -height % cell]
+    padded = pad(image, (1, 1 + rest[0], 1, 1 + rest[1]), value=-math.inf)
+    return max_pool2d(padded, cell + 2, stride=cell)[:, 0]
 
 
 def _logarithms(near: NDArray[np.float64], far: NDArray[np.float64]) -> tuple[NDArray[np.uint8], float, float]:

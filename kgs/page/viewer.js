@@ -397,7 +397,7 @@ async function openViewer() {
     splatFragment: text("splat-fragment"),
     depthFragment: text("depth-fragment"),
     coverageFragment: text("coverage-fragment"),
-    closingFragment: text("closing-fragment"),
+    smoothingFragment: text("smoothing-fragment"),
     screenVertex: text("screen-vertex"),
     screenFragment: text("screen-fragment"),
   };

@@ -35,7 +35,7 @@ _FILES = [
     "splat.frag.glsl",
     "depth.frag.glsl",
     "coverage.frag.glsl",
-    "closing.frag.glsl",
+    "smoothing.frag.glsl",
     "screen.vert.glsl",
     "screen.frag.glsl",
 ]
