@@ -24,8 +24,8 @@ ABOUT = f"""
 Upload {LIMITS.photos[0]} to {LIMITS.photos[1]} photos of something that does not move, with a step to the side between
 them, as your camera wrote them. You get a page in which you can look around: Gaussian splatting by kgs.
 
-Keep this page open: what nobody waits for is stopped. A job takes some minutes, {LIMITS.seconds / 60:.0f} at most. Your
-photos are deleted from this server within {LIMITS.kept / 3600:.0f} h, and so are the results.
+Keep this page open: what nobody waits for is stopped. A job takes some minutes, {LIMITS.seconds / 60:.0f} at most.
+Photos and results are deleted from this server after about {LIMITS.kept / 60:.0f} minutes.
 """
 workshop = Workshop(ROOT, LIMITS)
 

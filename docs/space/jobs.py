@@ -173,7 +173,7 @@ class Workshop:
                 job = self.jobs[0]
             try:
                 end = self._run(job)
-            except OSError:
+            except Exception:  # the next one shall not wait for ever
                 logging.exception("a job could not be run")
                 end = "No page was made: something is wrong with this server."
             shutil.rmtree(job.folder / "photos", ignore_errors=True)  # they have done their work
@@ -186,7 +186,8 @@ class Workshop:
             self._sweep()
 
     def _sweep(self) -> None:
-        sweep(self.root, self.limits, [job.folder for job in self.jobs])
+        with suppress(OSError):  # others write and remove here, too
+            sweep(self.root, self.limits, [job.folder for job in self.jobs])
 
     def _run(self, job: Job) -> str:
         """Run the command; returns how it ended."""
@@ -231,7 +232,7 @@ def checked(photos: Sequence[Path], limits: Limits) -> list[str]:
     names, total = [], 0
     for number, photo in enumerate(photos, 1):
         stem = re.sub(r"[^A-Za-z0-9]+", "-", photo.stem).strip("-")[:40]
-        shown = f"Photo {number} ({stem})"
+        shown = f"Photo {number} ({stem})" if stem else f"Photo {number}"
         try:
             size = photo.stat().st_size
         except OSError:
