@@ -3,7 +3,9 @@
 import configparser
 import doctest
 import importlib
+import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +57,73 @@ def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypat
     found = doctest.testmod(importlib.import_module(module))
     assert found.attempted
     assert not found.failed
+
+
+# -- links -----------------------------------------------------------------------------------------------------------
+
+
+def outside_of_code(text):
+    return re.sub(r"`[^`\n]*`", "", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+
+
+def text_of(path):
+    """The Markdown of a page or of a notebook's cells."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"]
+        text = "\n\n".join("".join(cell["source"]) for cell in cells)
+    return text
+
+
+def links(text):
+    """Where links and images lead, but for other sites."""
+    found = re.findall(r"\]\(([^)\s]+)\)", outside_of_code(text))
+    found += re.findall(r"^\[[^\]]+\]: (\S+)", outside_of_code(text), re.M)
+    found += re.findall(r"<(?:a|img)\b[^>]*?\b(?:href|src)=\"([^\"]+)\"", outside_of_code(text))
+    return [link for link in found if not re.match(r"[a-z]+:", link)]
+
+
+def anchors(path):
+    """Names of the headings, as GitHub and the site make them."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```", "", text_of(path), flags=re.M | re.S), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+LINKING = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.ipynb")]
+
+
+@pytest.mark.parametrize("path", LINKING, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_its_links_lead_somewhere(path):
+    missing = []
+    for link in links(text_of(path)):
+        place, _, anchor = link.partition("#")
+        target = path.parent / place if place else path
+        inside = target.resolve().is_relative_to(ROOT) and target.exists()
+        if not inside or (anchor and anchor not in anchors(target)):
+            missing.append(link)
+    assert not missing
+
+
+def test_links_are_found():
+    text = "![a](b.png) [c\nd](e.md#f) `[g](h)` [i](https://j.k) <img alt='' src=\"l.png\">\n\n```\n[m](n)\n```\n"
+    assert links(text) == ["b.png", "e.md#f", "l.png"]
+    assert "against-given-poses" in anchors(ROOT / "docs" / "photos.md")
+
+
+@pytest.mark.skipif(shutil.which("sed") is None, reason="no sed")
+def test_the_readme_of_a_published_package_links_to_the_repository(tmp_path):
+    """As CONTRIBUTING.md has it, in its own words."""
+    shutil.copy(ROOT / "README.md", tmp_path)
+    (block,) = re.findall(r"^(REPOSITORY=.*?README\.md\n)", (ROOT / "CONTRIBUTING.md").read_text(), re.M | re.S)
+    before = (ROOT / "README.md").read_text(encoding="utf-8")
+    subprocess.run(["sh", "-ec", block], cwd=tmp_path, check=True)
+    after = (tmp_path / "README.md").read_text(encoding="utf-8")
+    assert not links(after)
+    made = re.findall(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/([^)#]+)", after)
+    assert sorted(place for _, place in made) == sorted(link.partition("#")[0] for link in links(before))
+    shown = {place for kind, place in made if kind == "raw"}  # what a browser has to show as it is
+    assert shown == {place for _, place in made if place.endswith((".jpg", ".png", ".html"))} > {"docs/demo.png"}
+    assert re.sub(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/", "", after) == before
 
 
 @pytest.mark.slow
