@@ -84,8 +84,10 @@ def links(text):
 
 
 def anchors(path):
-    """Names of the headings, as GitHub and the site make them."""
+    """Names of the headings, as GitHub and the site make them; those of notebooks keep capitals."""
     headings = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```", "", text_of(path), flags=re.M | re.S), re.M)
+    if path.suffix == ".ipynb":
+        return {heading.strip().replace(" ", "-") for heading in headings}
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 

@@ -1,11 +1,14 @@
 """The notebooks run from top to bottom and show what they say: small in this process, in full in a kernel (slow)."""
 
+import importlib.util
 import os
 import re
 import shutil
+import sys
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -104,7 +107,7 @@ CLAIMS["07_your_own_photos"] = (
     """
     assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
     assert len(scene.test) == 0 and len(scene.train) == COUNT
-    assert trainer.step == judge.step == STEPS and half.test.names == ("0.png", "2.png")
+    assert trainer.step == judge.step == STEPS and half.test.names == ("1.png",)
     """,
     """
     assert max(errors) < 0.2 and trainer.psnr(scene.train) > 28
@@ -216,3 +219,84 @@ def test_it_is_small_and_names_no_place_on_a_disk(path):
             texts += [output.get("text", ""), *(v for k, v in output.get("data", {}).items() if k.startswith("text/"))]
     absolute = re.compile(r"(?<![\w.:/<])(?:/|~/)[A-Za-z_][\w.-]*/|\b[A-Z]:\\")
     assert not [found for text in texts for found in absolute.findall(text)]
+
+
+# -- your own photos -------------------------------------------------------------------------------------------------
+
+YOUR_OWN = nbformat.read(NOTEBOOKS[-1], as_version=4)
+
+
+def test_it_is_stored_without_photos_of_others():
+    """As it ran without KGS_DATA; the renders of these photos come with their attribution."""
+    (cell,) = [cell for cell in YOUR_OWN.cells if cell.cell_type == "code" and "BANANA" in cell.source]
+    assert [output.output_type for output in cell.outputs] == ["stream", "display_data"]
+    assert "would be shown here" in cell.outputs[0].text
+    (about,) = [cell.source for cell in YOUR_OWN.cells if cell.source.startswith("## Real photos")]
+    assert all("MIT licence" in text and "dataset_banana" in text for text in (cell.source, about))
+
+
+def hosted_cell(monkeypatch, folder, fit):
+    """Run the cell for hosted notebooks in this folder; returns what it asked of IPython, and what it displayed."""
+    display = pytest.importorskip("IPython.display")
+    from IPython.core.inputtransformer2 import TransformerManager
+
+    asked, shown, names = [], [], {}
+
+    class Shell:
+        def run_line_magic(self, *words):
+            asked.append(" ".join(words).format(**names))
+
+        def system(self, line):
+            asked.append(line.format(**names))
+            fit()
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(display, "display", lambda html: shown.append(html.data))
+    source = TransformerManager().transform_cell(YOUR_OWN.cells[-1].source)
+    names["get_ipython"] = Shell
+    exec(compile(source, "the cell for hosted notebooks", "exec"), names)
+    return asked, shown
+
+
+def write_page():
+    Path("out").mkdir()
+    Path("out", "index.html").write_text('<p title="a">')
+
+
+FRAMED = 'srcdoc="&lt;p title=&quot;a&quot;&gt;"'
+
+
+def test_on_colab_photos_are_uploaded_and_the_page_is_shown(tmp_path, monkeypatch):
+    files = SimpleNamespace(upload=lambda: {"IMG_1.jpg": b"1", "../IMG 2.jpg": b"2"})
+    google = SimpleNamespace(files=files)
+    monkeypatch.setitem(sys.modules, "google", SimpleNamespace(colab=google))
+    monkeypatch.setitem(sys.modules, "google.colab", google)
+    asked, shown = hosted_cell(monkeypatch, tmp_path, write_page)
+    assert asked == ['pip install -q "kgs-splat[app,sfm,heic]"', 'kgs fit "photos" -o out']
+    assert {path.name: path.read_bytes() for path in (tmp_path / "photos").iterdir()} == {
+        "IMG_1.jpg": b"1",
+        "IMG 2.jpg": b"2",
+    }
+    assert len(shown) == 1
+    assert FRAMED in shown[0]
+
+
+def test_on_kaggle_photos_are_those_of_the_input(tmp_path, monkeypatch):
+    spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "kaggle_secrets" or spec(name))
+    monkeypatch.delitem(sys.modules, "google.colab", raising=False)
+    (tmp_path / "input" / "my photos").mkdir(parents=True)
+    (tmp_path / "working").mkdir()
+    (tmp_path / "input" / "my photos" / "1.JPG").touch()
+    (tmp_path / "working" / "kgs_splat-0.1.0-py3-none-any.whl").touch()
+    asked, shown = hosted_cell(monkeypatch, tmp_path / "working", lambda: None)
+    wheel = "./kgs_splat-0.1.0-py3-none-any.whl"
+    assert asked == [f'pip install -q "{wheel}[app,sfm,heic]"', 'kgs fit "../input/my photos" -o out']
+    assert not shown, "without a page kgs has said why"
+
+
+def test_on_any_other_machine_nothing_happens(tmp_path, monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "google.colab", raising=False)
+    assert hosted_cell(monkeypatch, tmp_path, write_page) == ([], [])
+    assert "no hosted notebook" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
