@@ -8,8 +8,6 @@ Without Pillow an image has to be decoded to know its size, so that no bound on 
 import io
 import warnings
 from collections.abc import Callable
-from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +17,8 @@ from kornia_rs import io as kornia_io
 from numpy.typing import NDArray
 
 from kgs.errors import DataError
+
+from . import folders
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile as Opened  # what Pillow gives for a file
@@ -77,7 +77,7 @@ class ImageFile:
     @property
     def metadata(self) -> Metadata:
         """Size and tags, from the header; without Pillow from the decoded image, with no tags."""
-        if self._metadata is None and has_pillow():
+        if self._metadata is None and folders.has_pillow():
             if self._data is None:
                 self._metadata = _read_header_of_file(self.path)
             else:
@@ -103,7 +103,7 @@ class ImageFile:
     def _decode(self) -> Image:
         data = self.load()
         kind = _kind(self.path, data[:_LONGEST_SIGNATURE])
-        size = self.size if has_pillow() else None  # checked before anything is decoded
+        size = self.size if folders.has_pillow() else None  # checked before anything is decoded
         try:
             pixels = _decode(kind, data)
         except ValueError as error:
@@ -132,26 +132,14 @@ def read_bytes(path: Path) -> bytes:
         raise DataError(path, "", f"cannot be read ({error.strerror})") from error
 
 
-@cache
-def has_pillow() -> bool:
-    """Whether Pillow is installed."""
-    return find_spec("PIL") is not None
-
-
-@cache
-def has_heic() -> bool:
-    """Whether HEIC can be read: Pillow and pi-heif are installed."""
-    return has_pillow() and find_spec("pi_heif") is not None
-
-
 def is_heic(data: bytes) -> bool:
     """Whether a file that begins with these bytes is a HEIC image."""
     return data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS
 
 
 def _kind(path: Path, head: bytes) -> str:
-    """The format of a file that begins with these bytes; a DataError about `path` if it cannot be read."""
-    if is_heic(head) and has_heic():
+    """The format of a file that begins with these bytes; a DataError about `path` where it cannot be read."""
+    if is_heic(head) and folders.has_heic():
         return "HEIC"
     for signature, kind in _KINDS.items():
         if head.startswith(signature):
@@ -241,8 +229,8 @@ def check_size(path: Path, width: int, height: int, size: int) -> None:
 
 
 def _decode(kind: str, data: bytes) -> Image:
-    """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError if it cannot be decoded."""
-    if kind == "TIFF" and not has_pillow():
+    """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
+    if kind == "TIFF" and not folders.has_pillow():
         raise ValueError('TIFF is read with Pillow, which is not installed: pip install pillow, or the extra "app"')
     try:
         if kind == "JPEG":
@@ -251,8 +239,8 @@ def _decode(kind: str, data: bytes) -> Image:
             return _decode_tiff(data)
         if kind == "HEIC":
             return _to_float(np.array(_open(kind, io.BytesIO(data)).convert("RGB")))
-        if kind == "PNG" and has_pillow():
-            _open(kind, io.BytesIO(data)).verify()  # OpenCV allocates memory for chunks that the file does not have
+        if kind == "PNG" and folders.has_pillow():
+            _open(kind, io.BytesIO(data)).verify()  # OpenCV takes memory for chunks that are not in the file
         return _to_float(_decode_with_opencv(data))
     except (ValueError, MemoryError):
         raise
@@ -278,7 +266,7 @@ def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
 
 def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     """RGB of a JPEG. What lies behind its end, such as a phone's video, is ignored."""
-    if has_pillow():
+    if folders.has_pillow():
         file = io.BytesIO(data)
         image = _open("JPEG", file)
         end = file.tell()  # of the header of the first scan

@@ -1,7 +1,6 @@
-"""Removes lens distortion from photos and reduces them, with the intrinsics that result; lists folders of photos."""
+"""Photos as arrays: removing the lens's distortion, reducing, and the intrinsics that result."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Self
 
 import cv2
@@ -10,10 +9,6 @@ from numpy.typing import NDArray
 
 from .image_file import Image
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
-UNREADABLE_SUFFIXES = (*_RAW, ".heic", ".heif", ".hif", ".avif", ".gif", ".jxl", ".jp2", ".exr")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
 Maps = tuple[Image, Image]
 _LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
 
@@ -49,20 +44,6 @@ class Intrinsics:
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 calibration matrix for integer pixel centres: the one place where half a pixel is subtracted."""
         return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])
-
-
-def image_folder(root: Path) -> Path | None:
-    """The folder of photos beside a model: `images`, else the `images_k` of the largest photos, or None."""
-    if (root / "images").is_dir():
-        return root / "images"
-    reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
-    return min(reduced, key=lambda p: int(p.name.removeprefix("images_")), default=None)
-
-
-def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """The photos of a folder, sorted by name; hidden files and other kinds of files are skipped."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
-    return sorted(files, key=lambda p: p.name)
 
 
 def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:

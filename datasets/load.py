@@ -18,9 +18,10 @@ from torch import Tensor
 from kgs.errors import DataError
 
 from .border import border_light
+from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .images import rectification, remap, resize
-from .layouts import CAMERAS_REPORT, find_layout
+from .layouts import find_layout
 from .scene import Scene, Views, pinholes
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 

@@ -13,7 +13,7 @@ import pytest
 from photo_folders import planes, write_photos
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
-from kgs.datasets import image_file, load_scene
+from kgs.datasets import folders, image_file, load_scene
 from kgs.errors import DataError
 from kgs.sfm import pose, pose_photos
 
@@ -96,7 +96,7 @@ def test_a_scene_without_pillow(
     write(tmp_path)
     expected = load_scene(tmp_path, downscale=1.5)
     monkeypatch.setitem(sys.modules, "PIL", None)
-    monkeypatch.setattr(image_file, "has_pillow", lambda: False)
+    monkeypatch.setattr(folders, "has_pillow", lambda: False)
     opened.clear()
     decoded.clear()
     scene = load_scene(tmp_path, downscale=1.5)
@@ -113,7 +113,7 @@ def test_a_scene_without_pillow(
 
 def test_a_tiff_without_pillow_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(8))
-    monkeypatch.setattr(image_file, "has_pillow", lambda: False)
+    monkeypatch.setattr(folders, "has_pillow", lambda: False)
     with pytest.raises(DataError, match=r"a\.tif: TIFF is read with Pillow, which is not installed"):
         image_file.read_image(tmp_path / "a.tif")
 

@@ -17,8 +17,8 @@ from kgs.io.json_files import write_json
 from kgs.io.outputs import write_png
 from kgs.io.ownership import MARK
 from kgs.sfm import pose, pose_photos
+from kgs.sfm.place import photo_staging
 from kgs.sfm.read import blurred, open_photos, read_photos
-from kgs.sfm.write import photo_staging
 
 pytest.importorskip("pycolmap")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from photo_folders import write_planes
 
-from kgs.datasets import image_file
+from kgs.datasets import folders
 from kgs.datasets.image_file import is_heic
 from kgs.errors import DataError
 from kgs.io.console import silent
@@ -67,7 +67,7 @@ def test_a_bomb_is_not_decoded(folder, monkeypatch):
 
 
 def test_without_the_extra_it_is_said_what_to_do(folder, monkeypatch):
-    monkeypatch.setattr(image_file, "has_heic", lambda: False)
+    monkeypatch.setattr(folders, "has_heic", lambda: False)
     said = r"2 of 3 photos cannot be read \(IMG_1\.heic, IMG_2\.HEIC\).*\[heic\].*sips.*magick.*Most Compatible"
     with pytest.raises(DataError, match=said):
         find_photos(folder)

@@ -11,7 +11,7 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from kgs import cli, sfm
 from kgs.cli.unposed import is_unposed
 from kgs.datasets import synthetic_scene
-from kgs.datasets.layouts import nearest_scene
+from kgs.datasets.folders import nearest_scene
 from kgs.io.json_files import write_json
 
 SIZE = (72, 96)

@@ -6,12 +6,13 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
+from kgs.datasets.folders import find_model, image_folder
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
 from kgs.datasets.image_file import ImageFile
-from kgs.datasets.images import Intrinsics, image_folder
+from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
-from .colmap_model import ColmapCamera, ColmapImage, find_model, model_file, read_cameras, read_images, read_points
+from .colmap_model import ColmapCamera, ColmapImage, model_file, read_cameras, read_images, read_points
 
 
 def load_colmap(root: Path) -> FrameSet:

@@ -41,12 +41,6 @@ class ColmapImage(NamedTuple):
     name: str
 
 
-def find_model(root: Path) -> Path | None:
-    """The folder of a scene that holds a COLMAP model, `sparse/0` or `sparse`; None if there is none."""
-    files = (root / f"{folder}/images.{suffix}" for folder in ("sparse/0", "sparse") for suffix in ("bin", "txt"))
-    return next((file.parent for file in files if file.is_file()), None)
-
-
 def model_file(folder: Path, stem: str) -> Path:
     """The binary file of that stem, else the text file, else a DataError."""
     for suffix in ("bin", "txt"):

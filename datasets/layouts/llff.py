@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs.datasets.folders import find_model, image_folder, list_images
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
 from kgs.datasets.image_file import ImageFile
-from kgs.datasets.images import Intrinsics, image_folder, list_images
+from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
 from .colmap import camera_to_world, track_points
-from .colmap_model import find_model, model_file, read_images
+from .colmap_model import model_file, read_images
 
 
 def load_llff(root: Path) -> FrameSet:

@@ -15,9 +15,10 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
+from kgs.datasets.folders import IMAGE_SUFFIXES
 from kgs.datasets.frames import Frame, FrameSet, path_inside
 from kgs.datasets.image_file import ImageFile
-from kgs.datasets.images import IMAGE_SUFFIXES, Intrinsics
+from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 from kgs.io.json_files import is_number, read_json
 

@@ -79,7 +79,7 @@ def fit(
     """
     del preset  # `defaults` has read it
     from kgs.datasets import load_scene
-    from kgs.datasets.layouts import CAMERAS_REPORT
+    from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
     from kgs.io.outputs import check_folder

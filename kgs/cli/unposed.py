@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from kgs.datasets.images import VIDEO_SUFFIXES
-from kgs.datasets.layouts import nearest_scene
+from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
 from kgs.io.console import each, say
 from kgs.io.results_folder import locked
 
@@ -49,7 +48,7 @@ def find_scene(
 
 def settle(out: Path) -> None:
     """Put cameras that waited for a fit in their place, beside its results."""
-    from kgs.sfm.write import photo_staging
+    from kgs.sfm.place import photo_staging
 
     with locked(out):
         photo_staging(out).complete()

@@ -8,17 +8,16 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
-from torch import Tensor
-
-from kgs.datasets.images import list_images
-from kgs.datasets.layouts import CAMERAS_REPORT
+from kgs.datasets.folders import CAMERAS_REPORT, list_images
 from kgs.errors import DataError
 
-from .images import eight_bits
 from .json_files import write_whole
 from .ownership import MARK, is_own
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FILM = "turntable.webm"
 EXPORTS = ("cameras.json", "splat.glb", FILM)  # for other programs
@@ -68,11 +67,15 @@ def png_names(views: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def write_png(path: Path, image: Tensor) -> None:
-    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as made by kgs.
+def write_png(path: Path, image: "Tensor") -> None:
+    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs.
 
     Alpha is straight, as PNG has it: the colours are not multiplied by it.
     """
+    import cv2  # here, because the command looks at folders before anything heavy is loaded
+
+    from .images import eight_bits
+
     ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")

@@ -9,7 +9,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.datasets.layouts import CAMERAS_REPORT
+from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from kgs.datasets import image_file
-from kgs.datasets.images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, list_images
+from kgs.datasets import folders
+from kgs.datasets.folders import HEIC_SUFFIXES, IMAGE_SUFFIXES, UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, list_images
 from kgs.errors import DataError
 
 FEWEST = 3
-HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _LISTED = 10
 CONVERT = (
     'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install -e ".[heic]"). Or make JPEGs: on a '
@@ -54,7 +53,7 @@ def list_photos(folder: Path) -> list[Path]:
 
 
 def _readable() -> tuple[str, ...]:
-    return IMAGE_SUFFIXES + (HEIC_SUFFIXES if image_file.has_heic() else ())
+    return IMAGE_SUFFIXES + (HEIC_SUFFIXES if folders.has_heic() else ())
 
 
 def listed(paths: list[Path]) -> str:

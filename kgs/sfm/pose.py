@@ -35,18 +35,9 @@ from .gates import (
 )
 from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verify, write_colmap_matches
 from .match import exif_focal, lens_of, write_matches
+from .place import IMAGES, MODEL, REPORT, check_place, is_reusable, photo_staging
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
-from .write import (
-    IMAGES,
-    MODEL,
-    REPORT,
-    check_place,
-    is_reusable,
-    level_and_scale,
-    photo_staging,
-    write_images,
-    write_model,
-)
+from .write import level_and_scale, write_images, write_model
 
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
 SETTINGS = 4  # increased by every change after which the same photos give other files

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs.datasets import image_file
+from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import ImageFile, turn
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
@@ -129,7 +129,7 @@ def open_photos(paths: list[Path]) -> list[OpenPhoto]:
 def _open(path: Path) -> OpenPhoto:
     image = ImageFile(path)
     data = image.load()
-    if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and image_file.has_heic()):
+    if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
         raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
     exif = Exif.of(image.metadata.tags)
     width, height = image.size

@@ -1,0 +1,58 @@
+"""Where photos and cameras go: `images`, `sparse/0` and `photos.json` in a folder, all three or none.
+
+New ones go through `unfinished-photos` and `finished-photos`, see `kgs.io.staging`. Beside a fit, which belongs to the
+former cameras, they wait in the second folder until the new fit is there.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from kgs.datasets.folders import CAMERAS_REPORT
+from kgs.errors import DataError
+from kgs.io.json_files import read_json
+from kgs.io.ownership import is_own
+from kgs.io.staging import Staging
+
+REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
+
+
+def photo_staging(out: Path) -> Staging:
+    """How photos and cameras get to their folder."""
+    return Staging(out, "-photos", replaced=(IMAGES, "sparse"))
+
+
+def check_place(out: Path, folder: Path) -> None:
+    """A DataError where the results would lie among the user's photos or in place of files of another program."""
+    advice, photos = "choose another folder", folder.resolve()
+    staging = photo_staging(out)
+    replaced = [out / IMAGES, out / "sparse", staging.unfinished, staging.finished]
+    if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
+        raise DataError(out, "", f"holds the photos themselves: {advice}")
+    for path in filter(os.path.lexists, replaced):
+        if not (_is_own_model(out) if path.name == "sparse" else _has_only_own_images(path)):
+            raise DataError(path, "", f"holds files of a scene that kgs did not write: {advice}")
+
+
+def _is_own_model(out: Path) -> bool:
+    files = [path for path in (out / "sparse").rglob("*") if path.is_file()]
+    return is_own(out / REPORT) and {path.suffix for path in files} <= {".bin"}
+
+
+def _has_only_own_images(folder: Path) -> bool:
+    """Whether kgs wrote all files of a folder; hidden files do not count."""
+    if not folder.is_dir() or folder.is_symlink():
+        return False
+    return is_own(folder) or all(is_own(path) for path in folder.iterdir() if path.name[0] != ".")
+
+
+def is_reusable(out: Path, inputs: dict[str, Any]) -> bool:
+    """Whether the report of a former run has the same inputs, and all of its files are there."""
+    try:
+        report = read_json(out / REPORT)
+        images = [out / IMAGES / str(photo["image"]) for photo in report["photos"].values()]
+    except (DataError, KeyError, TypeError, AttributeError):
+        return False
+    files = [*images, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]
+    unchanged = all(report.get(key) == value for key, value in inputs.items())
+    return unchanged and all(path.is_file() for path in files)
