@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Self
 
 import kornia.geometry as kg
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,10 +21,10 @@ from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .images import rectification, remap, resize
 from .layouts import find_layout
+from .options import BACKGROUNDS, check_options
 from .scene import Scene, Views, pinholes
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
-_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LISTED = 20
 _BORDER = "the photos have a dark border, left by undistortion: it is taken for part of the lens, not of the scene"
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
@@ -76,14 +75,7 @@ def load_scene(
         >>> images = [view["image"] for view in scene.train]  # doctest: +SKIP
         >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
-    for name, value, known in (("background", background, _BACKGROUNDS), ("points", points, ("none", "model-points"))):
-        if value not in known:
-            raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
-    if downscale is not None and not (isinstance(downscale, int | float | np.number) and 1 <= downscale < math.inf):
-        raise ValueError(f"downscale: expected None or a number of at least 1, got {downscale!r}")
-    whole = isinstance(hold_out, int | np.integer) and not isinstance(hold_out, bool)
-    if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
-        raise ValueError(f"hold_out: expected None, 0 or a whole number of at least 2, got {hold_out!r}")
+    check_options(downscale, hold_out, background, points)
     root = Path(path)
     # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
@@ -100,7 +92,7 @@ def load_scene(
             listed = ", ".join(str(path.relative_to(root)) for path in missing[:_LISTED])
             listed += f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else ""
             raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {listed}")
-        color = torch.tensor(_BACKGROUNDS[background], dtype=torch.float32)
+        color = torch.tensor(BACKGROUNDS[background], dtype=torch.float32)
         offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; without the test views
         scales = [_Scale.of(train[0], downscale or 1.0)]
         height, width = scales[0].size

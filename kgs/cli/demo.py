@@ -46,8 +46,6 @@ def demo(
     from kgs.machine import check_tools
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    if min(size) < 12:  # the window of SSIM
-        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     check_tools(device, backend, "matplotlib", "jinja2")
     check_folder(out, ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS])
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)

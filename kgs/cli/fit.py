@@ -11,10 +11,9 @@ from kgs.errors import DataError, printable
 from kgs.fit.config import DETAILS, PRESETS, Background, FitConfig
 from kgs.io.console import VIEWER, as_line, say, say_next
 
-from .inputs import check_roll, load
+from .checks import SMALLEST
+from .inputs import load
 from .options import Existing, Out
-
-SMALLEST = 32  # pixels of the longer side
 
 
 def defaults(words: list[str]) -> dict[str, Any]:
@@ -82,9 +81,8 @@ def fit(
     from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
-    from kgs.io.outputs import check_folder
     from kgs.io.ownership import is_own
-    from kgs.io.results_folder import fit_staging, is_finished, replaced_files
+    from kgs.io.results_folder import fit_staging, is_finished
     from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
@@ -92,14 +90,8 @@ def fit(
 
     from .unposed import find_scene, is_unposed, settle
 
-    if size is not None and downscale is not None:
-        raise ValueError("size: expected either a size or a downscale factor, got both")
-    if size is not None and size < SMALLEST:
-        raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
-    check_roll(roll)
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
-    check_folder(out, replaced_files(out), scene, make=False)
     request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
     request["hold_out"] = hold_out
     request |= {"photos": photos, "roll": roll}
@@ -118,7 +110,8 @@ def fit(
     loaded = load(request, place)
     height, width = loaded.train.images.shape[-2:]
     if max(height, width) < SMALLEST:
-        raise ValueError(f"size: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
+        shrunk_by = "size" if downscale is None else "downscale"
+        raise ValueError(f"{shrunk_by}: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
     metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)

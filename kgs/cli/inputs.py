@@ -37,9 +37,3 @@ def load_splat(ply: Path, scene: Any, place: Any, backend: str) -> tuple[Any, An
     model = load_ply(ply, origin=scene.offset)
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     return model.to(place), GaussianRenderer(near_plane=near_plane, backend=backend).eval()
-
-
-def check_roll(roll: float) -> None:
-    """A ValueError unless this is an angle by which pictures can be turned."""
-    if not -360 <= roll <= 360:
-        raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")

@@ -8,7 +8,7 @@ from kgs.errors import printable
 from kgs.fit.config import Backend, Background
 from kgs.io.console import as_line, say, say_next
 
-from .inputs import check_roll, load_cameras, load_splat
+from .inputs import load_cameras, load_splat
 from .options import Existing, Out
 
 if TYPE_CHECKING:
@@ -50,20 +50,11 @@ def page(
 
     from kgs.camera import move_camera
     from kgs.datasets import load_scene
-    from kgs.errors import DataError
-    from kgs.io.ownership import is_own
     from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
-    check_roll(roll)
     place = check_tools(device, backend, "jinja2")
-    if out.suffix != ".html":
-        raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
-    if out.exists() and not is_own(out):
-        raise DataError(out, "", "was not written by kgs and would be overwritten: choose another file")
-    if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "expected a file in a folder that is there")
     scene = load_cameras(cameras, downscale, background=background, hold_out=0)
     model, renderer = load_splat(ply, scene, place, backend)
     behind = scene.background.to(place)

@@ -43,7 +43,6 @@ def render(
     from kgs.machine import check_tools
 
     place = check_tools(device, backend)
-    check_folder(out, (), cameras, make=False)
     clear = background == "transparent"
     scene = load_cameras(cameras, downscale, background="black" if clear else background)
     model, renderer = load_splat(ply, scene, place, backend)

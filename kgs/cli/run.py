@@ -62,6 +62,7 @@ def exit_code(words: list[str]) -> int:
         command, defaults = _load(name)
         flags |= _flags_of(command)
         call = _parse(command, f"kgs {name}", words, defaults(words))
+        _check(name, call)
         for module in _HEAVY:
             with suppress(ImportError):  # numba may be missing; the command says what it needs
                 import_module(module)
@@ -152,6 +153,16 @@ def _load(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], dict[str
     return getattr(home, function), getattr(home, "defaults", lambda _: {})
 
 
+def _check(name: str, call: partial[Any]) -> None:
+    """Tell a mistake that can be told before torch is loaded."""
+    from .checks import CHECKS  # after tyro has read the words: a misspelt option is told without them
+
+    if name in CHECKS:
+        bound = inspect.signature(call.func).bind(*call.args, **call.keywords)
+        bound.apply_defaults()
+        CHECKS[name](**bound.arguments)
+
+
 def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
     """What the command line calls the arguments that errors of the library name."""
     paths: dict[str, str] = {}
@@ -177,7 +188,7 @@ def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None
     raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
 
 
-def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: dict[str, Any]) -> Callable[[], Any]:
+def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: dict[str, Any]) -> partial[Any]:
     """Read the options; returns the call that they ask for, once its input paths are there."""
     import tyro
 
@@ -186,7 +197,7 @@ def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: d
     _check_out(command, prog, words)
 
     @wraps(command)
-    def bind(*arguments: Any, **options: Any) -> Callable[[], Any]:
+    def bind(*arguments: Any, **options: Any) -> partial[Any]:
         bound = inspect.signature(command).bind(*arguments, **options)
         for name, value in bound.arguments.items():
             hint = command.__annotations__[name]
@@ -198,5 +209,5 @@ def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: d
         return partial(command, *arguments, **options)
 
     function = partial(bind, **defaults) if defaults else bind
-    call: Callable[[], Any] = tyro.cli(function, prog=prog, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    call: partial[Any] = tyro.cli(function, prog=prog, args=words, config=(tyro.conf.FlagCreatePairsOff,))
     return call

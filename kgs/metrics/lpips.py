@@ -21,6 +21,8 @@ from torch import Tensor, nn
 
 from kgs.errors import DataError
 
+from .weights import weight_files
+
 # The mean and deviation of ImageNet, as the authors give them for images in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -76,13 +78,11 @@ class Lpips(nn.Module):
         """
         with torch.device("meta"):
             module = cls(net)
-        folder, files = Path(folder), (f"{net}_features.npz", f"lpips_lin_{net}.npz")
-        if not folder.is_dir():
-            raise DataError(folder, "", f"expected a folder with {files[0]} and {files[1]}, got none")
+        network, lines = weight_files(folder, net)
         shapes = {name: tuple(value.shape) for name, value in module.state_dict().items()}
         heads = {name: shape for name, shape in shapes.items() if name.startswith("lin")}
         features = {name: shape for name, shape in shapes.items() if name not in heads}
-        module.load_state_dict(_read(folder / files[0], features) | _read(folder / files[1], heads), assign=True)
+        module.load_state_dict(_read(network, features) | _read(lines, heads), assign=True)
         return module.requires_grad_(False).eval()
 
     def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:
@@ -115,9 +115,6 @@ def _unit(features: Tensor) -> Tensor:
 
 def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
     """The named arrays of an npz file as float32 tensors, each size checked before it is unpacked."""
-    if not zipfile.is_zipfile(path):
-        got = "another format or a part of one" if path.is_file() else "none"
-        raise DataError(path, "", f"expected an npz file of LPIPS weights, got {got}")
     field, weights = "", dict[str, Tensor]()
     try:
         with zipfile.ZipFile(path) as archive:
