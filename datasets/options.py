@@ -2,17 +2,18 @@
 
 import math
 from numbers import Integral, Real
+from typing import Any
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
-def check_options(downscale: object, hold_out: object, background: str = "black", points: str = "none") -> None:
+def check_options(downscale: Any, hold_out: Any, background: str = "black", points: str = "none") -> None:
     """Raise a ValueError for an argument of `load_scene` that no scene has a use for."""
     for name, value, known in (("background", background, BACKGROUNDS), ("points", points, ("none", "model-points"))):
         if value not in known:
             raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
-    if downscale is not None and not (isinstance(downscale, Real) and 1 <= downscale < math.inf):
+    real, whole = isinstance(downscale, Real), isinstance(hold_out, Integral) and not isinstance(hold_out, bool)
+    if downscale is not None and not (real and 1 <= downscale < math.inf):
         raise ValueError(f"downscale: expected None or a number of at least 1, got {downscale!r}")
-    whole = isinstance(hold_out, Integral) and not isinstance(hold_out, bool) and (hold_out == 0 or hold_out >= 2)
-    if hold_out is not None and not whole:
+    if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
         raise ValueError(f"hold_out: expected None, 0 or a whole number of at least 2, got {hold_out!r}")

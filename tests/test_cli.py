@@ -268,6 +268,28 @@ def test_each_help_page_has_two_examples_that_parse(command, capsys):
         tyro.cli(functools.partial(parse, **defaults(options)), args=options)
 
 
+def test_the_help_of_a_fit_is_short_and_its_last_line_names_the_long_one(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    said = {}
+    for words in (["--help"], ["--preset", "paper", "-h"], ["--help-all"], ["--preset", "paper", "--help-all"]):
+        assert run("fit", *words) == 0
+        said[" ".join(words)] = capsys.readouterr().out
+    short, whole = said["--help"], said["--help-all"]
+    assert len(short.splitlines()) <= 60
+    assert max(map(len, short.splitlines())) <= 80
+    assert short.splitlines()[-1] == "kgs fit --help-all shows all options"
+    names = set(re.findall(r"--[a-z][a-z.-]+", short)) - {"--help", "--help-all"}
+    assert names >= {"--out", "--views", "--size", "--preset", "--resume", "--steps", "--drop", "--device"}
+    assert not {name for name in names if "recipe" in name} | names & {"--coarse", "--growth", "--max-bytes"}
+    assert {"--recipe.lr-means", "--coarse", "--downscale", "--lpips-weights", *names} <= set(
+        re.findall(r"--[a-z][a-z.-]+", whole)
+    )
+    assert "(default: 3)" in said["--preset paper --help-all"]  # of --sh-degree
+    hidden = ["--recipe.near-plane", "0.1", "--coarse", "2"]  # both are read
+    assert run("fit", folder, "-o", tmp_path / "out", *hidden) == 2
+    assert "--coarse: expected" in one_line(capsys)
+
+
 @pytest.mark.parametrize("words", [[], ["--help"], ["bench"], ["bench", "--help"]])
 def test_help_without_a_command(words, capsys):
     assert run(*words) == 0

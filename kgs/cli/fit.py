@@ -67,9 +67,9 @@ def fit(
         downscale: reduce the photos by this factor instead.
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
-            counts scaled. plain: the same without dropping. Each sets the defaults below, see --preset paper --help.
+            counts scaled. plain: the same without dropping. Each sets other defaults, see --preset paper --help-all.
         detail: low: 378 pixels, half the steps, a third of them on small images. high: 1000 pixels, four times the
-            initial points, half the steps on small images. Other options win; --detail high --help shows the numbers.
+            initial points, half the steps on small images. Other options win; --detail high --help-all has all numbers.
         resume: continue from the checkpoint in the output folder.
         photos: photos beside their renders on the page; without them it is small, and can be shown where they must not.
         roll: turn the pictures of page and film clockwise by this angle in degrees, where photos lie on their side.

@@ -179,7 +179,7 @@ def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
 def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None:
     """Suggest a folder for the results where the command needs one and got everything but that."""
     out = inspect.signature(command).parameters.get("out")
-    is_given = any(word in ("-o", "--out", "-h", "--help") or word.startswith("--out=") for word in words)
+    is_given = any(word in ("-o", "--out", "-h", "--help", "--help-all") or word.startswith("--out=") for word in words)
     is_needed = out is not None and out.kind is out.KEYWORD_ONLY and out.default is out.empty
     if is_given or not is_needed or not words or words[0].startswith("-"):
         return
@@ -192,9 +192,17 @@ def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: d
     """Read the options; returns the call that they ask for, once its input paths are there."""
     import tyro
 
-    from .options import EXISTS
+    from .options import EXISTS, has_short_help, short
 
     _check_out(command, prog, words)
+    if "--help-all" in words:
+        words = ["--help" if word == "--help-all" else word for word in words]
+    elif has_short_help(command) and {"-h", "--help"} & {*words}:
+        try:
+            markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+            tyro.cli(short(command, defaults["config"]), prog=prog, args=["--help"], config=markers)
+        finally:
+            say(f"{prog} --help-all shows all options")
 
     @wraps(command)
     def bind(*arguments: Any, **options: Any) -> partial[Any]:
