@@ -324,6 +324,41 @@ def test_a_missing_extra_is_one_line_before_any_work(folder, tmp_path, package, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("package", "project"), [("pycolmap", "pycolmap (of the extra sfm)"), ("jinja2", "jinja2 (of the extra app)")]
+)
+def test_a_package_that_cannot_be_loaded_is_one_line(tmp_path, package, project, capsys, monkeypatch):
+    """As a shared library that it lacks leaves it."""
+    home, photos = tmp_path / "broken" / package, tmp_path / "photos"
+    home.mkdir(parents=True)
+    (home / "__init__.py").write_text("from .core import x")
+    (home / "core.py").write_text("raise ImportError('libx.so.1: cannot open shared object file\\nSee the manual.')")
+    photos.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(photos / f"{i}.png"), np.full((20, 20, 3), i, np.uint8))
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(home.parent)
+    monkeypatch.setattr("importlib.metadata.packages_distributions", dict)
+    assert run("fit", photos, "-o", tmp_path / "out") == 2
+    said = f"{package} is installed, but cannot be loaded (libx.so.1: cannot open shared object file): run pip install"
+    assert one_line(capsys) == f"kgs: {said} --force-reinstall {project}"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_large_package_that_cannot_be_loaded(monkeypatch):
+    def broken(name):
+        raise OSError("libcudart.so.12: cannot open shared object file")  # torch loads its libraries itself
+
+    monkeypatch.setattr(cli.run, "import_module", broken)
+    with pytest.raises(ImportError, match="libcudart") as caught:
+        cli.run._import("torch")
+    assert "torch is installed, but cannot be loaded (libcudart" in cli.run._of_a_broken_package(caught.value)
+    cli.run._import("numba")  # torch may do in its place
+    with pytest.raises(ImportError, match="of ours"):
+        cli.run._of_a_broken_package(ImportError("of ours", name="kgs.errors"))
+
+
 def test_all_photos_can_be_trained_on(folder, tmp_path, capsys):
     assert run("fit", folder, "-o", tmp_path, "--hold-out", 0, "--steps", 6, *FIT) == 0
     assert "no photo was held out" in capsys.readouterr().out

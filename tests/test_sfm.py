@@ -4,6 +4,7 @@ import json
 import shutil
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from photo_folders import NAMES, close, planes, poses, write_photos, write_plane
 from kgs.datasets import load_scene
 from kgs.errors import DataError
 from kgs.sfm import pose_photos
+from kgs.sfm.write import write_model
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -73,6 +75,24 @@ def test_points_project_to_where_the_photos_show_them(posed):
             errors.append(np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy))
     assert np.mean(errors) == pytest.approx(report["reprojection_error_px"], rel=0.05)  # COLMAP's is over points
     assert np.median(errors) < 0.5
+
+
+def test_a_model_that_was_not_written_whole_is_an_error(posed, tmp_path):
+    """COLMAP's writers do not look whether the disk took what they wrote."""
+    found = pycolmap.Reconstruction(posed[1] / "sparse" / "0")
+
+    class OnAFullDisk:
+        def write_binary(self, folder):
+            found.write_binary(folder)
+            data = (folder / cut).read_bytes()
+            (folder / cut).write_bytes(data[: len(data) // 2])
+
+        def extract_colors_for_all_images(self, images):
+            """They are there."""
+
+    for cut in ("points3D.bin", "images.bin", "cameras.bin"):
+        with pytest.raises(OSError, match="was not written whole"):
+            write_model(tmp_path / cut, SimpleNamespace(reconstruction=OnAFullDisk()), posed[1] / "images")
 
 
 def test_up_is_minus_y_and_the_median_depth_is_one(posed):

@@ -1,5 +1,8 @@
 """What a user's folder may hold instead of photos that fit together: what happened, and what to do, is said."""
 
+import os
+import signal
+import subprocess
 import sys
 
 import cv2
@@ -7,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from init_point_scenes import texture
+from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
 from kgs.cli import main
@@ -288,10 +292,13 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
     assert placed() == (3, 3)
 
 
+NOT_FOUND = "kgs: stopped: the cameras were not found yet, and nothing was written\n"
+
+
 @pytest.mark.parametrize("stage", ["pose.write_images", "pose.write_matches"])
 @pytest.mark.parametrize(
     ("error", "code", "said"),
-    [(OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, "")],
+    [(OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, NOT_FOUND)],
 )
 def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refused, stage, error, code, said):
     def fail(*arguments):
@@ -300,3 +307,30 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
     monkeypatch.setattr(f"kgs.sfm.{stage}", fail)
     refused(write_planes(folder), said, code=code)
     assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
+
+
+@pytest.mark.parametrize("size", [250_000, pytest.param(600_000, marks=pytest.mark.slow)])
+def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
+    """The first of two, in this process; and the second, in another one that it aborts."""
+    with limited(size):
+        said = refused(write_planes(folder), code=1).splitlines()
+    assert said[-1].removesuffix("/work: File too large").removesuffix(": File too large") == (
+        f"kgs: {folder.parent}/out/unfinished-photos"
+    )
+    assert all(" of 3 " in line for line in said[:-1])  # how far the work was
+    assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
+    save(folder, [cv2.resize(image, (1600, 1200)) for image in planes()])
+    command = [sys.executable, "-c", "import kgs.cli; kgs.cli.main()", "fit", str(folder), "-o", str(tmp_path / "out")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        lines = iter(process.stderr.readline, "")
+        assert any(line.startswith("keypoints: ") for line in lines)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        assert process.wait(20) == 130
+        said = list(lines)
+    assert said[-1] == NOT_FOUND
+    assert not [line for line in said[:-1] if " of 3 " not in line]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]

@@ -88,7 +88,7 @@ def fit(
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import write_own_page
 
-    from .unposed import find_scene, is_unposed, settle
+    from .unposed import find_scene, is_unposed, on_ctrl_c, settle
 
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
@@ -114,7 +114,8 @@ def fit(
         raise ValueError(f"{shrunk_by}: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
-    metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)
+    with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
+        metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)
     kept = bool(stopped_by) and is_finished(out)  # the former fit
     if unposed and not kept:
         settle(out)

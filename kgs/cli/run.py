@@ -4,9 +4,9 @@ import difflib
 import errno
 import inspect
 import sys
+import traceback
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import fields
 from functools import partial, wraps
 from importlib import import_module
@@ -64,14 +64,15 @@ def exit_code(words: list[str]) -> int:
         call = _parse(command, f"kgs {name}", words, defaults(words))
         _check(name, call)
         for module in _HEAVY:
-            with suppress(ImportError):  # numba may be missing; the command says what it needs
-                import_module(module)
+            _import(module)
         interrupt_as_usual()
         return int(call() or 0)
     except SystemExit as stop:
         message, code = (stop.code, 2) if isinstance(stop.code, str) else ("", stop.code or 0)
     except ModuleNotFoundError as error:
         message = _of_a_missing_package(error)
+    except ImportError as error:
+        message = _of_a_broken_package(error)
     except DataError as error:
         message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
     except ValueError as error:
@@ -88,8 +89,8 @@ def exit_code(words: list[str]) -> int:
         if not isinstance(error, MemoryError) and not any(cause in str(error) for cause in ("allocate", "of memory")):
             raise
         message, code = f"not enough memory: {error}".partition("\n")[0], 1
-    except KeyboardInterrupt:
-        code = 130
+    except KeyboardInterrupt as stop:
+        message, code = f"stopped{str(stop) and ': '}{stop}", 130
     finally:
         interrupt_as_usual()
     if message:
@@ -105,6 +106,34 @@ def _of_a_missing_package(error: ModuleNotFoundError) -> str:
     return (
         f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '
         f'or pip install "kgs-splat[{extra}]" where an index has it'
+    )
+
+
+def _import(module: str) -> None:
+    """Import a large package ahead; a missing one the command tells, and a broken one unless it can do without it."""
+    try:
+        import_module(module)
+    except ModuleNotFoundError:
+        pass
+    except (ImportError, OSError) as error:  # torch loads its libraries itself
+        if module != "numba":
+            raise ImportError(str(error), name=module) from error
+
+
+def _of_a_broken_package(error: ImportError) -> str:
+    """Of one that is there and cannot be imported: a shared library that it lacks, a NumPy that does not fit it."""
+    names = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    tops = [name.partition(".")[0] for name in [error.name or "", *names]]
+    package = next((top for top in tops if top not in ("", "kgs", *sys.stdlib_module_names)), "")
+    if not package:  # a mistake in kgs
+        raise error
+    from importlib.metadata import packages_distributions
+
+    project = packages_distributions().get(package, [package])[0]
+    reason = printable(str(error).strip().partition("\n")[0].rstrip("."))
+    return (
+        f"{package} is installed, but cannot be loaded ({reason}): run pip install --force-reinstall {project} "
+        f"(of the extra {_EXTRAS.get(package, 'app')})"
     )
 
 

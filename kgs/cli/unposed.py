@@ -1,5 +1,7 @@
 """`kgs fit` of unposed photos: their cameras first, and then a scene like any other, in the folder of the results."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,8 @@ def find_scene(
     """
     from kgs.sfm import pose_photos
 
-    report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
+    with on_ctrl_c("the cameras were not found yet, and nothing was written"):
+        report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
     kept = max(report["size"])
     wanted = kept if size is None else size
     if request["downscale"] is not None:
@@ -44,6 +47,15 @@ def find_scene(
         say(f"the photos are fitted at {kept} pixels, the size at which kgs keeps them")
     request = request | {"hold_out": request["hold_out"] or 0, "scene": ".", "title": photos.resolve().name}
     return request | {"downscale": max(1.0, kept / wanted)}, Path(report["folder"])
+
+
+@contextmanager
+def on_ctrl_c(kept: str) -> Iterator[None]:
+    """Have Ctrl-C say what is left of the work."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(kept) from stop
 
 
 def settle(out: Path) -> None:

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .aside import check_space
+
 FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
-_PEAK_FACTOR = 0.25  # of COLMAP's contrast threshold for keypoints
 _MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
-_LONGEST = 1000  # pixels; COLMAP's keypoints of photos reduced to this are as good, and take a minute less
 _FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
 _FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one places no pair
 _ROUNDS = 5  # at most, each of placing photos with the lens held and then adjusting it
@@ -65,25 +65,12 @@ def quiet_pycolmap() -> Iterator[Any]:
         pycolmap.logging.minloglevel = level
 
 
-def verify(database: Path, seed: int, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
-    """Verify the matches of each pair: keep those that one motion of the camera explains.
-
-    Args:
-        database: with matches.
-        seed: of RANSAC.
-        names: the photos' names by those of the images in the database.
-
-    Returns:
-        The number of verified matches by the names of the pair, for every pair.
-    """
-    with quiet_pycolmap() as pycolmap:
-        verifier = pycolmap.GeometricVerifierOptions()
-        verifier.num_threads = 1
-        pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_view_options(pycolmap, seed))
-        with pycolmap.Database.open(database) as file:
-            images = {image.image_id: names[image.name] for image in file.read_all_images()}
-            pairs = list(combinations(sorted(images), 2))
-            return {(images[i], images[j]): len(_inliers(file, i, j)) for i, j in pairs}
+def verified(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
+    """How many matches of every pair are verified, by the names that `names` gives the images of a database."""
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
+        images = {image.image_id: names[image.name] for image in file.read_all_images()}
+        pairs = list(combinations(sorted(images), 2))
+        return {(images[i], images[j]): len(_inliers(file, i, j)) for i, j in pairs}
 
 
 def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], PairGeometry]:
@@ -100,39 +87,6 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
                 shift = float(np.median(np.linalg.norm(first - second, axis=1)))
                 found[images[i], images[j]] = PairGeometry(shift, 0.0 if planar is None else float(np.mean(planar)))
     return found
-
-
-def write_colmap_matches(database: Path, images: Path, names: list[str], lens: Any, seed: int) -> None:
-    """Make a second database of the same photos, with COLMAP's own keypoints and matches, verified.
-
-    Args:
-        database: the file to write.
-        images: the folder of the photos.
-        names: the names of their files there.
-        lens: a first guess of their lens, a camera of pycolmap.
-        seed: of the verification.
-    """
-    with quiet_pycolmap() as pycolmap:
-        reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-        reader.camera_model = "SIMPLE_RADIAL"
-        if lens.has_prior_focal_length:
-            reader.camera_params = lens.params_to_string()
-        extraction.num_threads, extraction.use_gpu, extraction.max_image_size = 1, False, _LONGEST
-        extraction.sift.peak_threshold *= _PEAK_FACTOR
-        matching = pycolmap.FeatureMatchingOptions()
-        matching.num_threads, matching.use_gpu = 1, False
-        cpu, one = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
-        pycolmap.extract_features(
-            database,
-            images,
-            image_names=names,
-            camera_mode=one,
-            reader_options=reader,
-            extraction_options=extraction,
-            device=cpu,
-        )
-        rules = {"matching_options": matching, "verification_options": _two_view_options(pycolmap, seed)}
-        pycolmap.match_exhaustive(database, **rules, device=cpu)
 
 
 def solve(
@@ -214,6 +168,7 @@ def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options
     try:
         found = pycolmap.incremental_mapping(database, images, work, options)
     except (RuntimeError, ValueError):  # the mapper gives up
+        check_space(database.parent)
         return None
     return max(found.values(), key=lambda scene: scene.num_reg_images()) if found else None
 
@@ -276,12 +231,6 @@ def _focal_rise(reconstruction: Any, error: float) -> float:
 def lens_of_scene(reconstruction: Any) -> Any:
     """The one camera, with params focal length, centre (x, y) and radial distortion."""
     return next(iter(reconstruction.cameras.values()))
-
-
-def _two_view_options(pycolmap: Any, seed: int) -> Any:
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed, options.detect_watermark = seed, False
-    return options
 
 
 def _inliers(file: Any, i: int, j: int) -> NDArray[np.int64]:

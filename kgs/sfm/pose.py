@@ -21,6 +21,7 @@ from kgs.io.outputs import png_names
 from kgs.io.results_folder import locked
 from kgs.machine import versions
 
+from .aside import Aside, check_space
 from .find import find_photos
 from .gates import (
     FEWEST_POINTS,
@@ -33,7 +34,7 @@ from .gates import (
     judge,
     why_no_cameras,
 )
-from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verify, write_colmap_matches
+from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verified
 from .match import exif_focal, lens_of, write_matches
 from .place import IMAGES, MODEL, REPORT, check_place, is_reusable, photo_staging
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
@@ -131,7 +132,7 @@ def find_cameras(
     work, images = new / "work", new / IMAGES
     for path in (images, work):
         path.mkdir(parents=True)
-    with _one_thread():
+    with _one_thread(), _full_disk_told(new):
         photos = read_photos(opened, stage)
         unsharp = [photo.path.name for photo in blurred(photos)]
         if unsharp:
@@ -141,10 +142,14 @@ def find_cameras(
         write_images(images, photos, image_names)
         seconds["photos"] = lap()
         first, second = work / "first.db", work / "second.db"
-        with quiet_pycolmap(), ThreadPoolExecutor(1) as executor:
-            second_matches = executor.submit(write_colmap_matches, second, images, image_names, lens_of(photos), seed)
+        with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
+            of_second: dict[str, Any] = {"images": str(images), "names": image_names, "seed": seed}
+            lens = lens_of(photos)
+            of_second["lens"] = lens.params_to_string() if lens.has_prior_focal_length else None
+            second_matches = executor.submit(aside.run, "write_colmap_matches", second, **of_second)
             write_matches(first, photos, image_names, stage)
-            pairs = verify(first, seed, photo_names)
+            aside.run("verify", first, seed=seed)
+            pairs = verified(first, photo_names)
             seconds["matches"] = lap()
             if reason := why_no_cameras(names, pairs, pair_geometries(first, photo_names)):
                 raise DataError(folder, "", reason)
@@ -226,6 +231,16 @@ def _clock() -> Callable[[], float]:
         return round(last - before, 2)
 
     return lap
+
+
+@contextmanager
+def _full_disk_told(folder: Path) -> Iterator[None]:
+    """Raise an OSError where pycolmap failed because a disk is full: it does not say so."""
+    try:
+        yield
+    except RuntimeError:
+        check_space(folder)
+        raise
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Photos and cameras as files, as COLMAP has them: PNGs, and a binary model that is upright and scaled."""
 
+import errno
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
+from kgs.errors import DataError
 from kgs.io.outputs import write_png
 
+from .aside import check_space
 from .map import Cameras, quiet_pycolmap
 from .read import Photo
 
@@ -37,10 +41,16 @@ def level_and_scale(cameras: Cameras) -> None:
 
 
 def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
-    """Write cameras, images and points with tracks and colours, as COLMAP's binary files."""
+    """Write cameras, images and points with tracks and colours, as COLMAP's binary files; an OSError unless whole."""
     folder.mkdir(parents=True)
     cameras.reconstruction.extract_colors_for_all_images(images)
     cameras.reconstruction.write_binary(folder)
+    try:  # COLMAP does not look whether all was written
+        read_cameras(folder / "cameras.bin")
+        read_points(folder / "points3D.bin", set(read_images(folder / "images.bin")))
+    except DataError as error:
+        check_space(folder)
+        raise OSError(errno.EIO, "COLMAP's model was not written whole", str(folder)) from error
 
 
 def _depths(scene: Any, image: Any) -> NDArray[np.float64]:

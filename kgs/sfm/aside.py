@@ -1,0 +1,173 @@
+"""Steps of pycolmap that write a database, each in a process of its own.
+
+What one of pycolmap's threads raises, on a full disk for one, aborts the process that it is in; and Ctrl-C would wait
+until such a step is done. This file is what the process runs: it imports nothing of kgs.
+"""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+_PEAK_FACTOR = 0.25  # of COLMAP's contrast threshold for keypoints
+_LONGEST = 1000  # pixels; COLMAP's keypoints of photos reduced to this are as good, and take a minute less
+_PROBE = 4 * 2**20  # bytes that are written to see whether a disk is full
+
+
+class Aside:
+    """Runs steps, from any thread, until the block ends; those that are at work then are ended."""
+
+    def __init__(self) -> None:
+        self._lock, self._at_work, self._is_open = threading.Lock(), set[subprocess.Popen[str]](), True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        with self._lock:
+            self._is_open = False
+            for process in self._at_work:
+                process.kill()
+
+    def run(self, step: str, database: Path, **arguments: Any) -> None:
+        """Run one of the functions below by its name, without the underscore, and wait for it.
+
+        Args:
+            step: the name.
+            database: the file that it writes.
+            arguments: what else it takes; JSON has to know them.
+
+        Raises:
+            OSError: the disk is full.
+            MemoryError: the system ended the process, as a rule because memory was short.
+            RuntimeError: pycolmap failed for another reason.
+        """
+        request = json.dumps({"path": sys.path, "step": step, "database": str(database), "arguments": arguments})
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        with subprocess.Popen([sys.executable, "-P", __file__], text=True, errors="replace", **pipes) as process:
+            with self._lock:
+                self._at_work.add(process)
+                if not self._is_open:
+                    process.kill()
+            try:
+                with suppress(BrokenPipeError):  # it was ended
+                    print(request, file=process.stdin, flush=True)  # the pipe stays open as long as this process lives
+                said = process.stderr.read() if process.stderr else ""
+                code = process.wait()
+            finally:
+                process.kill()
+                with self._lock:
+                    self._at_work.discard(process)
+        if code:
+            raise _failure(code, said, database)
+
+
+def check_space(folder: Path) -> None:
+    """Raise an OSError about a folder that nothing can be written to any more: some MiB are, and removed."""
+    probe = folder / "probe"
+    try:
+        with open(probe, "wb") as file:
+            file.write(bytes(_PROBE))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+def _failure(code: int, said: str, database: Path) -> Exception:
+    """The error that says why a step failed: by its exit code, and by what it wrote to stderr."""
+    try:
+        check_space(database.parent)
+    except OSError as error:
+        return error
+    if "disk is full" in said:  # and has room again
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(database.parent))
+    if code == -getattr(signal, "SIGKILL", 0):
+        return MemoryError("the matching of photos was ended by the system")
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    reason = next((line.partition(":")[2].strip() for line in lines if line.startswith("what():")), "")
+    return RuntimeError(f"pycolmap: {reason or (lines or [f'exit code {code}'])[-1]}")
+
+
+def _write_colmap_matches(
+    pycolmap: Any, database: str, images: str, names: list[str], lens: str | None, seed: int
+) -> None:
+    """COLMAP's own keypoints and matches of photos, verified; the rest of their lens stands in their files.
+
+    Args:
+        pycolmap: the module.
+        database: the file to write.
+        images: the folder of the photos.
+        names: of the photos in it.
+        lens: the parameters of their SIMPLE_RADIAL lens, where they are known.
+        seed: of the verification.
+    """
+    reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader.camera_model = "SIMPLE_RADIAL"
+    if lens is not None:
+        reader.camera_params = lens
+    extraction.num_threads, extraction.use_gpu, extraction.max_image_size = 1, False, _LONGEST
+    extraction.sift.peak_threshold *= _PEAK_FACTOR
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads, matching.use_gpu = 1, False
+    cpu, one = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=names,
+        camera_mode=one,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=cpu,
+    )
+    rules = {"matching_options": matching, "verification_options": _two_view_options(pycolmap, seed)}
+    pycolmap.match_exhaustive(database, **rules, device=cpu)
+
+
+def _verify(pycolmap: Any, database: str, seed: int) -> None:
+    """Those matches of each pair that one motion of the camera explains."""
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = 1
+    pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_view_options(pycolmap, seed))
+
+
+def _two_view_options(pycolmap: Any, seed: int) -> Any:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed, options.detect_watermark = seed, False
+    return options
+
+
+def _end_with_the_parent() -> None:
+    while sys.stdin.readline():
+        pass
+    os._exit(1)
+
+
+def _main() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent ends this one
+    with suppress(ImportError, ValueError, OSError):
+        import resource  # of POSIX alone
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    request = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+    sys.path[:] = request["path"]
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    steps: dict[str, Callable[..., None]] = {"write_colmap_matches": _write_colmap_matches, "verify": _verify}
+    steps[request["step"]](pycolmap, request["database"], **request["arguments"])
+
+
+if __name__ == "__main__":
+    _main()
