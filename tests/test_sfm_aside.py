@@ -28,7 +28,7 @@ def own_matches(tmp_path):
 
 def test_a_full_disk_is_an_error_and_not_the_end(tmp_path, own_matches):
     with Aside() as steps, limited(400_000), pytest.raises(OSError, match=str(tmp_path)) as caught:
-        steps.run("write_own_matches", tmp_path / "second.db", **own_matches)
+        steps.run("write_colmap_matches", tmp_path / "second.db", **own_matches)
     assert caught.value.errno == errno.EFBIG
     assert not (tmp_path / "probe").exists()
     check_space(tmp_path)
@@ -37,7 +37,7 @@ def test_a_full_disk_is_an_error_and_not_the_end(tmp_path, own_matches):
 
 def test_another_failure_says_what_pycolmap_said(tmp_path, own_matches):
     with Aside() as steps, pytest.raises(RuntimeError, match=r"pycolmap: .*nowhere"):
-        steps.run("write_own_matches", tmp_path / "second.db", **own_matches | {"images": str(tmp_path / "nowhere")})
+        steps.run("write_colmap_matches", tmp_path / "second.db", **own_matches | {"images": str(tmp_path / "nowhere")})
 
 
 def test_what_pycolmap_says_of_a_disk_that_has_room_again(tmp_path):
@@ -52,7 +52,7 @@ def test_steps_end_with_the_block(tmp_path, own_matches):
     """As at Ctrl-C: a step in another thread is not waited for."""
     with ThreadPoolExecutor(1) as beside:
         with Aside() as steps:
-            step = beside.submit(steps.run, "write_own_matches", tmp_path / "second.db", **own_matches)
+            step = beside.submit(steps.run, "write_colmap_matches", tmp_path / "second.db", **own_matches)
             while not steps._at_work:
                 time.sleep(0.01)
         with pytest.raises(MemoryError):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from init_point_scenes import texture
+from init_point_scenes import cameras, texture
 from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
@@ -31,10 +31,10 @@ pytest.importorskip("pycolmap")
 def refused(capsys):
     """Runs `kgs fit` on a folder that is refused; the message. Nothing half-made is left behind."""
 
-    def run(folder, *parts, out=None, code=2, kept=False):
+    def run(folder, *parts, out=None, code=2, kept=False, options=()):
         place = out or folder.parent / "out"
         with pytest.raises(SystemExit) as stop:
-            main(["fit", str(folder), "-o", str(place)])
+            main(["fit", str(folder), "-o", str(place), *options])
         assert stop.value.code == code
         assert kept or not [path.name for path in place.glob("*photos*")]
         text = capsys.readouterr().err
@@ -164,6 +164,20 @@ def test_a_camera_that_only_turned(folder, refused):
 def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
     message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
     refused(write_photos(tmp_path / "photos", close(0.5)), *message)
+
+
+@pytest.mark.slow
+def test_walking_forward(tmp_path, refused):
+    images = planes(cameras(np.array([[0.02, 0.0, -0.2], [0.0, 0.02, 0.0], [-0.02, 0.0, 0.2]]), 0.01))
+    text = refused(write_photos(tmp_path / "photos", images), "step sideways, not forward", "Matches of each pair")
+    assert "places between" not in text
+
+
+def test_photos_that_would_be_shrunk_to_nothing(folder, refused):
+    """Told before their cameras are found."""
+    save(folder, [cv2.resize(image, (640, 480)) for image in planes()])
+    said = refused(folder, options=("--downscale", "40"))
+    assert said == "kgs: --downscale: expected 32 pixels or more of the longer side, got 16x12 of 640x480\n"
 
 
 def test_a_blurred_photo_is_told(folder):

@@ -1,11 +1,23 @@
 """What is not believed of a solver's cameras, and what is said of it."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
 from kgs.errors import DataError
-from kgs.sfm.gates import disagreement, groups_of, judge, objections, table, weakest_link, why_no_cameras
+from kgs.sfm import map as mapping
+from kgs.sfm.gates import (
+    disagreement,
+    groups_of,
+    is_forward,
+    judge,
+    objections,
+    table,
+    weakest_link,
+    why_no_cameras,
+)
 from kgs.sfm.map import Cameras, PairGeometry
 
 NAMES = ["a", "b", "c"]
@@ -102,3 +114,47 @@ def test_photos_that_can_give_no_cameras():
     assert "remove one of them" in said
     assert "watermark" in said  # matches at the same pixels can be those of what is printed on the photos
     assert "no two of the 3" in why_no_cameras(NAMES, dict.fromkeys(PAIRS, 0), {})
+
+
+@pytest.mark.parametrize(
+    ("step", "turn", "expected"),
+    [
+        ((0.0, 0.0, 0.5), 0.0, True),
+        ((0.0, 0.0, -0.5), 0.0, True),  # backward
+        ((0.05, -0.03, 0.5), 0.1, True),  # by hand, with a turn
+        ((0.5, 0.0, 0.0), 0.0, False),
+        ((0.0, 0.4, 0.1), -0.1, False),
+        ((0.5, 0.0, 0.5), 0.05, False),  # slanting: a good step
+    ],
+)
+def test_a_camera_that_moves_along_its_view(step, turn, expected):
+    """Points before two cameras of 90 degrees, with half a pixel of noise."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-3, -2, 3), (3, 2, 9), (400, 3))
+    moved = (points - step) @ cv2.Rodrigues(np.array([0.0, turn, 0.0]))[0].T
+    first, second = (400 * p[:, :2] / p[:, 2:] + (400, 300) + rng.normal(0, 0.5, (400, 2)) for p in (points, moved))
+    assert mapping._is_forward(first, second, SimpleNamespace(width=800, height=600)) is expected
+
+
+def test_no_camera_moves_along_its_view_where_nothing_matches():
+    rng = np.random.default_rng(0)
+    lens = SimpleNamespace(width=800, height=600)
+    for count in (30, 200):
+        first, second = rng.uniform(0, 600, (2, count, 2))
+        assert not mapping._is_forward(first, second, lens)
+    assert not mapping._is_forward(first, first, lens)  # one photo twice
+    assert not mapping._is_forward(first[:, :1] * (1, 0), first[:, :1] * (1, 0), lens)  # on one line
+
+
+def test_what_is_said_of_a_camera_that_went_forward(tmp_path):
+    forward, aside, flat = (PairGeometry(30.0, p, f) for p, f in ((0.5, True), (0.5, False), (0.99, False)))
+    assert is_forward({("a", "b"): forward, ("b", "c"): forward, ("a", "c"): flat})
+    for pairs in ({("a", "b"): forward, ("b", "c"): aside}, {("a", "b"): flat}, {}):
+        assert not is_forward(pairs)
+    alone, turned = [cameras(), None], [cameras(), cameras(turn=3.0)]
+    for found in ([cameras(focal=3001)] * 2, [cameras(rise=0.0)] * 2, turned, alone):
+        with pytest.raises(DataError, match="step sideways, not forward") as caught:
+            judge(tmp_path, found, NAMES, 1000, PAIRS, forward=True)
+        assert "places between" not in str(caught.value)
+        assert "Matches of each pair" in str(caught.value)
+    assert judge(tmp_path, [cameras()] * 2, NAMES, 1000, PAIRS, forward=True)[1] == 0  # good cameras are good

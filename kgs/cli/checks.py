@@ -191,6 +191,5 @@ def _check_photos(folder: Path, out: Path, views: int | None, hold_out: int | No
 
         width, height = min(read_size(path) for path in paths)
         if max(width, height) / downscale < SMALLEST:
-            shrunk = f"{max(1, round(width / downscale))}x{max(1, round(height / downscale))}"
-            reason = f"{SMALLEST} pixels must be left of the longer side, got photos of {shrunk} by {downscale:g}"
-            raise ValueError(f"downscale: {reason}")
+            shrunk = f"{max(1, round(width / downscale))}x{max(1, round(height / downscale))} of {width}x{height}"
+            raise ValueError(f"downscale: expected {SMALLEST} pixels or more of the longer side, got {shrunk}")

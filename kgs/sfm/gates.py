@@ -24,6 +24,11 @@ LEAST_RISE = 0.03  # relative growth of the squared errors if the focal length i
 _SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
 _WITHOUT = "A fit without some photos: take them out of the folder"
+_FORWARD = (
+    "The camera moved along its view, as when walking forward: what lies ahead hardly moves between such photos, and "
+    "nothing tells how far away it is. What helps most: step sideways, not forward, so that neighbours are 3 to 20 "
+    "degrees apart"
+)
 Pairs = Mapping[tuple[str, str], int]  # verified matches of each pair
 
 
@@ -78,31 +83,32 @@ def focal_difference(found: Sequence[Cameras]) -> str:
 
 
 def judge(
-    folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs
+    folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs, *, forward: bool = False
 ) -> tuple[Cameras, float]:
     """The cameras that pass the gates, and the solvers' largest difference in degrees; a DataError if none pass.
 
-    If both pass, those whose worst photo sees more points are taken.
+    If both pass, those whose worst photo sees more points are taken. `forward`: whether the camera moved along its
+    view, which is what a refusal then speaks of.
     """
     reasons = [objections(cameras, names, longest) for cameras in found]
     good = [cameras for cameras, against in zip(found, reasons, strict=True) if cameras and not against]
     if not good:
-        raise DataError(folder, "", refusal(reasons[0], names, pairs))
+        raise DataError(folder, "", refusal(reasons[0], names, pairs, forward))
     for cameras in found:  # nothing confirms a photo that only one solver placed
         if missing := [name for name in names if cameras is None or name not in cameras.points]:
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
-            raise DataError(folder, "", refusal([reason], names, pairs))
+            raise DataError(folder, "", refusal([reason], names, pairs, forward))
     both = [cameras for cameras in found if cameras]
     if doubt := focal_doubt(both):
-        raise DataError(folder, "", focal_refusal(doubt, names, pairs))
+        raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
     degrees, pair = disagreement(*both)
     if degrees > MOST_DEGREES:
         reason = (
             f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
         )
-        raise DataError(folder, "", refusal([reason], names, pairs))
+        raise DataError(folder, "", refusal([reason], names, pairs, forward))
     if doubt := focal_difference(both):
-        raise DataError(folder, "", focal_refusal(doubt, names, pairs))
+        raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
     sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE] or good
     return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
 
@@ -168,8 +174,17 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
     return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
 
 
-def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
-    """The error message if neither the photos nor their Exif determine the focal length; `doubt` says why."""
+def is_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:
+    """Whether the camera moved along its view, as far as pairs tell: that one plane explains tells nothing of it."""
+    telling = [geometry for geometry in geometries.values() if geometry.planar < _PLANAR]
+    return bool(telling) and all(geometry.forward for geometry in telling)
+
+
+def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs, forward: bool = False) -> str:
+    """What to say of photos of which neither they nor their Exif tell the focal length; `doubt` says why."""
+    if forward:
+        reason = f"the photos do not tell the focal length, and their Exif does not say it: {doubt}"
+        return f"no cameras that can be trusted: {reason}. {_FORWARD}.\n{table(names, pairs)}"
     return (
         "no cameras that can be trusted: the photos do not tell the focal length, as a rule because they are close "
         f"together, and their Exif does not say it: {doubt}, and the depth of the scene is as unsure. What helps: "
@@ -178,8 +193,10 @@ def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs) -> str:
     )
 
 
-def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs) -> str:
-    """The error message for cameras that cannot be trusted: the reasons, and what to photograph next."""
+def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs, forward: bool = False) -> str:
+    """What to say of cameras that cannot be believed, and what to photograph next."""
+    if forward:
+        return f"no cameras that can be trusted: {'; '.join(reasons)}. {_FORWARD}. {_WITHOUT}.\n{table(names, pairs)}"
     between = " and ".join(weakest_link(names, pairs))
     return (
         f"no cameras that can be trusted: {'; '.join(reasons)}. What helps most: photos from places between {between}, "

@@ -28,6 +28,7 @@ _ROUNDS = 5  # at most, each of placing photos with the lens held and then adjus
 _CONVERGED = 0.01  # relative change of the focal length, and change of the distortion, at which rounds end
 _USUAL_DISTORTION = 0.05  # radial; larger ones have to explain much of the errors
 _DISTORTION_GAIN = 0.1  # share of the squared errors that a larger distortion has to explain
+_ONE_WAY = 0.9  # share of the matches that move away from where a camera goes, or towards it
 _WRONG_FOCAL = 1.25  # factor by which the focal length is made wrong to see whether points still fit
 
 
@@ -47,6 +48,7 @@ class PairGeometry(NamedTuple):
 
     shift: float  # median distance that they move between the photos, pixels
     planar: float  # share that one homography explains: 1 where the camera only turned, or saw one plane
+    forward: bool = False  # whether each photo shows the place of the other: the camera moved along its view
 
 
 @contextmanager
@@ -79,14 +81,33 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         images = {image.image_id: names[image.name] for image in file.read_all_images()}
         places = {i: file.read_keypoints(i)[:, :2] for i in images}
+        lens = file.read_all_cameras()[0]
         for i, j in combinations(sorted(images), 2):
             rows = _inliers(file, i, j)
             if len(rows) >= FEWEST_MATCHES:
                 first, second = places[i][rows[:, 0]], places[j][rows[:, 1]]
                 _, planar = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
                 shift = float(np.median(np.linalg.norm(first - second, axis=1)))
-                found[images[i], images[j]] = PairGeometry(shift, 0.0 if planar is None else float(np.mean(planar)))
+                share = 0.0 if planar is None else float(np.mean(planar))
+                found[images[i], images[j]] = PairGeometry(shift, share, _is_forward(first, second, lens))
     return found
+
+
+def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: Any) -> bool:
+    """Whether both photos show the place of the other's camera, and nearly all matches `(M, 2)` move away from it.
+
+    These places are the epipoles, of a matrix that few or wrong matches leave open: hence the second condition.
+    """
+    found, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, _MAX_ERROR, 0.999)
+    if found is None or found.shape != (3, 3):
+        return False
+    epipoles = np.array([np.linalg.svd(matrix)[2][-1] for matrix in (found, found.T)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = epipoles[:, :2] / epipoles[:, 2:]
+    if not bool(((places > 0) & (places < (lens.width, lens.height))).all()):
+        return False
+    away = np.linalg.norm(second - places[1], axis=1) > np.linalg.norm(first - places[0], axis=1)
+    return bool(abs(away.mean() - 0.5) > _ONE_WAY - 0.5)
 
 
 def solve(

@@ -31,6 +31,7 @@ from .gates import (
     MOST_RATIO,
     focal_difference,
     focal_doubt,
+    is_forward,
     judge,
     why_no_cameras,
 )
@@ -151,7 +152,8 @@ def find_cameras(
             aside.run("verify", first, seed=seed)
             pairs = verified(first, photo_names)
             seconds["matches"] = lap()
-            if reason := why_no_cameras(names, pairs, pair_geometries(first, photo_names)):
+            geometries = pair_geometries(first, photo_names)
+            if reason := why_no_cameras(names, pairs, geometries):
                 raise DataError(folder, "", reason)
 
             def solve_second() -> Cameras | None:
@@ -170,7 +172,7 @@ def find_cameras(
             say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
             found = [solve(matches, images, work / "held", seed, photo_names, held) for matches in (first, second)]
         seconds["second solver"] = lap()
-        chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs)
+        chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs, forward=is_forward(geometries))
         level_and_scale(chosen)
         write_model(new / MODEL, chosen, images)
         shutil.rmtree(work)
