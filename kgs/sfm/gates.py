@@ -175,13 +175,13 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
 
 
 def is_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:
-    """Whether the camera moved along its view, as far as pairs tell: that one plane explains tells nothing of it."""
+    """Whether the camera moved along its view in every pair that shows depth."""
     telling = [geometry for geometry in geometries.values() if geometry.planar < _PLANAR]
     return bool(telling) and all(geometry.forward for geometry in telling)
 
 
 def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs, forward: bool = False) -> str:
-    """What to say of photos of which neither they nor their Exif tell the focal length; `doubt` says why."""
+    """The error message if neither the photos nor their Exif determine the focal length; `doubt` says why."""
     if forward:
         reason = f"the photos do not tell the focal length, and their Exif does not say it: {doubt}"
         return f"no cameras that can be trusted: {reason}. {_FORWARD}.\n{table(names, pairs)}"
@@ -194,7 +194,7 @@ def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs, forward: bool 
 
 
 def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs, forward: bool = False) -> str:
-    """What to say of cameras that cannot be believed, and what to photograph next."""
+    """The error message for cameras that cannot be trusted: the reasons, and what to photograph next."""
     if forward:
         return f"no cameras that can be trusted: {'; '.join(reasons)}. {_FORWARD}. {_WITHOUT}.\n{table(names, pairs)}"
     between = " and ".join(weakest_link(names, pairs))
