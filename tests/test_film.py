@@ -107,13 +107,39 @@ def test_cameras_side_by_side_are_never_left() -> None:
     assert (places <= centers(poses).amax(0) + 1e-9).all()
 
 
-def test_the_film_begins_and_ends_slowly_and_has_one_speed_between() -> None:
-    shares = film._eased(np.linspace(0, 1, 1001))
-    assert (shares[0], shares[-1]) == pytest.approx((0, 1))
-    speeds = np.diff(shares) * 1000
-    assert speeds[[0, -1]] == pytest.approx(0, abs=0.02)
-    assert speeds[120:880] == pytest.approx(1 / 0.88)
-    assert np.diff(speeds[:120]).min() > 0
+@pytest.mark.parametrize("poses", [*PATHS.values(), ring(12), ring(7)[:1]], ids=[*PATHS, "ring of 12", "1"])
+def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
+    """Measured on the poses of the film: where the path does not turn back, steps are as long as each other."""
+    path = film.paced(poses, 400, 3.0)
+    places = centers(path)
+    unit = torch.cdist(centers(poses), centers(poses)).max() if len(poses) > 1 else 3.0
+    moves = torch.cat([places / unit, path[:, 2, :3] / math.pi], 1).diff(dim=0)
+    lengths = moves.norm(dim=1)
+    ahead = moves / lengths[:, None]
+    turns = (ahead[1:] * ahead[:-1]).sum(1).clamp(-1, 1).acos().rad2deg()
+    cruise = lengths.quantile(0.75)
+    assert (lengths <= 1.03 * cruise).all()  # at its speed, and never above
+    bends = torch.nn.functional.max_pool1d(turns[None], 25, 1, 12)[0]  # sharpest turn within 12 frames
+    calm = (bends < 4)[50:348]
+    assert calm.float().mean() > 0.5
+    torch.testing.assert_close(lengths[51:349][calm], cruise.expand(int(calm.sum())), rtol=0.03, atol=0)
+    assert lengths[[0, -1]].max() < 0.1 * cruise
+    assert (lengths[:20].diff() > -1e-6 * cruise).all()  # gets up to its speed
+    assert (lengths[-20:].diff() < 1e-6 * cruise).all()
+    assert (lengths.diff().abs() < 0.25 * cruise).all()  # no jolt
+    torch.testing.assert_close(path[0], tour(poses, evenly(1), 3.0)[0])
+
+
+def test_an_even_path_takes_each_step_in_the_same_time() -> None:
+    """Against the plain round of a circle: 86 % of the way at one speed, the rest at half of it on the mean."""
+    count, frames = 12, 240
+    rim = 2 * math.pi * torch.arange(count).double() / count
+    poses = looking_at(torch.zeros(3).double(), torch.stack([rim.cos(), rim.sin(), 0.3 * torch.ones(count)], 1))
+    places = centers(film.paced(poses, frames, 1.0))
+    steps = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
+    steps = torch.minimum(steps, 2 * math.pi - steps)
+    expected = 2 * math.pi / frames * (0.86 + 2 * 0.14)
+    torch.testing.assert_close(steps[40:200], torch.full((160,), expected).double(), rtol=0.02, atol=0)
 
 
 def test_the_round_trip_is_short() -> None:
@@ -134,6 +160,7 @@ def test_a_single_camera_sways_and_keeps_its_target() -> None:
 
 def test_cameras_at_one_place_are_no_trouble() -> None:
     assert tour(facing(1).repeat(3, 1, 1), evenly(10), 1.0).isfinite().all()
+    assert film.paced(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
 
 
 def views_of(size: tuple[int, int]) -> Views:

@@ -1,4 +1,4 @@
-"""A film of a splat: a smooth path through the training cameras, written as a WebM file that browsers play."""
+"""A film of a splat: a smooth path through the training cameras at one speed, as a file that browsers play."""
 
 import contextlib
 import os
@@ -26,7 +26,9 @@ from .ownership import MARK
 
 FRAMES = 144
 RATE = 24.0  # frames per second
-_RAMP = 0.12  # share of the film in which it gets up to its speed, and again of that in which it slows down
+_RAMP = 0.07  # share of the path on which a film gets up to its speed, and again of that on which it slows down
+_TURN = 40.0  # largest v^2 / r at speed 1, in path lengths: only turns of a radius below 1/40 of the path are slow
+_PIECES = 4000  # in which a path is measured
 LONGEST = 640  # pixels of the longer side
 _STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
 _LEAST_SIDE = 64  # pixels of a film that is made smaller
@@ -44,7 +46,7 @@ def write_film(
 ) -> str:
     """Write a film along the :func:`tour` through some views, as WebM with VP8. The write is atomic.
 
-    The film has `FRAMES` frames at `RATE` frames per second; it begins and ends slowly, where it began. Frames have the
+    The film has `FRAMES` frames at `RATE` frames per second; see :func:`paced` for its speed. Frames have the
     size of the views, reduced to at most `LONGEST` pixels and rounded to even numbers. (OpenCV's VP9 encoder takes six
     times as long for 0.5 dB.)
 
@@ -60,7 +62,7 @@ def write_film(
     """
     path = Path(path)
     size, lens = _frame_lens(views)
-    poses = tour(views.cameras.extrinsics, _eased(np.arange(FRAMES) / FRAMES), depth).to(lens)
+    poses = paced(views.cameras.extrinsics, FRAMES, depth).to(lens)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
     try:
         with _stderr_discarded():
@@ -123,11 +125,51 @@ def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:
     return size, lens
 
 
-def _eased(times: Array) -> Array:
-    """The shares of a path that are done at times in [0, 1]: at constant speed, but for a ramp at each end."""
-    begun, left = times.clip(max=_RAMP), (1 - times).clip(max=_RAMP)
-    shares: Array = (begun**2 - left**2 + _RAMP**2) / (2 * _RAMP) + (times - begun) - (_RAMP - left)
-    return shares / (1 - _RAMP)
+def paced(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
+    """Poses of a :func:`tour` at the times of the frames of a film, in which the camera moves at one speed.
+
+    The speed is that of the position, in largest distances between cameras, and of the viewing direction, in half
+    turns, as the hypotenuse of both. The film begins and ends at rest, with the same acceleration over the first and
+    last `_RAMP` of the path. Where the path turns back, as at the end of a row of cameras, the camera slows down.
+
+    Convention:
+        World-to-camera extrinsics, OpenCV axes, in and out.
+
+    Args:
+        extrinsics: `(V, 4, 4)`, V >= 1.
+        frames: number of poses, >= 1. The first is that of a camera; after the last one the path would be there again.
+        depth: distance from the cameras to the scene, in world units.
+
+    Returns:
+        `(frames, 4, 4)`, float64.
+    """
+    even = np.linspace(0, 1, _PIECES + 1)
+    path = torch.linalg.inv(tour(extrinsics, even, depth))
+    centers = torch.linalg.inv(extrinsics.double().cpu())[:, :3, 3]
+    unit = float(torch.cdist(centers, centers).max()) or depth
+    places = torch.cat([path[:, :3, 3] / unit, path[:, :3, 2] / torch.pi], 1).numpy()
+    done = np.append(0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
+    if done[-1] < 1e-9:  # it does not move
+        return tour(extrinsics, np.arange(frames) / frames, depth)
+    shares = np.interp(even, done / done[-1], even)  # of the path's time, after equal parts of its length
+    speeds = _speeds(np.stack([np.interp(shares, even, column) for column in places.T], 1))
+    times = np.append(0, (2 / (speeds[1:] + speeds[:-1])).cumsum())
+    return tour(extrinsics, np.interp(np.arange(frames) / frames, times / times[-1], shares), depth)
+
+
+def _speeds(places: Array) -> Array:
+    """Speeds in (0, 1] at places `(M, D)` that are as far from each other along a path; 0 at both ends."""
+    part = 1 / (len(places) - 1)
+    steps = np.diff(places, axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True).clip(1e-12)
+    turns = np.arccos((steps[1:] * steps[:-1]).sum(1).clip(-1, 1)) / part  # one over the radius
+    squares = np.append(np.append(0, np.minimum(1, _TURN / turns.clip(1e-9))), 0)
+    gains = 2 * _TURN * part * np.arange(len(places))  # v^2 - 2 a s is constant while it accelerates
+    squares[1:-1] = np.minimum.accumulate(squares[1:-1] - gains[1:-1]) + gains[1:-1]
+    squares[1:-1] = (np.minimum.accumulate((squares[1:-1] + gains[1:-1])[::-1]))[::-1] - gains[1:-1]
+    ends = np.linspace(0, 1, len(places)) / _RAMP
+    speeds: Array = np.sqrt(np.minimum(squares, np.minimum(ends, ends[::-1])))
+    return speeds
 
 
 def tour(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
