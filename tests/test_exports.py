@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from kgs.fit import exports
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
 from kgs.io.json_files import write_json
-from kgs.io.outputs import EXPORTS
+from kgs.io.outputs import EXPORTS, film_in
 from kgs.io.ownership import is_own
 
 
@@ -63,6 +64,8 @@ def test_upright() -> None:
 
 
 def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+
     class Fitted:
         scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
         shown, notes = random_model(), list[str]()
@@ -75,12 +78,38 @@ def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> 
 
     monkeypatch.setattr(film, "FRAMES", 3)
     exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    assert {path.name for path in tmp_path.iterdir()} == set(EXPORTS)
+    assert {path.name for path in tmp_path.iterdir()} == set(EXPORTS) - {"turntable.mp4"}
     assert all(is_own(path) for path in tmp_path.iterdir())
+    assert film_in(tmp_path) == tmp_path / "turntable.webm"
     (tmp_path / "turntable.webm").unlink()
+    assert film_in(tmp_path) is None
     monkeypatch.setattr(exports, "write_film", lambda *_: "no turntable.webm: a reason")
+    monkeypatch.setenv("KGS_H264", "libx264")
     exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    assert Fitted.notes == ["no turntable.webm: a reason"]
+    assert Fitted.notes == [
+        "no turntable.webm: a reason",
+        "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)",
+    ]
+
+
+def test_one_film_takes_the_place_of_the_other(tmp_path: Path, monkeypatch: Any) -> None:
+    class Fitted:
+        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        shown = random_model()
+
+        def render(self, camera: PinholeCamera) -> torch.Tensor:
+            return torch.zeros(1, 3, int(camera.height), int(camera.width))
+
+    pytest.importorskip("av")
+    monkeypatch.setattr(film, "FRAMES", 3)
+    monkeypatch.setenv("KGS_H264", "libx264")
+    (tmp_path / "turntable.webm").write_bytes(b"made by kgs")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert [path.name for path in tmp_path.glob("turntable.*")] == ["turntable.mp4"]
+    assert is_own(tmp_path / "turntable.mp4")
+    (tmp_path / "turntable.webm").write_bytes(b"mine")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert (tmp_path / "turntable.webm").read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize("background", ["black", "white"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from browser import Browser
 from torch import Tensor
 
 from kgs.datasets.scene import Views, pinholes
-from kgs.io import film
+from kgs.io import encoders, film
 from kgs.io.film import tour, write_film
 from kgs.io.ownership import is_own
 
@@ -179,18 +180,29 @@ def render(camera: Any) -> Tensor:
     return torch.stack([bar, 0.8 * bar, 0.6 * bar])[None, :, None].expand(1, 3, height, width)
 
 
+@pytest.fixture(params=["webm", "mp4"])
+def suffix(request: Any, monkeypatch: Any) -> str:
+    """Of a film that can be made here: MP4 by the encoder that PyAV's packages have on Linux."""
+    if request.param == "mp4":
+        pytest.importorskip("av")
+        monkeypatch.setenv(encoders.ASKED, "libx264")
+        assert encoders.film_suffix() == (".mp4", "")
+    return f".{request.param}"
+
+
 @pytest.mark.parametrize(("size", "expected"), [((33, 45), (32, 44)), ((1000, 1500), (426, 640))])
-def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, size: Any, expected: Any) -> None:
+def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: str, size: Any, expected: Any) -> None:
     monkeypatch.setattr(film, "FRAMES", 8)
+    monkeypatch.setattr(encoders, "BITS", 2.0)
     rendered = []
 
     def kept(camera: Any) -> Tensor:
         rendered.append(render(camera)[0])
         return rendered[-1][None]
 
-    views, path = views_of(size), tmp_path / "film.webm"
+    views, path = views_of(size), tmp_path / f"film{suffix}"
     assert write_film(path, kept, views, 1.0) == ""
-    assert [file.name for file in tmp_path.iterdir()] == ["film.webm"]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
     assert is_own(path)
     video, frames = cv2.VideoCapture(str(path)), []
     while (found := video.read())[0]:
@@ -205,17 +217,56 @@ def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, size: Any,
     assert centre[0] == pytest.approx(centre[1], abs=1e-3)
 
 
-def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: Any) -> None:
+def boxes(content: bytes) -> list[tuple[bytes, bytes]]:
+    """The kinds and contents of the boxes of ISO/IEC 14496-12, one after the other."""
+    found = []
+    while content:
+        length = int.from_bytes(content[:4], "big")
+        found.append((content[4:8], content[8:length]))
+        content = content[length:]
+    return found
+
+
+def test_a_phone_plays_the_mp4(tmp_path: Path, monkeypatch: Any) -> None:
+    """Main profile, 4:2:0, eight bits, the index in front; read by the standard's boxes, not by FFmpeg."""
+    pytest.importorskip("av")
+    monkeypatch.setenv(encoders.ASKED, "libx264")
+    frame = np.zeros((48, 96, 3), np.uint8)
+    assert encoders.encode(tmp_path / "a.mp4", [frame] * 30, (96, 48)) == ""
+    content = (tmp_path / "a.mp4").read_bytes()
+    kinds = [kind for kind, _ in boxes(content)]
+    assert kinds[0] == b"ftyp"
+    assert kinds.index(b"moov") < kinds.index(b"mdat")
+    assert boxes(content)[-1] == (b"free", b"made by kgs")
+    configuration = content[content.index(b"avcC") + 4 :]
+    assert configuration[1] in (66, 77)  # baseline, main (ISO/IEC 14496-15)
+    assert configuration[3] <= 31  # level 3.1: 1280x720 at 30 frames per second
+    assert content.count(b"avc1") >= 1
+
+
+def test_the_colours_of_a_film_are_those_of_the_frames(tmp_path: Path, suffix: str) -> None:
+    colors = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (230, 230, 230), (20, 20, 20)]
+    frame = np.repeat(np.array(colors, np.uint8)[None], 64, 0).repeat(32, 1)
+    path = tmp_path / f"a{suffix}"
+    assert encoders.encode(path, [frame] * 5, (160, 64)) == ""
+    shown = cv2.VideoCapture(str(path)).read()[1][32, 16::32]
+    np.testing.assert_allclose(shown.astype(int), colors, rtol=0, atol=6)
+
+
+def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
     monkeypatch.setattr(film, "FRAMES", 6)
-    path, views = tmp_path / "film.webm", views_of((180, 240))
+    monkeypatch.setattr(encoders, "BITS", 4.0)
+    path, views = tmp_path / f"film{suffix}", views_of((180, 240))
     noise = torch.rand(6, 3, 180, 240, generator=torch.Generator().manual_seed(0))
     frames = iter(noise)
     assert write_film(path, lambda _: next(frames)[None], views, 1.0) == ""
     size = path.stat().st_size
     assert film.film_within(path, size) == path.read_bytes()
-    (tmp_path / "smaller.webm").write_bytes(film.film_within(path, size // 3))
-    assert 0 < (tmp_path / "smaller.webm").stat().st_size <= size // 3
-    video, count = cv2.VideoCapture(str(tmp_path / "smaller.webm")), 0
+    smaller = tmp_path / f"smaller{suffix}"
+    smaller.write_bytes(film.film_within(path, size // 3))
+    assert 0 < smaller.stat().st_size <= size // 3
+    assert is_own(smaller)
+    video, count = cv2.VideoCapture(str(smaller)), 0
     while (found := video.read())[0]:
         count += 1
         height, width = found[1].shape[:2]
@@ -225,8 +276,53 @@ def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: A
     assert film.film_within(path, 100) == b""
 
 
+def test_an_mp4_where_there_is_no_encoder_any_more_is_shown_as_webm(tmp_path: Path, monkeypatch: Any) -> None:
+    pytest.importorskip("av")
+    frames = np.random.default_rng(0).integers(0, 256, (6, 180, 240, 3)).astype(np.uint8)
+    with monkeypatch.context() as patch:
+        patch.setenv(encoders.ASKED, "libx264")
+        assert encoders.encode(tmp_path / "film.mp4", frames, (240, 180), 4e6) == ""
+    monkeypatch.setitem(sys.modules, "av", None)
+    smaller = film.film_within(tmp_path / "film.mp4", 60_000)
+    assert 0 < len(smaller) <= 60_000
+    assert smaller[:4] == b"\x1aE\xdf\xa3"  # EBML
+
+
+def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.delenv(encoders.ASKED, raising=False)
+    assert encoders.film_suffix() == (".webm", "")
+    monkeypatch.setenv(encoders.ASKED, "libx264")
+    assert encoders.film_suffix() == (".webm", "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)")
+    assert (
+        write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0) == "no a.mp4: there is no encoder of H.264 here"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["libx265", "h264_nothing", "mpeg4", "aac"])
+def test_an_encoder_of_something_else_is_none(monkeypatch: Any, name: str) -> None:
+    pytest.importorskip("av")
+    monkeypatch.setenv(encoders.ASKED, name)
+    suffix, note = encoders.film_suffix()
+    assert suffix == ".webm"
+    assert f"has no encoder KGS_H264={name} that works" in note
+
+
+def test_an_encoder_that_fails_leaves_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
+    av = pytest.importorskip("av")
+    monkeypatch.setenv(encoders.ASKED, "libx264")
+
+    def failing(*_: Any, **__: Any) -> None:
+        raise av.error.ExternalError(1, "no session left")
+
+    monkeypatch.setattr(av, "open", failing)
+    assert "no a.mp4: libx264: " in write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_without_a_codec_there_is_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(film.cv2.VideoWriter, "fourcc", lambda *_: 0)
+    monkeypatch.setattr(encoders.cv2.VideoWriter, "fourcc", lambda *_: 0)
     assert "this OpenCV writes no WebM" in write_film(tmp_path / "film.webm", render, views_of((12, 16)), 1.0)
     assert list(tmp_path.iterdir()) == []
 
@@ -244,15 +340,21 @@ def test_a_render_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_browser_plays_it(tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_browser_plays_it(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
     monkeypatch.setattr(film, "FRAMES", 15)
-    (tmp_path / "page.html").write_text('<video id="v" src="film.webm" preload="auto" muted></video>')
+    path = tmp_path / f"film{suffix}"
+    (tmp_path / "page.html").write_text(f'<video id="v" src="{path.name}" preload="auto" muted></video>')
+    flat = torch.tensor([200, 40, 90]).reshape(1, 3, 1, 1) / 255
     with Browser(tmp_path / "profile") as page:
-        assert write_film(tmp_path / "film.webm", render, views_of((48, 64)), 1.0) == ""
+        assert write_film(path, lambda _: flat.expand(1, 3, 48, 64), views_of((48, 64)), 1.0) == ""
         page.open(tmp_path / "page.html", ready="v.error || v.readyState == 4")
         assert page.run("v.error && v.error.message") is None
         assert page.run("[v.videoWidth, v.videoHeight]") == [64, 48]
         assert page.run("v.duration") == pytest.approx(15 / 24, abs=0.05)
         page.run("v.play()")
         page.run("new Promise(done => { v.onended = done })")
+        page.call("Page.bringToFront")
+        picture = page.picture("data:," + page.call("Page.captureScreenshot")["data"])
+        bound = 3 if suffix == ".mp4" else 12  # OpenCV's VP8 is BT.601 and does not say so; Chromium takes it for 709
+        np.testing.assert_allclose(picture[20:40, 20:60].mean((0, 1)) * 255, [200, 40, 90], rtol=0, atol=bound)
         assert page.problems == []

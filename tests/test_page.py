@@ -138,6 +138,11 @@ def test_a_film_is_left_out_before_anything_of_the_splat(tmp_path: Path) -> None
     assert "<video" not in write(path, film=bytes(1_100_001))
 
 
+def test_the_kind_of_a_film_is_told_by_its_first_bytes(tmp_path: Path) -> None:
+    assert 'src="data:video/mp4;base64,' in write(tmp_path / "a.html", film=b"\0\0\0\x20ftypisom" + bytes(200))
+    assert 'src="data:video/webm;base64,' in write(tmp_path / "a.html", film=b"\x1aE\xdf\xa3" + bytes(200))
+
+
 def test_curves_stay_in_their_picture() -> None:
     curve = [{"seconds": 9.0 * i, "test_psnr": None if i == 1 else 20 - i, "train_psnr": 25.0 + i} for i in range(4)]
     drawn = psnr_plot({"": {"curve": curve}})

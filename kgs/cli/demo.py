@@ -33,7 +33,7 @@ def demo(
 
     Args:
         out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply and .glb, cameras.json and
-            turntable.webm.
+            turntable.webm (.mp4 where there is an encoder).
         steps: training steps; all of the demo takes a minute on 2 cores with the default.
         size: height and width of the pictures.
         compare: a second fit without DropGaussian, from the same initial points.
@@ -76,7 +76,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     from kgs.fit.trainer import Trainer
     from kgs.io.figures import write_curve, write_sheet
     from kgs.io.json_files import write_json
-    from kgs.io.outputs import FILM
+    from kgs.io.outputs import film_in
     from kgs.io.ply import save_ply
     from kgs.page.fit_page import PAGE, write_fit_page
 
@@ -103,6 +103,14 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
     notes = [f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else []
     write_fit_page(
-        out / PAGE, "kgs demo", scene, trainer.shown, trainer.near_plane, drawn, measured, notes=notes, film=out / FILM
+        out / PAGE,
+        "kgs demo",
+        scene,
+        trainer.shown,
+        trainer.near_plane,
+        drawn,
+        measured,
+        notes=notes,
+        film=film_in(out),
     )
     return runs

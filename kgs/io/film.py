@@ -1,9 +1,8 @@
 """A film of a splat: a smooth path through the training cameras at one speed, as a file that browsers play."""
 
-import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,10 @@ from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import meeting_point
 
 from .cameras import upright
+from .encoders import MP4, RATE, encode, film_suffix
 from .images import eight_bits
-from .ownership import MARK
 
 FRAMES = 144
-RATE = 24.0  # frames per second
 _RAMP = 0.07  # share of the path on which a film gets up to its speed, and again of that on which it slows down
 _TURN = 40.0  # largest v^2 / r at speed 1, in path lengths: only turns of a radius below 1/40 of the path are slow
 _PIECES = 4000  # in which a path is measured
@@ -33,7 +31,7 @@ LONGEST = 640  # pixels of the longer side
 _STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
 _LEAST_SIDE = 64  # pixels of a film that is made smaller
 _SWAY = 0.03  # radius of the path around a single camera, as a share of the scene's depth
-_EBML_VOID = b"\xec"  # element ID of padding, which players skip
+_SPARE = 4  # H.264: the bits for a pixel can be divided by this before there are fewer pixels
 Array = NDArray[np.float64]
 
 
@@ -44,39 +42,29 @@ def write_film(
     depth: float,
     stage: Callable[[Sequence[Any], str, str], Iterable[Any]] = lambda items, *_: items,
 ) -> str:
-    """Write a film along the :func:`tour` through some views, as WebM with VP8. The write is atomic.
+    """Write a film along the :func:`tour` through some views, as MP4 or WebM by the suffix. The write is atomic.
 
-    The film has `FRAMES` frames at `RATE` frames per second; see :func:`paced` for its speed. Frames have the
-    size of the views, reduced to at most `LONGEST` pixels and rounded to even numbers. (OpenCV's VP9 encoder takes six
-    times as long for 0.5 dB.)
+    The film has `FRAMES` frames at `RATE` frames per second; see :func:`paced` for its speed. Frames have the size of
+    the views, reduced to at most `LONGEST` pixels and rounded to even numbers.
 
     Args:
-        path: the file to write, in an existing folder.
+        path: the file to write, in an existing folder; see :func:`kgs.io.encoders.film_suffix`.
         render: from a camera to an image `(1, 3, H, W)`.
         views: the views whose cameras the path passes.
         depth: distance from the cameras to the scene, in world units.
         stage: wraps the poses to show progress, such as :func:`kgs.io.console.each`.
 
     Returns:
-        "", or the reason why no film was written: OpenCV cannot write such files here.
+        "", or the reason why no film was written: there is no encoder for it here.
     """
     path = Path(path)
     size, lens = _frame_lens(views)
     poses = paced(views.cameras.extrinsics, FRAMES, depth).to(lens)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
+    cameras = (pinholes(lens[None], pose[None], size) for pose in stage(list(poses), "film", "frame"))
     try:
-        with _stderr_discarded():
-            writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP80"), RATE, size[::-1])
-        if not writer.isOpened():
-            return f"no {path.name}: this OpenCV writes no WebM files"
-        for pose in stage(list(poses), "film", "frame"):
-            image = render(pinholes(lens[None], pose[None], size))[0]
-            writer.write(eight_bits(image))
-        writer.release()
-        if round(cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT)) != len(poses):
-            return f"no {path.name}: it could not be written whole"
-        with open(part, "ab") as file:
-            file.write(_EBML_VOID + bytes([0x80 | len(MARK)]) + MARK)
+        if why := encode(part, (eight_bits(render(camera)[0]) for camera in cameras), size[::-1]):
+            return f"no {path.name}: {why}"
         os.replace(part, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -86,9 +74,10 @@ def write_film(
 
 
 def film_within(path: Path, most_bytes: int) -> bytes:
-    """The content of a film that was written by `write_film`, with fewer pixels where it has more bytes than these.
+    """The content of a film that was written by `write_film`, encoded again where it has more bytes than these.
 
-    OpenCV's encoder takes about a bit for each pixel, and no other rate. b"" where the film cannot be made so small.
+    H.264 gets fewer bits for a pixel first; then, and VP8 at once, as OpenCV knows no other rate for it, fewer pixels.
+    b"" where the film cannot be made so small.
     """
     content = path.read_bytes()
     video = cv2.VideoCapture(str(path))
@@ -96,19 +85,20 @@ def film_within(path: Path, most_bytes: int) -> bytes:
     frames = []
     while len(content) > most_bytes and (found := video.read())[0]:
         frames.append(found[1])
-    share = 1.0
+    suffix = film_suffix()[0] if path.suffix == MP4 else path.suffix
+    share, spare = 1.0, _SPARE if suffix == MP4 else 1
+    bits = 8 * len(content) * RATE / max(1, len(frames))  # per second
     with tempfile.TemporaryDirectory() as folder:
-        smaller = Path(folder) / path.name
+        smaller = Path(folder) / f"film{suffix}"
         while frames and len(content) > most_bytes:
             share *= 0.9 * most_bytes / len(content)
-            size = tuple(2 * int(side * share**0.5 / 2) for side in (width, height))
+            pixels = min(1.0, spare * share)
+            size = (2 * int(width * pixels**0.5 / 2), 2 * int(height * pixels**0.5 / 2))
             if min(size) < _LEAST_SIDE:
                 return b""
-            with _stderr_discarded():
-                writer = cv2.VideoWriter(str(smaller), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP80"), RATE, size)
-            for frame in frames:
-                writer.write(cv2.resize(frame, size, interpolation=cv2.INTER_AREA))
-            writer.release()
+            resized = (cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames)
+            if encode(smaller, resized, size, bits * share):
+                return b""
             content = smaller.read_bytes()
     return content
 
@@ -305,16 +295,3 @@ def _tangents(before: Array, after: Array, step_before: Array, step_after: Array
     weights = (2 * step_after + step_before) / before + (step_after + 2 * step_before) / after
     tangents: Array = np.where(extremum, 0.0, 3 * (step_before + step_after) / weights)
     return tangents
-
-
-@contextlib.contextmanager
-def _stderr_discarded() -> Iterator[None]:
-    """Discards what native code writes to stderr: OpenCV prints a remark for each WebM file."""
-    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)

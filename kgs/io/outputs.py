@@ -19,8 +19,8 @@ from .ownership import MARK, is_own
 if TYPE_CHECKING:
     from torch import Tensor
 
-FILM = "turntable.webm"
-EXPORTS = ("cameras.json", "splat.glb", FILM)  # for other programs
+FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
+EXPORTS = ("cameras.json", "splat.glb", *FILMS)  # for other programs
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name
@@ -48,6 +48,11 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
             raise DataError(path, "", f"was not written by kgs and would be overwritten: {advice}")
     if make:
         out.mkdir(parents=True, exist_ok=True)
+
+
+def film_in(folder: Path) -> Path | None:
+    """The film in a folder of results, if there is one."""
+    return next((folder / name for name in FILMS if (folder / name).is_file()), None)
 
 
 def png_names(views: Iterable[str]) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """Tells files of kgs from the user's: each file that kgs writes contains the mark `made by kgs`, as its format allows.
 
 PNG has it as Software text, PLY as a comment, JSON under "generator", HTML and glTF as generator, WebM in a void
-element, checkpoints in their metadata. Nothing else is ever overwritten or removed.
+element, MP4 in a free box, checkpoints in their metadata. Nothing else is ever overwritten or removed.
 """
 
 import shutil
@@ -11,7 +11,7 @@ from pathlib import Path
 MADE_BY = "made by kgs"
 MARK = MADE_BY.encode()
 _FOLDER_MARK = ".kgs"  # an empty file in a temporary folder
-_HEAD, _TAIL = 2**20, 2**10  # bytes that are searched: the mark is at the end of WebM, else in the header
+_HEAD, _TAIL = 2**20, 2**10  # bytes that are searched: the mark is at the end of films, else in the header
 
 
 def is_own(path: Path) -> bool:

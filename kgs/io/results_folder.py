@@ -8,13 +8,13 @@ from pathlib import Path
 from kgs.errors import DataError
 
 from .json_files import read_json
-from .outputs import EXPORTS, FILM
+from .outputs import EXPORTS, FILMS
 from .ownership import is_own
 from .staging import Staging
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
 RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
-_OPTIONAL = (PREVIOUS, FILM)
+_OPTIONAL = (PREVIOUS, *FILMS)
 
 
 def fit_staging(out: Path) -> Staging:

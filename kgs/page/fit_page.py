@@ -20,7 +20,7 @@ from kgs.io.cameras import rolled
 from kgs.io.console import each, say
 from kgs.io.film import film_within
 from kgs.io.json_files import read_json
-from kgs.io.outputs import FILM
+from kgs.io.outputs import film_in
 from kgs.io.ownership import is_own
 from kgs.model import GaussianModel
 
@@ -67,7 +67,7 @@ def write_fit_page(
         notes: sentences to show below the one that says how good the fit is.
         settings: the content of config.json.
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
-        film: a WebM file to show; ignored if kgs did not write it.
+        film: an MP4 or WebM file to show; ignored if kgs did not write it.
         photos: whether the page shows photos, renders and their differences.
         roll: degrees by which all pictures are turned clockwise, see :func:`kgs.io.cameras.rolled`.
 
@@ -145,7 +145,7 @@ def _write_page_of(
     """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
     request = settings["request"]
     title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
-    options: dict[str, Any] = {"report": scene.root / CAMERAS_REPORT, "film": path.with_name(FILM)}
+    options: dict[str, Any] = {"report": scene.root / CAMERAS_REPORT, "film": film_in(path.parent)}
     options |= {"settings": settings, "photos": request.get("photos", True), "roll": request.get("roll", 0.0)}
     write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **options)
 

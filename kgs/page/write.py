@@ -83,7 +83,7 @@ def write_page(
         background: colour behind the splat, `(3,)` in [0, 1].
         pictures: photos with renders, `kgs.page.Picture`.
         pictures_note: a sentence that says which photos these are.
-        film: the content of a WebM file; b"" for none. It is left out where it has more than `MOST_FILM_BYTES`,
+        film: the content of an MP4 or WebM file; b"" for none. It is left out where it has more than `MOST_FILM_BYTES`,
             or where anything of the splat would have to be left out for it.
         runs: the content of metrics.json by the name of the run; "" if there is only one run.
         left_out: what the fit left out, and why.
@@ -156,7 +156,8 @@ def write_page(
         return pack(gaussians, cameras, room * 3 // 4, weights, near_plane)  # base64 turns 3 bytes into 4
 
     has_film = 0 < len(film) <= MOST_FILM_BYTES
-    packed = packed_beside("data:video/webm;base64," + base64.b64encode(film).decode() if has_film else "")
+    kind = "mp4" if film[4:8] == b"ftyp" else "webm"
+    packed = packed_beside(f"data:video/{kind};base64," + base64.b64encode(film).decode() if has_film else "")
     if has_film and packed.left_out:
         packed = packed_beside("")
     content = base64.b64encode(packed.content).decode()
