@@ -24,11 +24,30 @@ from kgs.io.json_files import write_json
 from kgs.io.outputs import EXPORTS, film_in
 from kgs.io.ownership import is_own
 
+POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_the_bounds_are_those_of_the_scene_not_of_strays() -> None:
+    """In each entry, as readers take every element of the list for a camera: none of them is anything else."""
+    strays = torch.tensor([[900.0, 0.5, 0.5], [0.5, -900.0, 0.5], [0.5, 0.5, 900.0]])
+    offset = torch.tensor([1e6, 2e6, -5.0]).double()
+    listed = camera_list([random_views(2)], offset, torch.cat([POINTS, strays]))
+    assert all(
+        {"position", "rotation", "img_name", "fx", "fy", "width", "height", "bounds"} <= set(each) for each in listed
+    )
+    for entry in listed:
+        low, high = (torch.tensor(corner, dtype=torch.float64) - offset for corner in entry["bounds"])
+        torch.testing.assert_close(low, torch.full((3,), 0.01).double(), atol=0.01, rtol=0)
+        torch.testing.assert_close(high, torch.full((3,), 0.99).double(), atol=0.01, rtol=0)
+        outside = torch.cat([low > POINTS, high < POINTS], 1).float().mean(0)
+        assert ((outside > 0.007) & (outside < 0.013)).all()
+    assert all("bounds" not in each for each in camera_list([random_views(2)], offset, torch.zeros(0, 3)))
+
 
 def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:
     """With the reader of the reference viewers in mind: pixel = f R^T (x - position) + the middle."""
     views, offset = random_views(3), torch.tensor([1e6, 2e6, -5.0]).double()
-    write_json(tmp_path / "cameras.json", camera_list([views.select([2, 0]), views.select([1])], offset))
+    write_json(tmp_path / "cameras.json", camera_list([views.select([2, 0]), views.select([1])], offset, POINTS))
     assert is_own(tmp_path / "cameras.json")
     listed = json.loads((tmp_path / "cameras.json").read_text())
     assert [(each["id"], each["img_name"]) for each in listed] == [

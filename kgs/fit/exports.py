@@ -22,7 +22,7 @@ def write_exports(trainer: Trainer, folder: Path, roll: float = 0.0) -> None:
     """
     scene, model = trainer.scene, trainer.shown
     upright_views = rolled(scene.train, roll)
-    write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset))
+    write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset, model.means))
     save_glb(folder / "splat.glb", model, upright(upright_views.cameras.extrinsics), scene.offset)
     depth = typical_depths(model.means, scene.train.cameras)[1]
     suffix, note = film_suffix()

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,12 +15,15 @@ from kgs.geometry import common_up
 
 from .ownership import MADE_BY
 
+_OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
 
-def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
+
+def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[dict[str, Any]]:
     """The content of the `cameras.json` that some viewers expect beside a 3DGS PLY file: one entry per view.
 
     Source: the reference implementation of B. Kerbl et al., "3D Gaussian Splatting", 2023. The format has no principal
-    point.
+    point, and no box: viewers that frame all Gaussians frame the few giants and strays around the scene. Readers take
+    every element of the list for a camera and its values by their names, so a box is one more value of each.
 
     Convention:
         Camera to world in the coordinates of the PLY file, OpenCV axes. `rotation` holds the rows of the matrix.
@@ -27,11 +31,17 @@ def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
     Args:
         views: sets of views, listed one after the other.
         offset: the `offset` of the Scene, `(3,)`, in world units. It is added to the positions in float64.
+        means: centres of the Gaussians, `(N, 3)`, in world units without the offset.
 
     Returns:
         One dict per view: id (counted from 0), img_name, width, height, fx and fy (pixels), position (world units),
-        rotation, and generator, the version of kgs that wrote it.
+        rotation, bounds (two opposite corners of a box, in world units; beyond each of its sides lies a hundredth of
+        the centres; not without Gaussians), and generator, the version of kgs that wrote it.
     """
+    box = dict[str, Any]()
+    if len(means):
+        corners = np.quantile(means.detach().double().cpu().numpy(), [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+        box["bounds"] = (corners + offset.double().cpu().numpy()).tolist()
     entries = list[dict[str, Any]]()
     for part in views:
         height, width = part.images.shape[-2:]
@@ -48,6 +58,7 @@ def camera_list(views: Sequence[Views], offset: Tensor) -> list[dict[str, Any]]:
                     "rotation": pose[:3, :3].tolist(),
                     "fx": float(k[0, 0]),
                     "fy": float(k[1, 1]),
+                    **box,
                     "generator": f"{MADE_BY} {kgs.__version__}",
                 }
             )
