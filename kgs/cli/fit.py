@@ -57,8 +57,8 @@ def fit(
     Args:
         scene: a folder of 3 or more photos, whose cameras are found first (extra sfm) and written to the output folder
             (images, sparse/0, photos.json); or one with camera poses: LLFF, COLMAP, Blender or nerfstudio.
-        out: folder for index.html, the page to look at, turntable.webm or .mp4, a film, splat.ply and .glb, cameras.json,
-            metrics.json, test/*.png, curve.png, config.json and the checkpoints.
+        out: folder for index.html, the page to look at, turntable.webm or .mp4, a film, splat.ply and .glb,
+            cameras.json, metrics.json, test/*.png, curve.png, config.json and the checkpoints.
         views: training views, spread over the views that are not held out; all of them unless given.
         hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
             scene's files name, or else every eighth; of unposed photos none.
