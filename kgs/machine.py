@@ -12,13 +12,9 @@ from pathlib import Path
 import cv2
 import kornia
 import torch
-from torch import Tensor
 
 from . import __version__
 from .backends import resolve
-
-# Measured, with room: what libraries load at first use; parameters, gradients, moments and copies of each Gaussian.
-_AT_FIRST_USE, _PER_GAUSSIAN, _IMAGES_OF_THE_LOSS = 96 * 2**20, 4096, 40
 
 
 def check_device(name: str) -> torch.device:
@@ -71,9 +67,3 @@ def peak_rss_mb() -> int:
     except ModuleNotFoundError:
         return 0
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10))
-
-
-def bytes_of(gaussians: int, photos: Tensor) -> int:
-    """Upper bound of a fit's memory, for photos `(V, 3, H, W)`, without the renderer's working memory."""
-    pictures: int = photos[:1].nbytes * _IMAGES_OF_THE_LOSS + 4 * photos.nbytes
-    return _AT_FIRST_USE + gaussians * _PER_GAUSSIAN + pictures

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from kgs.io import film
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
+
+if "XDG_CACHE_HOME" not in os.environ:  # what kgs measures of this machine is kept, but not in the user's folder
+    os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "kgs-tests-cache")
 
 settings.register_profile("kgs", deadline=None)  # another program may take the core
 settings.load_profile("kgs")

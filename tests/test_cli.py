@@ -18,6 +18,7 @@ import kgs
 import kgs.cli.run
 from kgs import cli
 from kgs.fit.config import DETAILS, PAPER, FitConfig
+from kgs.io.outputs import FILMS
 from kgs.io.results_folder import RESULTS
 
 STEPS = 30
@@ -38,7 +39,9 @@ def fitted(folder, tmp_path_factory):
 
 
 def test_fit_writes_everything(fitted):
-    assert {*RESULTS, "test"} <= set(os.listdir(fitted))
+    files = set(os.listdir(fitted))
+    assert {*RESULTS, "test"} - {*FILMS} <= files
+    assert len(files & {*FILMS}) == 1
     assert "checkpoint.safetensors" in os.listdir(fitted)
     assert sorted(os.listdir(fitted / "test")) == ["test_r_0.png", "test_r_1.png"]
     assert cv2.imread(str(fitted / "test" / "test_r_0.png")).shape == (36, 40, 3)
@@ -210,7 +213,18 @@ def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert len(kgs.load_ply(tmp_path / "splat.ply")) == runs["with"]["gaussians"]
 
 
-def test_as_many_first_points_as_asked_for(folder, tmp_path):
+def test_time_and_memory_are_announced_before_a_fit_and_not_when_it_goes_on(folder, tmp_path, capsys):
+    words = ("fit", folder, "-o", tmp_path, "--steps", 2, *FIT)
+    assert run(*words) == 0
+    said = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in said if line.startswith("this takes about ")]
+    assert re.search(r" \(start .* fit .* film and page .*\) and [0-9.]+ GiB of memory$", line)
+    assert said.index(line) < said.index(next(line for line in said if line.startswith("initial points")))
+    assert run(*words, "--resume") == 0
+    assert "this takes about" not in capsys.readouterr().out
+
+
+def test_as_many_initial_points_as_asked_for(folder, tmp_path):
     assert run("fit", folder, "-o", tmp_path, "--steps", 1, "--init", "random", "--init-points", 321) == 0
     assert json.loads((tmp_path / "metrics.json").read_text())["init"] == {"kind": "random", "points": 321}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import sys
 from dataclasses import replace
@@ -152,14 +151,6 @@ def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) ->
     fit_scene(scene, short, tmp_path, say=lambda line: None)
     fit_scene(scene, replace(short, seed=1), tmp_path, say=lambda line: None)
     assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
-
-
-def test_time_and_memory_are_told_before_the_fit(scene: Any, tmp_path: Path) -> None:
-    lines: list[str] = []
-    fit_scene(scene, replace(CONFIG, steps=2), tmp_path, say=lines.append)
-    said = [line for line in lines if line.startswith("the fit takes about ")]
-    assert len(said) == 1
-    assert re.fullmatch(r"the fit takes about \d+ s, .* at most \d+ MiB of memory with 300 Gaussians", said[0])
 
 
 def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> None:

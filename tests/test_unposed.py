@@ -83,7 +83,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     out = tmp_path / "out"
     assert run("fit", folder(4), "-o", out, *FIT) == 0
     said = capsys.readouterr().out
-    assert "the fit takes about" in said
+    assert "this takes about" in said
     assert "4 training and 0 test views of 96x72" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said

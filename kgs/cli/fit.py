@@ -57,19 +57,17 @@ def fit(
     Args:
         scene: a folder of 3 or more photos, whose cameras are found first (extra sfm) and written to the output folder
             (images, sparse/0, photos.json); or one with camera poses: LLFF, COLMAP, Blender or nerfstudio.
-        out: folder for index.html, the page to look at, turntable.webm or .mp4, a film, splat.ply and .glb,
-            cameras.json, metrics.json, test/*.png, curve.png, config.json and the checkpoints.
+        out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 a film.
         views: training views, spread over the views that are not held out; all of them unless given.
         hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
-            scene's files name, or else every eighth; of unposed photos none.
-        size: reduce the photos to this many pixels on their longer side. Unless given, that of --detail; of photos with
-            poses and --detail normal, and on a GPU, the size that they have (unposed ones at most 1600).
+            scene's files name, else every eighth; of unposed photos none.
+        size: reduce the photos to this many pixels on their longer side; 504 for unposed photos on a CPU.
         downscale: reduce the photos by this factor instead.
         background: behind photos with transparency.
         preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
             counts scaled. plain: the same without dropping. Each sets other defaults, see --preset paper --help-all.
-        detail: low: 378 pixels, half the steps, a third of them on small images. high: 1000 pixels, four times the
-            initial points, half the steps on small images. Other options win; --detail high --help-all has all numbers.
+        detail: moves size, steps and initial points together; high: 1000 pixels. Options given by name win. See
+            --detail high --help-all.
         resume: continue from the checkpoint in the output folder.
         photos: photos beside their renders on the page; without them it is small, and can be shown where they must not.
         roll: turn the pictures of page and film clockwise by this angle in degrees, where photos lie on their side.
@@ -79,6 +77,7 @@ def fit(
     del preset  # `defaults` has read it
     from kgs.datasets import load_scene
     from kgs.datasets.folders import CAMERAS_REPORT
+    from kgs.fit.forecast import forecast
     from kgs.fit.prune import left_out
     from kgs.fit.run import fit_scene
     from kgs.io.ownership import is_own
@@ -88,7 +87,7 @@ def fit(
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import write_own_page
 
-    from .unposed import find_scene, is_unposed, on_ctrl_c, settle
+    from .unposed import announce_unposed, find_scene, is_unposed, on_ctrl_c, settle
 
     check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
@@ -100,6 +99,8 @@ def fit(
     unposed = is_unposed(scene)
     if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
+    if unposed and not resume:
+        announce_unposed(scene, out, request, config, size)
     if unposed:
         request, place = find_scene(scene, out, request, config.seed, size)
     elif is_own(out / CAMERAS_REPORT):
@@ -113,6 +114,8 @@ def fit(
         shrunk_by = "size" if downscale is None else "downscale"
         raise ValueError(f"{shrunk_by}: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    if not unposed and not resume:
+        say(str(forecast(len(loaded.train), (height, width), config)))
     options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)

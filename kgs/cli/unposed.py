@@ -5,7 +5,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
+from kgs.datasets.folders import CAMERAS_REPORT, VIDEO_SUFFIXES, nearest_scene
+from kgs.fit.config import FitConfig
 from kgs.io.console import each, say
 from kgs.io.results_folder import locked
 
@@ -15,6 +16,25 @@ def is_unposed(scene: Path) -> bool:
     if scene.is_file():
         return scene.suffix.lower() in VIDEO_SUFFIXES
     return scene.is_dir() and nearest_scene(scene) is None
+
+
+def announce_unposed(photos: Path, out: Path, request: dict[str, Any], config: FitConfig, size: int | None) -> None:
+    """Say what a fit of unposed photos takes, from the size of the first of them; arguments as of `find_scene`."""
+    from kgs.datasets.image_file import read_size
+    from kgs.fit.forecast import forecast
+    from kgs.sfm.find import find_photos
+    from kgs.sfm.read import LONGEST
+
+    paths = find_photos(photos)
+    width, height = read_size(paths[0])
+    longest = max(width, height)
+    kept = min(1.0, LONGEST / longest)
+    wanted = longest / request["downscale"] if request["downscale"] else size or LONGEST
+    scale = min(kept, wanted / longest)
+    views = len(paths) - (len(paths) // request["hold_out"] if request["hold_out"] else 0)
+    count = 0 if (out / CAMERAS_REPORT).is_file() else len(paths)
+    fitted = (round(scale * height), round(scale * width))
+    say(str(forecast(request["train_views"] or views, fitted, config, count, kept**2 * width * height)))
 
 
 def find_scene(

@@ -28,7 +28,6 @@ from kgs.metrics.lpips import Lpips
 from .checkpoint import save_checkpoint
 from .config import FitConfig
 from .exports import write_exports
-from .forecast import forecast
 from .probes import decide
 from .prune import prune
 from .trainer import Trainer
@@ -123,7 +122,6 @@ def fit_scene(
                 say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
             points = choose_points(scene, config, each)
             say(f"initial points: {len(points.points)} ({points.kind})")
-            say(forecast(scene.train.images, len(points.points), config))
             config, needs = decide(scene, config, choose_points, each)
             trainer = Trainer(scene, config, points, needs)
         for note in trainer.notes:

@@ -106,7 +106,7 @@ def memory_of(folder: Path, steps: int) -> tuple[float, int, int]:
 
     Returns:
         Growth in KiB per step over the second half, whose number of Gaussians stays; the peak of the resident memory
-        over that at the start, and the bound that the fit foretold, in bytes.
+        over that at the start, and a bound for it, in bytes.
     """
     Fit(folder, "memory", steps)
     with _PROCESSES.Pool(1) as pool:
@@ -117,7 +117,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.forecast import most_bytes
+    from kgs.fit.config import most_gaussians
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
 
@@ -136,7 +136,11 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     half = resident[len(resident) // 2 :]
     middle = len(half) // 2
     slope = (sum(half[middle:]) / len(half[middle:]) - sum(half[:middle]) / middle) / middle
-    return slope / 1024, max(resident) - before, most_bytes(scene.train.images, len(points.points), config)
+    photos = scene.train.images
+    images = 40 * photos[:1].nbytes + 4 * photos.nbytes  # those of the loss, and copies
+    # what libraries load at first use; parameters, gradients, moments and copies of each Gaussian
+    ceiling = config.max_bytes + 96 * 2**20 + 4096 * most_gaussians(config, len(points.points)) + images
+    return slope / 1024, max(resident) - before, ceiling
 
 
 def _resident() -> int:
