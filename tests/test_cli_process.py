@@ -129,7 +129,10 @@ MISTAKES = {  # words, and what is said of them; "blocked": a package that canno
     "among the photos": ("fit photos -o photos", "photos: holds files of a scene"),
     "a range": ("fit photos -o out --steps 0", "--steps: expected a whole number in [1, 10000000], got '0'"),
     "another range": ("fit photos -o out --drop 2", "--drop: expected a finite number in [0, 1), got '2.0'"),
-    "two sizes": ("fit photos -o out --size 99 --downscale 2", "--size: expected --size or --downscale, got both"),
+    "two sizes": (
+        "fit photos -o out --size 99 --downscale 2",
+        "--size: expected either a size or a downscale factor, got both",
+    ),
     "no views": ("fit photos -o out --views 0", "--views: expected a whole number of at least 1, got 0"),
     "too many views": ("fit photos -o out --views 5", "--views: expected at most 4 of 4 photos, got 5"),
     "no reduction": ("fit photos -o out --downscale 0.5", "--downscale: expected None or a number of at least 1"),

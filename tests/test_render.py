@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import kgs
+from kgs.cli.checks import check_page
 from kgs.cli.page import page
 from kgs.cli.render import render
 from kgs.datasets import synthetic_scene
@@ -95,9 +96,10 @@ def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     assert f"open {out} in a browser" in capsys.readouterr().out
     page(splat, cameras=llff, out=out)  # its own file is written again
     out.write_text("mine")
-    with pytest.raises(DataError, match=r"page\.html: was not written by kgs"):
-        page(splat, cameras=llff, out=out)
-    with pytest.raises(ValueError, match=r"out: expected a file that ends in \.html, got"):
-        page(splat, cameras=llff, out=tmp_path / "page")
-    with pytest.raises(DataError, match="expected a file in a folder that is there"):
-        page(splat, cameras=llff, out=tmp_path / "no" / "page.html")
+    for place, error, message in (
+        (out, DataError, r"page\.html: was not written by kgs"),
+        (tmp_path / "page", ValueError, r"out: expected a file that ends in \.html, got"),
+        (tmp_path / "no" / "page.html", DataError, "expected a file in a folder that is there"),
+    ):
+        with pytest.raises(error, match=message):
+            check_page(llff, place, None, 0.0, "cpu", "auto")

@@ -69,8 +69,8 @@ def fit(
         detail: moves size, steps and initial points together; high: 1000 pixels. Options given by name win. See
             --detail high --help-all.
         resume: continue from the checkpoint in the output folder.
-        photos: photos beside their renders on the page; without them it is small, and can be shown where they must not.
-        roll: turn the pictures of page and film clockwise by this angle in degrees, where photos lie on their side.
+        photos: photos on the page; without them it can be shown where they must not.
+        roll: turn page and film clockwise by this angle in degrees, where photos lie on their side.
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
         config: every number of the fit.
     """

@@ -110,8 +110,7 @@ class FitConfig:
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, short
             fits (probes) find out what the training views need.
         refine_poses: optimise the poses of the training cameras too. It helps where they are half a degree or more off,
-            and accurate poses get slightly worse. The mean pose and the spread of the training cameras stay as given,
-            and so do test cameras.
+            and accurate poses get slightly worse. Their mean and spread stay, and so do test cameras.
         coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1].
         seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
         init: initial points. dense: points of depth maps, made from the training images by a plane sweep in some
