@@ -64,8 +64,8 @@ def fit(
         size: reduce the photos to this many pixels on their longer side; 504 for unposed photos on a CPU.
         downscale: reduce the photos by this factor instead.
         background: behind photos with transparency.
-        preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published,
-            counts scaled. plain: the same without dropping. Each sets other defaults, see --preset paper --help-all.
+        preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published.
+            plain: the same without dropping. See --preset paper --help-all.
         detail: moves size, steps and initial points together; high: 1000 pixels. Options given by name win. See
             --detail high --help-all.
         resume: continue from the checkpoint in the output folder.
