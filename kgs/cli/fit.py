@@ -59,8 +59,8 @@ def fit(
             (images, sparse/0, photos.json); or one with camera poses: LLFF, COLMAP, Blender or nerfstudio.
         out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 a film.
         views: training views, spread over the views that are not held out; all of them unless given.
-        hold_out: every Nth photo is for testing, not for training; 0 uses all. Unless given: the test photos that the
-            scene's files name, else every eighth; of unposed photos none.
+        hold_out: every Nth photo is for testing; 0 uses all for training. Unless given: what the scene's files say, or
+            every eighth; of unposed photos none.
         size: reduce the photos to this many pixels on their longer side; 504 for unposed photos on a CPU.
         downscale: reduce the photos by this factor instead.
         background: behind photos with transparency.
