@@ -18,7 +18,7 @@ from study_rows import tiny_cell
 from kgs import DataError
 from kgs.bench.study import cells as cells_module
 from kgs.bench.study.cells import FULL, sparse_cell
-from kgs.bench.study.presets import METHODS, SCENES, sparse_cells
+from kgs.bench.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
 from kgs.cli import main
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
@@ -51,7 +51,7 @@ def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, m
     assert not list(tmp_path.rglob("*.jsonl"))
 
 
-@pytest.mark.parametrize("preset", ["quick", "cpu", "paper"])
+@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "field-long", "paper"])
 def test_each_cell_is_there_once_and_is_a_fit(preset, data):
     cells = sparse_cells(preset, data)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
@@ -59,6 +59,20 @@ def test_each_cell_is_there_once_and_is_a_fit(preset, data):
         fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})
         config = FitConfig.from_dict(FitConfig().to_dict() | fit)
         assert config.drop == METHODS[cell["method"]].get("drop", 0.2)
+
+
+def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
+    cells = sparse_cells("field", data)
+    assert all(cell["downscale"] is None and cell["fit"]["steps"] == 2000 for cell in cells)
+    forward, objects = cells[:27], cells[27:54]
+    assert {cell["method"] for cell in cells[:54]} == {*MAIN}
+    assert {(cell["scene"], cell["views"]) for cell in forward} == {*[*SCENES.items()][:3]}
+    assert {(cell["scene"], cell["views"]) for cell in objects} == {*[*SCENES.items()][3:]}
+    assert {cell["seed"] for cell in forward} == {cell["seed"] for cell in objects} == {0, 1, 2}
+    assert {cell["method"] for cell in cells[54:90]} == {AUTO, AUTO_OFF}
+    long = sparse_cells("field-long", data)
+    assert len(long) == 9
+    assert {cell["fit"]["steps"] for cell in long} == {10_000}
 
 
 def test_the_preset_cpu_holds_what_the_study_must_show(data):

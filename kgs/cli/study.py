@@ -8,7 +8,7 @@ from .options import Existing, Out
 def study(
     *,
     out: Out,
-    preset: Literal["quick", "cpu", "paper"] = "quick",
+    preset: Literal["quick", "cpu", "field", "field-long", "paper"] = "quick",
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Existing | None = None,
@@ -26,8 +26,9 @@ def study(
 
     Args:
         out: folder for the results; fits that its sparse.jsonl has are not repeated.
-        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA; paper is the
-            paper's 10 000 steps on every scene there in the size it has, for a large machine.
+        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
+            field hours on the same in full size, field-long on three of them with 10 000 steps; paper is the paper's
+            10 000 steps on every scene there in the size it has, for a large machine.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the fits instead; they find scenes and weights under
             the same paths.

@@ -12,7 +12,7 @@ from kgs.errors import DataError
 def study(
     *,
     out: Path,
-    preset: Literal["quick", "cpu", "paper"] = "quick",
+    preset: Literal["quick", "cpu", "field", "field-long", "paper"] = "quick",
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Path | None = None,
@@ -29,8 +29,9 @@ def study(
 
     Args:
         out: folder for the results; cells that its sparse.jsonl has are not repeated.
-        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA; paper is the
-            paper's 10 000 steps on every scene there in the size it has, for a large machine.
+        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
+            field hours on the same in full size, field-long on three of them with 10 000 steps; paper is the paper's
+            10 000 steps on every scene there in the size it has, for a large machine.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the cells instead; they find scenes and weights under
             the same paths.

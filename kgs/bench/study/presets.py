@@ -34,7 +34,10 @@ SCENES = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3, "blender/lego": 8,
 SCENES["colmap/monstree"] = 8
 MORE_VIEWS = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
-_FITS = {"quick": {"steps": 200, "max_gaussians": 12_000}, "cpu": {"steps": 2000}, "paper": {"steps": 10_000}}
+# The field's protocol: photos in the size that they have, every eighth held out. LLFF's are 504x378.
+FIELD, OBJECTS = ({scene: SCENES[scene] for scene in part} for part in ([*SCENES][:3], [*SCENES][3:]))
+_FITS: dict[str, dict[str, Any]] = {"quick": {"steps": 200, "max_gaussians": 12_000}, "cpu": {"steps": 2000}}
+_FITS |= {"field": {"steps": 2000}, "field-long": {"steps": 10_000}, "paper": {"steps": 10_000}}
 Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]  # seeds, scenes, starts, methods
 
 
@@ -43,8 +46,9 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
 
     Args:
         preset: "quick": the synthetic scene, minutes. "cpu": the six scenes of `SCENES` in a quarter of the pixels of
-            504x378, 2000 steps, and the synthetic one to be shown; hours. "paper": 10 000 steps in full size on every
-            scene below `data`; days on a CPU.
+            504x378, 2000 steps, and the synthetic one to be shown; hours. "field": the six scenes in full size, 2000
+            steps; hours. "field-long": the first three of them with 10 000 steps, one seed; hours. "paper": 10 000
+            steps in full size on every scene below `data`; days on a CPU.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -56,7 +60,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     elif data is None:
         raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
     else:
-        blocks = _cpu(data) if preset == "cpu" else _paper(data)
+        blocks = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper}[preset](data)
     return [
         {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
         | {"downscale": 2.0 if preset == "cpu" else None, "fit": _FITS[preset] | METHODS[method]}
@@ -78,6 +82,24 @@ def _cpu(data: Path) -> list[Block]:
     blocks += [(range(3), [(fern, 3)], [start], [PAPER]) for start in bounds]
     blocks += [([0], [(SYNTHETIC, 3)], ["dense"], names) for names in (MAIN, auto)]  # pictures for the page
     return [*blocks, ([0], [(flower, 3)], bounds, [PAPER])]
+
+
+def _field(data: Path) -> list[Block]:
+    check_scenes(data, SCENES)
+    seeds, auto = range(3), (AUTO, AUTO_OFF)
+    blocks: list[Block] = [
+        ([seed], [scene], ["dense"], MAIN) for scenes in (FIELD, OBJECTS) for seed in seeds for scene in scenes.items()
+    ]
+    blocks += [([seed], [scene], ["dense"], auto) for seed in seeds for scene in SCENES.items()]
+    more = [*product(FIELD, (6, 9))]
+    return blocks + [
+        ([seed], [setting], ["dense"], names) for seed in seeds for setting in more for names in ((OFF, PAPER), auto)
+    ]
+
+
+def _field_long(data: Path) -> list[Block]:
+    check_scenes(data, FIELD)
+    return [([0], [scene], ["dense"], (OFF, PAPER, AUTO)) for scene in FIELD.items()]
 
 
 def _paper(data: Path) -> list[Block]:
