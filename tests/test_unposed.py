@@ -1,4 +1,4 @@
-"""`kgs fit` of unposed photos, with their true cameras in the place of those that are found: what follows from them."""
+"""`kgs fit` of unposed photos, with their true cameras instead of found ones: what follows from them."""
 
 import json
 import shutil
@@ -46,7 +46,7 @@ def folder(truth, tmp_path):
 
 @pytest.fixture(autouse=True)
 def asked(truth, monkeypatch):
-    """True cameras in the place of found ones; the folders that were asked for."""
+    """True cameras instead of found ones; the folders that were asked for."""
     calls = []
 
     def true_cameras(folder, out, **_):

@@ -330,7 +330,7 @@ class SplatRenderer {
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, canvas.width, canvas.height);
-    this.screenProgram.use({ picture: PICTURE, coverage: SMOOTH }, {
+    this.screenProgram.use({ picture: PICTURE, coverage: this.canFade ? SMOOTH : PICTURE }, {
       ground: settings.background, fades: Number(fades && this.canFade),
     });
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);

@@ -373,6 +373,7 @@ class Viewer {
     };
     addSwitch(".roam", () => this.isRoaming = !this.isRoaming);
     addSwitch(".pyramids", () => !this.overlay.toggleAttribute("hidden"));
+    frame.querySelector(".fade").hidden = !this.renderer.canFade;
     addSwitch(".fade", () => {
       this.isFading = !this.isFading;
       this.requestDraw();
