@@ -28,7 +28,7 @@ with suppress(ImportError):  # the extra heic
 
 KGS = (sys.executable, "-P", "-c", "from kgs.cli import main; main()", "fit")  # -P: no module from a job's folder
 KINDS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "HEIF": ".heic"}  # by Pillow's names
-RESULTS = ("index.html", "splat.ply", "turntable.webm")
+RESULTS = ("index.html", "splat.ply", "turntable.mp4", "turntable.webm")
 
 
 @dataclass(frozen=True)
