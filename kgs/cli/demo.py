@@ -36,7 +36,7 @@ def demo(
             turntable.webm (.mp4 where there is an encoder).
         steps: training steps; all of the demo takes a minute on 2 cores with the default.
         size: height and width of the pictures.
-        compare: a second fit without DropGaussian, from the same initial points. In this room the two differ little.
+        compare: a second fit without DropGaussian, from the same initial points. For most seeds the two differ little.
         seed: the scene, the initial points and both fits derive from it.
         device: cpu, cuda, ...
         backend: as of kgs fit.

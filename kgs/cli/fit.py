@@ -99,9 +99,9 @@ def fit(
     unposed = is_unposed(scene)
     if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
-    if unposed and not resume:
-        announce_unposed(scene, out, request, config, size)
     if unposed:
+        if not resume:
+            announce_unposed(scene, out, request, config, size)
         request, place = find_scene(scene, out, request, config.seed, size)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")

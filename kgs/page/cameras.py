@@ -62,8 +62,7 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         )
     depth = float(np.median([camera["distance"] for camera in found]))
     rotations = np.array([camera["rotation"] for camera in found])
-    training = [part != "test" for part in parts]
-    training = training if any(training) else [True] * len(parts)
+    training = are_training(parts)
     first = _nearest_mean_pose(rotations, positions / depth, training)
     up = common_up(cameras.extrinsics)
     path = tour(cameras.extrinsics[training], np.arange(_SWAY_POSES) / _SWAY_POSES, depth)
@@ -78,6 +77,12 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         ],
         "sway": _sway(path.numpy(), positions[first]),
     }
+
+
+def are_training(parts: Sequence[str]) -> list[bool]:
+    """Which photos count as training photos, by what they were used for: all but "test"; all if there are no others."""
+    training = [part != "test" for part in parts]
+    return training if any(training) else [True] * len(parts)
 
 
 def lenses(cameras: PinholeCamera) -> list[tuple[Array, Array, NDArray[np.intp]]]:

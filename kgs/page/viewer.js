@@ -357,7 +357,7 @@ class Viewer {
       if (arrow && event.shiftKey) this.move(-MOVE_PER_KEY * arrow[0], -MOVE_PER_KEY * arrow[1]);
       else if (arrow) this.turn(TURN_PER_KEY * arrow[0], TURN_PER_KEY * arrow[1]);
       else if (event.key in ZOOM_KEYS) this.zoom(ZOOM_KEYS[event.key]);
-      else if (event.key === "r") this.rollQuarter();
+      else if (event.key.toLowerCase() === "r") this.rollQuarter();
       else if (event.key === "0" || event.key === "Home") this.flyTo(this.scene.first);
       else return;
       event.preventDefault();

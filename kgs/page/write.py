@@ -15,7 +15,7 @@ from kgs.camera import MARGIN
 from kgs.io.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 
-from .cameras import viewer_scene
+from .cameras import are_training, viewer_scene
 from .data import Packed, pack
 from .figures import facts, measure_table, psnr_plot, verdict, without_folders
 from .pictures import GAIN, Picture, encoded
@@ -141,7 +141,7 @@ def write_page(
         "background": background.tolist(),
     }
 
-    training = [view for view, part in enumerate(parts) if part != "test"] or list(range(len(parts)))
+    training = [view for view, is_training in enumerate(are_training(parts)) if is_training]
     seen = seen_by(gaussians, cameras, training, near_plane)
     depths = {"layout": seen.layout, "content": base64.b64encode(seen.content).decode()}
 
