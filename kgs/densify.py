@@ -56,6 +56,8 @@ class Densifier:
             RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
+        absgrad: take the absolute gradients that renders with `RasterOptions.absgrad` leave; they are about four times
+            as large.
         percent_dense: up to this fraction of the extent (largest scale) a Gaussian is cloned, above it split, > 0.
         prune_opacity: Gaussians below this opacity are removed, in [0, 1].
         max_gaussians: upper bound for the count; Gaussians with the largest gradients come first. None: no limit.
@@ -80,6 +82,7 @@ class Densifier:
         extent: float,
         *,
         grad_threshold: float = 5e-4,
+        absgrad: bool = False,
         percent_dense: float = 0.01,
         prune_opacity: float = 0.005,
         max_gaussians: int | None = None,
@@ -100,7 +103,7 @@ class Densifier:
             raise ValueError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
         self.model, self.optimizer, self.extent = model, optimizer, float(extent)
         self.grad_threshold, self.percent_dense, self.prune_opacity = grad_threshold, percent_dense, prune_opacity
-        self.max_gaussians = max_gaussians
+        self.max_gaussians, self.absgrad = max_gaussians, absgrad
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
         self._restart_statistics(torch.zeros_like(self.model.means[:, 0]))
         self._check()
@@ -124,11 +127,11 @@ class Densifier:
             raise ValueError(f"projected: expected a render of the model's {expected} Gaussians, got one of {count}")
         if len(projected) == 0:
             return
-        gradient = projected.means2d.grad
+        name = "absgrad" if self.absgrad else "grad"
+        gradient = getattr(projected.means2d, name, None)
         if gradient is None:
-            raise ValueError(
-                "projected: expected means2d.grad, got None: observe comes after backward (and retain_grad)"
-            )
+            why = "the render needs absgrad=True" if self.absgrad else "observe comes after backward (and retain_grad)"
+            raise ValueError(f"projected: expected means2d.{name}, got None: {why}")
         height, width = projected.image_size
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         ids = projected.gaussian_ids

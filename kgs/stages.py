@@ -87,7 +87,8 @@ def composite(
     Args:
         projected: M visible pairs (camera, Gaussian).
         features: what to accumulate, `(M, F)`: colours, depths, anything.
-        options: None for the defaults. Only tile_size, alpha_threshold, transmittance_stop and max_bytes matter here.
+        options: None for the defaults. Only tile_size, alpha_threshold, transmittance_stop, max_bytes and absgrad
+            matter here.
         median_depth: also find the depth at which T falls below one half.
         chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
@@ -119,7 +120,9 @@ def composite(
     chosen = choose(
         backend,
         "compositing",
-        lambda candidate: candidate.covers(features) and candidate.covers_compositing(projected, given, chunk_size),
+        lambda candidate: (
+            candidate.covers(features) and candidate.covers_compositing(projected, features, given, chunk_size)
+        ),
     )
     tile_size = given.tile_size or chosen.tile_size
     given = replace(given, tile_size=tile_size)
@@ -179,7 +182,10 @@ class _Composite(torch.autograd.Function):
             raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         needs = ctx.needs_input_grad[:4]
         # what was kept is freed as soon as it has been used; a second backward computes it again
-        found = ctx.compositor.backward(ctx.saved_tensors, _taken(ctx), grad_sums, grad_transmittance, needs)
+        inputs = ctx.saved_tensors
+        *found, absolute = ctx.compositor.backward(inputs, _taken(ctx), grad_sums, grad_transmittance, needs)
+        if absolute is not None:
+            inputs[0].absgrad = absolute  # the tensor that was given, not a copy of it
         return *found, None, None
 
 

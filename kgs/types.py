@@ -36,6 +36,9 @@ class RasterOptions:
             farther than 15 % of the frame's size beyond its borders. A render that is wider than the images which the
             Gaussians were fitted to shows the same inside their frame if it is given: else Gaussians that lie far
             beside it cover it like a veil.
+        absgrad: `backward` also sets `projected.means2d.absgrad`, `(M, 2)` in units of `means2d.grad`: the sums, over
+            pixels, of the absolute values of what each pixel says of a centre. Where pixels pull a Gaussian apart the
+            gradient vanishes, and these sums do not (AbsGS, Ye et al., ACM MM 2024).
 
     Raises:
         ValueError: an option is out of range.
@@ -48,8 +51,11 @@ class RasterOptions:
     transmittance_stop: float = 1e-4
     max_bytes: int = 2**30
     frame: tuple[float, float, float, float] | None = None
+    absgrad: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.absgrad, bool):
+            raise ValueError(f"absgrad: expected True or False, got {self.absgrad!r}")
         for name in ("tile_size", "max_bytes"):
             value: Any = getattr(self, name)
             if name == "tile_size" and value is None:
@@ -83,6 +89,7 @@ class RasterFields(TypedDict, total=False):
     transmittance_stop: float
     max_bytes: int
     frame: tuple[float, float, float, float] | None
+    absgrad: bool
 
 
 def raster_options(options: RasterOptions | None, fields: RasterFields) -> RasterOptions:

@@ -14,7 +14,7 @@ class Half(backends.TorchBackend):
     name = "half"
     tile_size = 4
 
-    def covers_compositing(self, projected, options, chunk_size):
+    def covers_compositing(self, projected, features, options, chunk_size):
         return projected.image_size[0] <= 8
 
     def compositor(self, projected, features, options, median_depth, chunk_size):

@@ -29,7 +29,10 @@ class Compositor(Protocol):
     def backward(
         self, inputs: Inputs, kept: Any, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
     ) -> tuple[Tensor | None, ...]:
-        """The gradients of the inputs, None for those that are not needed.
+        """The gradients of the inputs, None for those that are not needed; and last, or None, `(M, 2)`.
+
+        The last are the sums of absolute values of :class:`kgs.RasterOptions`, made where `options.absgrad` asks for
+        them and a gradient of means2d is needed.
 
         `kept` is what `forward` kept, or None in a second backward pass: then it is computed again.
         """
@@ -68,7 +71,9 @@ class Backend(ABC):
         """Whether it works on tensors of this dtype, on this device; cheap, reads no values."""
         return like.dtype in self.dtypes and self.runs_on(like.device) and self.is_installed()
 
-    def covers_compositing(self, projected: ProjectedGaussians, options: RasterOptions, chunk_size: int | None) -> bool:
+    def covers_compositing(
+        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, chunk_size: int | None
+    ) -> bool:
         """Whether it composites under these options; cheap, reads no values of tensors."""
         return True
 

@@ -55,10 +55,12 @@ class TorchCompositing:
     ) -> None:
         self._settings = SETTINGS.get(features.device.type, SETTINGS["cuda"])
         tile_size, number = options.tile_size or 8, features.element_size()
-        step_bytes = min(self._settings.pairs * _ARRAYS * number, options.max_bytes // 4)
+        arrays = _ARRAYS + 3 * options.absgrad
+        step_bytes = min(self._settings.pairs * arrays * number, options.max_bytes // 4)
         budget = options.max_bytes - step_bytes
         # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved T
-        per_span, per_entry = 32 + 16 * number, 80 + (8 + 2 * features.shape[1] + tile_size**2 // 8) * number
+        width = 8 + 2 * features.shape[1] + 4 * options.absgrad + tile_size**2 // 8
+        per_span, per_entry = 32 + 16 * number, 80 + width * number
         self._coverage = TileCoverage(
             projected, tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span))
         )
@@ -68,8 +70,8 @@ class TorchCompositing:
         self._spare = budget - lists_bytes if len(self._row_slices) == 1 else 0  # to keep alphas
         self._image_size, self._eps2d = projected.image_size, projected.eps2d
         self._depths = projected.depths.detach() if median_depth else None
-        self._cut = Cut(step_bytes // (_ARRAYS * number), chunk_size)
-        self._thresholds = Thresholds.of(options, features.dtype)
+        self._cut = Cut(step_bytes // (arrays * number), chunk_size)
+        self._thresholds, self._absgrad = Thresholds.of(options, features.dtype), options.absgrad
 
     def forward(self, inputs: tuple[Tensor, ...], keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
         """See `Compositor`: one row slice is kept, several are computed again."""
@@ -91,8 +93,8 @@ class TorchCompositing:
         """See `Compositor`."""
         coverage = self._coverage
         grads, behind = (to_tiles(x, coverage.grid, coverage.tile_size) for x in (grad_features, grad_transmittance))
-        needs_moments, width = any(needs[:3]), grads.shape[0] if needs[3] else 0
-        total = grads.new_zeros(coverage.ids.shape[0], 6 * needs_moments + width)  # of each Gaussian
+        wanted = Wanted(any(needs[:3]), self._absgrad and needs[0], needs[3])
+        total = grads.new_zeros(coverage.ids.shape[0], wanted.columns(grads.shape[0]))  # of each Gaussian
         for begin, end in self._row_slices:
             transmittance, slices = self._draw(inputs, (begin, end), keep=True)[1] if kept is None else kept
             kept = None
@@ -100,15 +102,17 @@ class TorchCompositing:
             later = torch.where(transmittance[0] > 0, behind[0, :, tiles], 0.0)
             while slices:
                 (low, high), part = slices.pop()
-                total[low:high] += part.differentiate(grads[:, :, tiles], later, needs_moments, width > 0)
-        found: tuple[Tensor | None, ...] = (None, None, None, total[:, total.shape[1] - width :])
-        if needs_moments:
+                total[low:high] += part.differentiate(grads[:, :, tiles], later, wanted)
+        moments, absolute, features = total.split(wanted.widths(grads.shape[0]), 1)
+        found: tuple[Tensor | None, ...] = (None, None, None, features, absolute)
+        if wanted.moments:
             factors, opacities = (x.index_select(0, coverage.ids) for x in inputs[1:3])
-            found = (*moment_gradients(total[:, :6], factors, opacities, self._eps2d), found[3])
+            found = (*moment_gradients(moments, factors, opacities, self._eps2d), features, absolute)
 
         def of_all(value: Tensor) -> Tensor:
             return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
 
+        needs = (*needs, wanted.absolute)
         return tuple(of_all(x) if needed and x is not None else None for x, needed in zip(found, needs, strict=True))
 
     def _draw(self, inputs: tuple[Tensor, ...], rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
@@ -144,6 +148,23 @@ class TorchCompositing:
 
 
 Canvas = tuple[Tensor, Tensor, Tensor]  # transmittance (1, P, T), median depth (1 or 0, P, T), features (F, P, T)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a backward pass sums up for each Gaussian, in this order."""
+
+    moments: bool  # six moments of dL/d ln alpha about its centre
+    absolute: bool  # absolute values of what pixels add to dL/d mean, x and y
+    features: bool  # dL/d features
+
+    def widths(self, features: int) -> list[int]:
+        """The numbers of each."""
+        return [6 * self.moments, 2 * self.absolute, features * self.features]
+
+    def columns(self, features: int) -> int:
+        """All together."""
+        return sum(self.widths(features))
 
 
 @dataclass(frozen=True)
@@ -255,29 +276,27 @@ class DepthSlice:
         for whole, part in zip(canvas, state, strict=True):
             whole.index_copy_(2, self._tiles, part)
 
-    def differentiate(self, grads: Tensor, behind: Tensor, needs_moments: bool, needs_features: bool) -> Tensor:
-        """What each Gaussian gets: six moments of dL/d ln alpha about its centre, and dL/d features, `(n, 6 + F)`.
+    def differentiate(self, grads: Tensor, behind: Tensor, wanted: Wanted) -> Tensor:
+        """What each Gaussian gets of what is wanted, `(n, columns)`.
 
         `grads` are dL/d features of the pixels, `(F, P, T)`. `behind` is V behind the last layer, `(P, T)`, and becomes
-        V before the first. Columns of moments or features that are not needed are left out.
+        V before the first.
         """
-        lists, width = self.lists, 6 * needs_moments + grads.shape[0] * needs_features
+        lists, width = self.lists, wanted.columns(grads.shape[0])
         own_grads, own_behind = grads.index_select(2, self._tiles), behind.index_select(1, self._tiles)
         rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
         while self._steps:
             step = self._steps.pop()  # whose memory is free afterwards
             positions, ids = self._entries_of(step)
             pixels = own_grads[:, :, step.tiles]
-            found = self._step_gradients(step, ids, pixels, own_behind[:, step.tiles], needs_moments, needs_features)
+            found = self._step_gradients(step, ids, pixels, own_behind[:, step.tiles], wanted)
             rows.index_copy_(0, positions.view(-1), torch.stack(found, -1).view(-1, width))
         behind.index_copy_(1, self._tiles, own_behind)
         # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
         return F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
-    def _step_gradients(
-        self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, needs_moments: bool, needs_features: bool
-    ) -> list[Tensor]:
-        """Six moments and dL/d features of the entries of a step, each `(K, n)`; `behind` moves before the step."""
+    def _step_gradients(self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
+        """What is wanted of the entries of a step, each `(K, n)`; `behind` moves before the step."""
         table, dx, dy = self._offsets(step, ids)
         alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
         assert step.before is not None
@@ -287,7 +306,7 @@ class DepthSlice:
             alpha.mul_(transmittance[:-1].sign())
         weights = alpha * transmittance[:-1]
         found = []
-        if needs_moments:
+        if wanted.moments:
             value = torch.zeros_like(alpha)  # c . g
             for color, grad in zip(self._features(ids), grads, strict=True):
                 value.addcmul_(color[:, None], grad)
@@ -296,8 +315,9 @@ class DepthSlice:
             value.sub_(later[1:]).mul_(weights)
             if self._clamps:  # no derivative where alpha is held at its maximum
                 value.mul_((ALPHA_MAX - alpha).sign_())
-            found += _moments(value, dx, dy)
-        if needs_features:
+            absolute = _absolute(value, table, dx, dy) if wanted.absolute else []
+            found += _moments(value, dx, dy) + absolute
+        if wanted.features:
             product = torch.empty_like(weights)
             found += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
         return found
@@ -380,6 +400,16 @@ def _moments(slope: Tensor, dx: Tensor, dy: Tensor) -> list[Tensor]:
     turning = square.mul_(dx[:, None]).sum(2)
     x, y = columns * dx, rows * dy
     return [columns.sum(1), x.sum(1), y.sum(1), (x * dx).sum(1), (turning * dy).sum(1), (y * dy).sum(1)]
+
+
+def _absolute(slope: Tensor, table: Tensor, dx: Tensor, dy: Tensor) -> list[Tensor]:
+    """Sums over the pixels of |slope d(ln alpha)/d(mean)|, x and y, `(K, n)`."""
+    _, _, _, ax, ay, bx, by = table[:, :, None]
+    a = (ax * dx)[:, None] + (ay * dy)[:, :, None]
+    b = (bx * dx)[:, None] + (by * dy)[:, :, None]
+    square = slope.unflatten(1, (dy.shape[1], dx.shape[1]))
+    vectors = ((ax, bx), (ay, by))
+    return [(square * (a * u[:, None] + b * v[:, None])).abs_().sum((1, 2)) for u, v in vectors]
 
 
 def to_images(tiles: Tensor, grid: tuple[int, int], image_size: tuple[int, int]) -> Tensor:

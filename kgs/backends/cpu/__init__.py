@@ -41,10 +41,13 @@ class CpuBackend(Backend):
         """Float32 on a CPU, while no graph is traced."""
         return not torch.compiler.is_compiling() and super().covers(like)
 
-    def covers_compositing(self, projected: ProjectedGaussians, options: RasterOptions, chunk_size: int | None) -> bool:
-        """Only its own tile size, and no `chunk_size`."""
+    def covers_compositing(
+        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, chunk_size: int | None
+    ) -> bool:
+        """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
         narrow = projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
-        return options.tile_size in (None, self.tile_size) and chunk_size is None and narrow
+        one_block = not options.absgrad or features.shape[1] <= 8
+        return options.tile_size in (None, self.tile_size) and chunk_size is None and narrow and one_block
 
     def project(
         self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool

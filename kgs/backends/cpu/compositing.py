@@ -40,12 +40,12 @@ class CpuCompositing:
         self._blocks = _blocks(features.shape[1])
         channels = sum(width for _, width in self._blocks)
         # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of kept T
-        per_span = _NUMBER * (1 + 1 + 7 + channels + median_depth + 6 + channels)
+        per_span = _NUMBER * (1 + 1 + 7 + channels + median_depth + 6 + channels + 2 * options.absgrad)
         per_entry = _NUMBER * (1 + kernels.P // kernels.K)
         inputs = (projected.means2d, projected.factors, projected.opacities, features)
         fields = arrays(*inputs, projected.depths, projected.camera_ids)
         self._size, self._cameras, self._median_depth = projected.image_size, projected.num_cameras, median_depth
-        self._eps2d = np.float32(projected.eps2d)
+        self._eps2d, self._absgrad = np.float32(projected.eps2d), options.absgrad
         rules = self._eps2d, np.float32(options.alpha_threshold)
         most = max(2**12, options.max_bytes // (2 * per_span))
         threads = torch.get_num_threads()
@@ -75,21 +75,28 @@ class CpuCompositing:
     ) -> tuple[Tensor | None, ...]:
         """See `Compositor`."""
         needs_moments, needs_features = any(needs[:3]), needs[3]
+        needs_absolute = self._absgrad and needs[0]
         grads, behind = arrays(grad_features, grad_transmittance[:, 0])
         columns = self._coverage.table.shape[1] - 1 - self._median_depth
-        totals = np.zeros((len(self._coverage.ids), columns), np.float32)
+        totals = np.zeros((len(self._coverage.ids), columns + 2 * needs_absolute), np.float32)
         blank = (np.empty_like(behind), _nothing(3), _nothing(4))
         for rows in self._row_slices:
             part, done = self._forward(rows, blank, True) if kept is None else kept
             kept = None
-            self._backward(part, done, grads, behind, totals, (needs_moments, needs_features))
+            self._backward(part, done, grads, behind, totals, (needs_moments, needs_absolute, needs_features))
             del part, done  # before the next is made
         wanted = (*[needs_moments] * 3, needs_features)
         found = [x.new_empty(x.shape if need else (0, *x.shape[1:])) for x, need in zip(inputs, wanted, strict=True)]
         own = arrays(*inputs[1:3])
         rest = (self._coverage.ranks, totals, *own, self._eps2d, *arrays(*found))
         over(torch.get_num_threads(), len(inputs[0]), kernels.fill_gradients, *rest)
-        return tuple(x if need else None for x, need in zip(found, needs, strict=True))
+        absolute = None
+        if needs_absolute:
+            ranks = torch.from_numpy(self._coverage.ranks)
+            sums = torch.from_numpy(totals[:, -2:])
+            absolute = inputs[0].new_zeros(inputs[0].shape)
+            absolute[ranks >= 0] = sums[ranks[ranks >= 0]]
+        return *(x if need else None for x, need in zip(found, needs, strict=True)), absolute
 
     def _forward(self, rows: tuple[int, int], outputs: tuple[Floats, ...], keep: bool) -> tuple[RowSlice, list[_Done]]:
         """Fill transmittance, median depth and sums; without sums only compute what `backward` needs again."""

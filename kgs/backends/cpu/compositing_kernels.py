@@ -19,6 +19,7 @@ _ALPHA_MAX = f32(0.99)
 _FLOOR = f32(-126.0)  # of the exponent to base 2: below it floats are denormal
 _CENTRE = f32(0.5 * (SIZE - 1))
 _SLAB = 4 * P
+TWICE_LN2 = f32(1.3862943611198906)  # of the derivative of the exponent to base 2, by the whitening vectors
 _BLOCK = 64
 
 
@@ -136,7 +137,7 @@ def composite_forward(
 def composite_backward(
     first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, grads,
     grad_transmittance,
-    needs_moments, needs_features, sums,
+    needs_moments, needs_absolute, needs_features, sums,
 ):  # fmt: skip
     """For each member the six moments of dL/d ln alpha about its centre, and dL/d features.
 
@@ -155,8 +156,9 @@ def composite_backward(
         grads: dL/d sums, `(C, F, H, W)`.
         grad_transmittance: dL/d transmittance, `(C, H, W)`; used with the first block.
         needs_moments: whether the moments are needed.
+        needs_absolute: whether the sums of |dL/d mean| are needed, too.
         needs_features: whether dL/d features is needed.
-        sums: added to, `(members, 6 + F)`.
+        sums: added to, `(members, 6 + F)`, with those sums `(members, 6 + F + 2)`.
     """
     height, width = grad_transmittance.shape[1], grad_transmittance.shape[2]
     F = len(channels)
@@ -223,12 +225,24 @@ def composite_backward(
                         mxx += d * dx * dx
                         mxy += d * dx * dy
                         myy += d * dy * dy
+                        s[b + p] = d
                     sums[i, 0] += m0
                     sums[i, 1] += mx
                     sums[i, 2] += my
                     sums[i, 3] += mxx
                     sums[i, 4] += mxy
                     sums[i, 5] += myy
+                if needs_absolute:
+                    ax, ay, bx, by = layers[k, 3], layers[k, 4], layers[k, 5], layers[k, 6]
+                    ux, uy = layers[k, 1] - cx, layers[k, 2] - cy
+                    left_right = up_down = ZERO
+                    for p in range(P):
+                        dx, dy = pixels[p] - ux, pixels[P + p] - uy
+                        va, vb = ax * dx + ay * dy, bx * dx + by * dy
+                        left_right += abs(s[b + p] * (va * ax + vb * bx))
+                        up_down += abs(s[b + p] * (va * ay + vb * by))
+                    sums[i, sums.shape[1] - 2] += TWICE_LN2 * left_right
+                    sums[i, sums.shape[1] - 1] += TWICE_LN2 * up_down
                 if needs_features:
                     for f in range(F):
                         total = ZERO

@@ -1,0 +1,107 @@
+"""Absolute gradients of the centres: against one backward pass for each pixel, on every backend."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from factories import batch, random_camera, random_gaussians
+
+import kgs
+
+HEIGHT, WIDTH = 18, 13  # tiles that are not full
+
+
+def drawn(projected, features, backend, **options):
+    """The image and transmittance of one render, the centres as a leaf."""
+    centres = projected.means2d.detach().requires_grad_()
+    out = kgs.composite(replace(projected, means2d=centres), features, backend=backend, **options)
+    return centres, torch.cat([out.features, out.transmittance], 1)
+
+
+def scene(dtype, width=3):
+    gaussians = random_gaussians(40, 3, sh_degree=None)
+    cameras = batch(*(random_camera(HEIGHT, WIDTH, seed) for seed in (1, 2)))
+    projected = kgs.project(gaussians, cameras, backend="torch")
+    names = ("means2d", "factors", "opacities", "depths", "colors")
+    projected = replace(projected, **{name: getattr(projected, name).detach().to(dtype) for name in names})
+    generator = torch.Generator().manual_seed(5)
+    features = torch.rand(len(projected), width, generator=generator, dtype=torch.float64).to(dtype)
+    grads = torch.randn(2, width + 1, HEIGHT, WIDTH, generator=generator, dtype=torch.float64).to(dtype)
+    return projected, features, grads
+
+
+def by_pixel(projected, features, grads):
+    total = torch.zeros_like(projected.means2d)
+    for y in range(HEIGHT):
+        for x in range(WIDTH):
+            centres, image = drawn(projected, features, "torch")
+            (image * grads)[:, :, y, x].sum().backward()
+            total += centres.grad.abs()
+    return total
+
+
+@pytest.mark.parametrize(
+    ("backend", "dtype", "bound"),
+    [("torch", torch.float64, 1e-12), ("torch", torch.float32, 1e-5), ("numba", torch.float32, 1e-5)],
+)
+@pytest.mark.parametrize("options", [{}, {"max_bytes": 2**16}], ids=["whole", "slices"])
+def test_sums_of_absolute_values_over_pixels(backend, dtype, bound, options):
+    projected, features, grads = scene(dtype)
+    expected = by_pixel(*scene(torch.float64))
+    centres, image = drawn(projected, features, backend, absgrad=True, **options)
+    (image * grads).sum().backward()
+    assert (centres.absgrad - expected).abs().max() < bound * expected.max()
+    assert (centres.grad.abs() <= centres.absgrad * (1 + 1e-5) + 1e-7).all()
+    assert centres.grad.abs().sum() < 0.9 * centres.absgrad.sum()  # there is something to tell apart
+
+
+def test_gradients_are_the_same_with_and_without():
+    for backend in ("torch", "numba"):
+        projected, features, grads = scene(torch.float32)
+        found = []
+        for absgrad in (False, True):
+            centres, image = drawn(projected, features, backend, absgrad=absgrad)
+            (image * grads).sum().backward()
+            found.append(centres)
+        assert torch.equal(found[0].grad, found[1].grad)
+        assert not hasattr(found[0], "absgrad")
+
+
+def test_many_features_go_to_torch():
+    projected, features, grads = scene(torch.float32, width=9)
+    centres, image = drawn(projected, features, "auto", absgrad=True)
+    (image * grads).sum().backward()
+    expected, image = drawn(projected, features, "torch", absgrad=True)
+    (image * grads).sum().backward()
+    assert torch.equal(centres.absgrad, expected.absgrad)
+    with pytest.raises(ValueError, match=r"backend: .*numba"):
+        drawn(projected, features, "numba", absgrad=True)
+
+
+def test_the_renderer_leaves_them_for_the_densifier():
+    model = kgs.GaussianModel.from_points(torch.rand(50, 3) + torch.tensor([-0.5, -0.5, 2.0]), torch.rand(50, 3))
+    optimizer = torch.optim.Adam(model.parameters())
+    renderer = kgs.GaussianRenderer(absgrad=True)
+    out = renderer(model(), random_camera(HEIGHT, WIDTH, 1, torch.float32))
+    out.image.square().sum().backward()
+    assert (out.projected.means2d.absgrad >= out.projected.means2d.grad.abs() - 1e-6).all()
+    usual, absolute = (kgs.Densifier(model, optimizer, 1.0, absgrad=absgrad) for absgrad in (False, True))
+    for densifier in (usual, absolute):
+        densifier.observe(out.projected)
+    assert (absolute.mean_gradients >= usual.mean_gradients - 1e-6).all()
+    assert absolute.mean_gradients.sum() > 1.1 * usual.mean_gradients.sum()
+
+
+def test_the_densifier_says_what_is_missing():
+    model = kgs.GaussianModel.from_points(torch.rand(50, 3) + torch.tensor([-0.5, -0.5, 2.0]), torch.rand(50, 3))
+    out = kgs.GaussianRenderer()(model(), random_camera(HEIGHT, WIDTH, 1, torch.float32))
+    out.image.square().sum().backward()
+    densifier = kgs.Densifier(model, torch.optim.Adam(model.parameters()), 1.0, absgrad=True)
+    with pytest.raises(ValueError, match="means2d.absgrad, got None: the render needs absgrad=True"):
+        densifier.observe(out.projected)
+
+
+@pytest.mark.parametrize("value", [1, None, "yes"])
+def test_it_is_true_or_false(value):
+    with pytest.raises(ValueError, match="absgrad: expected True or False"):
+        kgs.RasterOptions(absgrad=value)
