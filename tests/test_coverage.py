@@ -11,7 +11,7 @@ from kgs.datasets.scene import pinholes
 from kgs.fit.config import FitConfig
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.metrics.coverage import _shown, measure_coverage
+from kgs.metrics.coverage import MIN_VIEWS, measure_coverage, views_that_show
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 10, 40, 20.0, 5.0
 
@@ -28,6 +28,10 @@ def rig(*centers):
 
 def wall(depth=DEPTH):
     return torch.full((HEIGHT, WIDTH), depth)
+
+
+def _shown(*given):
+    return views_that_show(*given) >= MIN_VIEWS
 
 
 def test_what_two_pictures_hold_is_shown():

@@ -1,9 +1,9 @@
 """A synthetic scene with exact poses and exact depth: a table with books, a lamp, a plant and a mug.
 
-It stands in a room, to be photographed from the front, or in a garden, to be photographed from all around. Meshes are
-trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing of kgs
-takes part in making the images. Four rays per pixel are averaged. The world depends on `kind` and `seed` only, never on
-the cameras.
+It stands in a room, to be photographed from the front, or in a garden, to be photographed from all around, or from an
+arc and before a sky at the horizon. Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a
+procedural texture is evaluated: nothing of kgs takes part in making the images. Four rays per pixel are averaged. The
+world depends on `kind` and `seed` only, never on the cameras.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,11 @@ from . import garden, room
 from .raycast import Array, raycast
 from .world import World
 
-KINDS = ("room", "orbit")
+KINDS = ("room", "orbit", "arc")
 SUPERSAMPLING = 2  # rays along each side of a pixel
+ARC_RADIUS = 2.6  # m from the middle of the arc's cameras to what they look at
+ARC_SPAN, ARC_HEIGHT = np.radians(25.0), 0.12  # half the extent of the arc's cameras: an angle, and m up and down
+ARC_CENTER = garden.CENTER + np.array([0.0, -0.2, 0.0])  # what they look at: the horizon is in the middle of the image
 
 
 class _Setup(NamedTuple):
@@ -32,6 +35,7 @@ class _Setup(NamedTuple):
 
     world: World
     place: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # places of so many training and test cameras
+    beyond: Callable[[int, float], Array]  # places of so many cameras, so many times as far out as the training cameras
     center: Array  # (3,), what they look at
     focal: float  # focal length over the longer side of the image
 
@@ -47,7 +51,8 @@ def synthetic_scene(
     Args:
         kind: "room": forward-facing cameras on a small patch before the table in a room, the test views between the
             training views and a little outside of them. "orbit": cameras on a circle around the table in a garden,
-            which look inwards, the test views between the training views.
+            which look inwards, the test views between the training views. "arc": cameras on an arc of 50 degrees
+            before the table in the garden, under a sky that is as good as infinitely far away.
         train_views: at least 1.
         test_views: at least 0.
         size: (height, width) of all images in pixels. The field of view is 58 degrees along the longer side.
@@ -87,6 +92,29 @@ def synthetic_views(
     return _views(setup, setup.center + eyes, size, "photo")
 
 
+def views_beyond(kind: str, out: float, count: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0) -> Views:
+    """Images of the synthetic scene from places `out` times as far from the middle of the training cameras as these.
+
+    The places are evenly spread over an ellipse whose half axes are those of the patch of the training cameras (of the
+    arc: an angle around the table, and a height), times `out`. Of the "orbit" it is a circle `out` times as large. All
+    cameras look at the middle of the scene.
+
+    Args:
+        kind: as given to `synthetic_scene`.
+        out: > 0; 1 is as far as the training cameras.
+        count: of cameras, at least 1.
+        size: as given to `synthetic_scene`.
+        seed: as given to `synthetic_scene`.
+
+    Raises:
+        ValueError: the kind is unknown, or a number is out of range.
+    """
+    if not 0.0 < out < np.inf or count < 1:
+        raise ValueError(f"out, count: expected a number > 0 and at least one camera, got {out} and {count}")
+    setup = _setup(kind, seed)
+    return _views(setup, setup.beyond(count, out), size, "beyond")
+
+
 def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) -> Tensor:
     """The true depth of the synthetic scene at the pixel centres of any cameras.
 
@@ -122,8 +150,11 @@ def _setup(kind: str, seed: int) -> _Setup:
 @lru_cache(maxsize=2)
 def _make_setup(kind: str, seed: int) -> _Setup:
     if kind == "room":
-        return _Setup(room.make_room(seed), _patch_eyes, room.CENTER, room.FOCAL)
-    return _Setup(garden.make_garden(seed), _orbit_eyes, garden.CENTER, garden.FOCAL)
+        return _Setup(room.make_room(seed), _patch_eyes, _eyes_beyond_patch, room.CENTER, room.FOCAL)
+    if kind == "arc":
+        far = garden.make_garden(seed, far_sky=True)
+        return _Setup(far, _arc_eyes, _eyes_beyond_arc, ARC_CENTER, garden.FOCAL)
+    return _Setup(garden.make_garden(seed), _orbit_eyes, _eyes_beyond_orbit, garden.CENTER, garden.FOCAL)
 
 
 def _views(setup: _Setup, eyes: Array, size: tuple[int, int], split: str) -> Views:
@@ -157,12 +188,29 @@ def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int
 
 def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Training cameras in a zigzag from left to right, test cameras spread over a patch 1.15 times as large."""
-    x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
-    # M. Roberts' R2 sequence: evenly spread, however many there are
-    spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
-    flat = np.concatenate([np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], -1), 1.15 * (2.0 * spread - 1.0)])
+    flat = _zigzag(train, test, rng)
     eyes = room.EYE + room.PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
     return eyes[:train], eyes[train:]
+
+
+def _eyes_beyond_patch(count: int, out: float) -> Array:
+    return np.asarray(room.EYE + out * _ellipse(count) * room.PATCH)
+
+
+def _arc_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """As `_patch_eyes`, on an arc around the table."""
+    eyes = _on_arc(_zigzag(train, test, rng))
+    return eyes[:train], eyes[train:]
+
+
+def _eyes_beyond_arc(count: int, out: float) -> Array:
+    return _on_arc(out * _ellipse(count)[:, :2])
+
+
+def _on_arc(flat: Array) -> Array:
+    """Places `(n, 3)` of coordinates `(n, 2)` along the arc and up, in halves of its extent."""
+    angles, heights = ARC_SPAN * flat[:, 0], ARC_HEIGHT * flat[:, 1]
+    return np.asarray(ARC_CENTER + ARC_RADIUS * np.stack([np.sin(angles), heights / ARC_RADIUS, -np.cos(angles)], -1))
 
 
 def _orbit_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -170,9 +218,33 @@ def _orbit_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array,
     gaps = np.arange(test) * train // max(test, 1) + rng.uniform(0.25, 0.75, size=test)
     angles = 2 * np.pi / train * np.concatenate([np.arange(train), gaps])
     heights = garden.HEIGHT + rng.uniform(-0.15, 0.15, size=train + test)
-    away = np.stack([garden.RADIUS * np.sin(angles), -heights, -garden.RADIUS * np.cos(angles)], axis=-1)
-    eyes = garden.CENTER + away
+    eyes = _on_circle(angles, heights, garden.RADIUS)
     return eyes[:train], eyes[train:]
+
+
+def _eyes_beyond_orbit(count: int, out: float) -> Array:
+    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
+    return _on_circle(angles, np.full(count, garden.HEIGHT), out * garden.RADIUS)
+
+
+def _on_circle(angles: Array, heights: Array, radius: float) -> Array:
+    """Places `(n, 3)` around the table; heights are above `garden.CENTER`."""
+    away = np.stack([radius * np.sin(angles), -heights, -radius * np.cos(angles)], axis=-1)
+    return np.asarray(garden.CENTER + away)
+
+
+def _zigzag(train: int, test: int, rng: np.random.Generator) -> Array:
+    """Coordinates `(train + test, 2)`: a zigzag in [-1, 1] x [-0.5, 0.5], and places spread over a square of 1.15."""
+    x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
+    # M. Roberts' R2 sequence: evenly spread, however many there are
+    spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
+    return np.concatenate([np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], -1), 1.15 * (2.0 * spread - 1.0)])
+
+
+def _ellipse(count: int) -> Array:
+    """Places `(n, 3)` evenly spread over the unit circle in the plane z = 0, the first at the right."""
+    turn = 2 * np.pi * np.arange(count) / count
+    return np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=-1)
 
 
 def _look_at(eye: Array, target: Array) -> Array:

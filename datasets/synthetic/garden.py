@@ -1,7 +1,7 @@
 """The garden of the synthetic scene: the room's table on a paved lawn under a sky, to be photographed from all around.
 
 A terrace of slabs lies around the table, grass beyond it; the sky is a dome with hills and clouds, not lit by the sun.
-The ground is y = 0.
+The ground is y = 0. The dome is 9 m away, or so far that the sky does not move with the camera.
 """
 
 import numpy as np
@@ -19,18 +19,24 @@ CENTER = np.array([0.0, -0.55, 1.75])  # what the cameras look at
 RADIUS, HEIGHT = 2.3, 0.55  # m: of the circle of the cameras, and of its middle above `CENTER`
 FOCAL = 0.9  # focal length over the longer side of the image
 SUN, SKY = np.array([-0.5, -0.75, -0.45]), np.array([0.0, -1.0, 0.0])  # towards the sun and the middle of the sky
-DOME, LAWN = 9.0, 20.0  # radius of the sky and side of the lawn: it ends behind the sky
+DOME = 9.0  # m: radius of the sky
+HORIZON_DISTANCE = 900.0  # m: radius of a sky that is as good as infinitely far away
+PLAIN = (
+    8.0  # m from the middle at which the grass has lost half its contrast, under a far sky: less for pixels to alias
+)
 TERRACE, SLAB, JOINT = 1.55, 0.42, 0.012  # radius of the terrace, side of a slab, half of the gap between two
 GRASS, MOSS = (96, 142, 62), (74, 96, 52)
 HORIZON, ZENITH, CLOUD = (222, 234, 242), (86, 146, 214), (255, 255, 255)
 FAR_HILLS, NEAR_HILLS = (132, 162, 150), (84, 128, 78)
 
 
-def make_garden(seed: int) -> World:
-    """The garden of a seed."""
+def make_garden(seed: int, far_sky: bool = False) -> World:
+    """The garden of a seed, its sky a dome around the lawn, or (`far_sky`) at the horizon."""
     rng = np.random.default_rng([seed, 3])
-    sky = put([make.Part(_dome(), _sky(rng))], CENTER[0], CENTER[2])
-    ground = put([make.sheet(LAWN, LAWN, _ground(rng))], CENTER[0], CENTER[2])
+    radius, fade = (HORIZON_DISTANCE, PLAIN) if far_sky else (DOME, np.inf)
+    sky = put([make.Part(_dome(radius), _sky(rng))], CENTER[0], CENTER[2])
+    lawn = 2.2 * radius  # its side: it ends behind the sky
+    ground = put([make.sheet(lawn, lawn, _ground(rng, fade))], CENTER[0], CENTER[2])
     return make_world(ground, [*things(rng), *_around(rng)], SUN, SKY, unlit=sky)
 
 
@@ -52,9 +58,9 @@ def _around(rng: np.random.Generator) -> list[Placed]:
     return placed
 
 
-def _dome() -> trimesh.Trimesh:
+def _dome(radius: float) -> trimesh.Trimesh:
     """The upper half of a ball of few faces, open below the horizon."""
-    ball = trimesh.creation.icosahedron().apply_scale(DOME)
+    ball = trimesh.creation.icosahedron().apply_scale(radius)
     ball.apply_transform(euler_matrix(0.3, 0.2, 0.0))
     above = ball.vertices[ball.faces][..., 2].max(axis=1) > 0
     return trimesh.Trimesh(ball.vertices, ball.faces[above], process=False)
@@ -90,8 +96,8 @@ def _sky(rng: np.random.Generator) -> Texture:
     return texture
 
 
-def _ground(rng: np.random.Generator) -> Texture:
-    """Slabs of stone, each of its own shade, with moss between them; grass beyond the terrace."""
+def _ground(rng: np.random.Generator, fade: float) -> Texture:
+    """Slabs of stone, each of its own shade, with moss between them; grass beyond the terrace, even beyond `fade` m."""
     patch, blades, grain = field(rng, 0.5, 2.0), field(rng, 0.05, 0.2), field(rng, 0.03, 0.15)
     shades, tints = rng.normal(size=(64, 64)), rng.normal(size=(64, 64))
     grass, moss = make.albedo(GRASS), make.albedo(MOSS)
@@ -105,9 +111,10 @@ def _ground(rng: np.random.Generator) -> Texture:
         tint = (0.5 + 0.35 * tints[column, row]).clip(0, 1)[:, None]
         slabs = (stone * (1 - tint) + warm * tint) * (1 + 0.1 * shades[column, row] + 0.06 * grain(points))[:, None]
         slabs = np.where(gap[:, None], moss * (1 + 0.15 * grain(points))[:, None], slabs)
-        lawn = grass * (1 + 0.14 * patch(points) + 0.16 * blades(points))[:, None]
-        edge = TERRACE + 0.05 * patch(points)
-        outside = np.hypot(points[:, 0], points[:, 1]) > edge
+        distance = np.hypot(points[:, 0], points[:, 1])
+        contrast = 1 / (1 + (distance / fade) ** 2)
+        lawn = grass * (1 + contrast * (0.14 * patch(points) + 0.16 * blades(points)))[:, None]
+        outside = distance > TERRACE + 0.05 * patch(points)
         return np.asarray(np.where(outside[:, None], lawn, slabs))
 
     return texture

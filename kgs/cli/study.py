@@ -8,7 +8,7 @@ from .options import Existing, Out
 def study(
     *,
     out: Out,
-    preset: Literal["quick", "cpu", "field", "field-long", "paper"] = "quick",
+    preset: Literal["quick", "cpu", "field", "field-long", "paper", "beyond"] = "quick",
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Existing | None = None,
@@ -20,15 +20,16 @@ def study(
       kgs study -o study
       KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
 
-    Writes sparse.jsonl, a line per finished fit, and the report, also when it is interrupted; the same command goes on
-    where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and
-    --scheduler.
+    Writes sparse.jsonl (beyond.jsonl), a line per finished fit, and the report, also when it is interrupted; the same
+    command goes on where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on
+    each, and --scheduler.
 
     Args:
-        out: folder for the results; fits that its sparse.jsonl has are not repeated.
+        out: folder for the results; fits that its JSONL file has are not repeated.
         preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
             field hours on the same in full size, field-long on three of them with 10 000 steps; paper is the paper's
-            10 000 steps on every scene there in the size it has, for a large machine.
+            10 000 steps on every scene there in the size it has, for a large machine; beyond measures the default from
+            cameras farther out than the photos', on two built-in scenes in minutes, with KGS_DATA on three more.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the fits instead; they find scenes and weights under
             the same paths.

@@ -4,7 +4,7 @@ A single training view does not determine depth, and what no view shows is a gue
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -47,7 +47,7 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
     shares = []
     for view in range(len(test)):
         camera = test.camera(view)
-        shown = _shown(median_depth(camera), camera, depths, train.cameras)
+        shown = views_that_show(median_depth(camera), camera, depths, train.cameras) >= MIN_VIEWS
         image = test.as_photo(render(camera)[0].cpu())
         errors = (image - test.images[view].cpu().to(image)).square().mean(dim=0)
         shares.append(float(shown.float().mean()))
@@ -58,8 +58,18 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
     return {"share": round(fmean(shares), 4), **means}
 
 
-def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: PinholeCamera) -> Tensor:
-    """Pixels of one camera that at least `MIN_VIEWS` of the others show, bool `(H, W)`, given the depths of all."""
+def views_that_show(depth: Tensor, camera: PinholeCamera, depths: Sequence[Tensor], cameras: PinholeCamera) -> Tensor:
+    """How many other cameras show the surface of each pixel of one camera, int64 `(H, W)`.
+
+    A camera shows it if it projects into that image and is no farther than `OCCLUDED` times the depth of the nearest
+    pixel there.
+
+    Args:
+        depth: of the one camera, `(H, W)`, 0 where there is nothing: no camera shows that.
+        camera: the one camera.
+        depths: of the others, each `(H, W)`.
+        cameras: the others.
+    """
     height, width = depth.shape
     pixels = torch.ones_like(depth).nonzero().flip(1)  # (x, y), row by row
     values = depth.reshape(-1).double()
@@ -70,4 +80,4 @@ def _shown(depth: Tensor, camera: PinholeCamera, depths: list[Tensor], cameras: 
         distance = distances[:, view]
         x, y, inside = nearest_pixels(places[:, view], distance, *there.mT.shape)
         count += (values > 0) & inside & (distance <= OCCLUDED * there[y, x])
-    return (count >= MIN_VIEWS).reshape(height, width)
+    return count.reshape(height, width)

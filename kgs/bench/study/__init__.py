@@ -8,11 +8,13 @@ from typing import Literal
 
 from kgs.errors import DataError
 
+Preset = Literal["quick", "cpu", "field", "field-long", "paper", "beyond"]
+
 
 def study(
     *,
     out: Path,
-    preset: Literal["quick", "cpu", "field", "field-long", "paper"] = "quick",
+    preset: Preset = "quick",
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Path | None = None,
@@ -24,14 +26,15 @@ def study(
       kgs study -o study
       KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
 
-    Writes sparse.jsonl, a line per fit as they come, and the report also when it is interrupted. For many machines:
-    `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
+    Writes sparse.jsonl (beyond.jsonl), a line per fit as they come, and the report also when it is interrupted. For
+    many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
 
     Args:
-        out: folder for the results; cells that its sparse.jsonl has are not repeated.
+        out: folder for the results; cells that its JSONL file has are not repeated.
         preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
             field hours on the same in full size, field-long on three of them with 10 000 steps; paper is the paper's
-            10 000 steps on every scene there in the size it has, for a large machine.
+            10 000 steps on every scene there in the size it has, for a large machine; beyond measures the default from
+            cameras farther out than the photos', on two built-in scenes in minutes, with KGS_DATA on three more.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the cells instead; they find scenes and weights under
             the same paths.
@@ -42,24 +45,30 @@ def study(
     Raises:
         DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
     """
-    from . import presets
+    from . import beyond, beyond_report, presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
     from .report import write_report
 
-    folder, path = os.environ.get("KGS_DATA"), out / "sparse.jsonl"
-    cells = presets.sparse_cells(preset, None if folder is None else Path(folder))
+    folder = os.environ.get("KGS_DATA")
+    place = None if folder is None else Path(folder)
+    if preset == "beyond":
+        cells, path = beyond.beyond_cells(place), out / "beyond.jsonl"
+        do, write = beyond.beyond_cell, beyond_report.write_beyond
+    else:
+        cells, path = presets.sparse_cells(preset, place), out / "sparse.jsonl"
+        do, write = sparse_cell, write_report
     data, weights = (None if place is None else os.path.abspath(place) for place in (folder, lpips_weights))
     if (report_only or read_rows(path)) and not finished_rows(cells, path):
         raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
-    work = partial(sparse_cell, data=data, lpips_weights=weights)
+    work = partial(do, data=data, lpips_weights=weights)
     try:
         if not report_only:
             run_grid(cells, work, path, scheduler=scheduler, processes=processes)
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
-            scenes = "" if preset == "quick" else "KGS_DATA=SCENES "
+            scenes = "" if preset == "quick" or folder is None else "KGS_DATA=SCENES "
             options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
-            write_report(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
+            write(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
     return int(len(rows) < len(cells))
