@@ -27,11 +27,15 @@ from kgs.io.ownership import is_own
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
 
 
-def test_the_bounds_are_those_of_the_scene_not_of_strays() -> None:
+SKY = 300 * torch.nn.functional.normalize(torch.randn(450, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+
+
+@pytest.mark.parametrize("around", [SKY[:0], SKY])
+def test_the_bounds_are_those_of_the_scene_not_of_strays_or_a_sky(around: torch.Tensor) -> None:
     """In each entry, as readers take every element of the list for a camera: none of them is anything else."""
     strays = torch.tensor([[900.0, 0.5, 0.5], [0.5, -900.0, 0.5], [0.5, 0.5, 900.0]])
     offset = torch.tensor([1e6, 2e6, -5.0]).double()
-    listed = camera_list([random_views(2)], offset, torch.cat([POINTS, strays]))
+    listed = camera_list([random_views(2)], offset, torch.cat([POINTS, strays, around]))
     assert all(
         {"position", "rotation", "img_name", "fx", "fy", "width", "height", "bounds"} <= set(each) for each in listed
     )

@@ -226,6 +226,7 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Ini
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     rules: dict[str, Any] = {"seed": config.seed, "count": config.init_points, "draw": config.draw}
+    rules["pixels"] = scene.train.images[:, 0].numel()
     rules |= {"file": config.init_file, "origin": scene.offset}  # files that kgs writes are in the world's coordinates
     return initial_points(views, kind, stage=stage, backend=config.backend, **rules)
 

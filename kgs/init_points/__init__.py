@@ -23,7 +23,7 @@ from kgs.geometry import (
 from kgs.io.console import Stage, silent
 from kgs.types import check_kind
 
-from .dense import dense_points
+from .dense import FEWEST, dense_points
 from .files import read_points
 from .tracks import find_tracks
 from .triangulate import triangulate_certain
@@ -56,7 +56,8 @@ def initial_points(
     kind: str = "dense",
     *,
     seed: int = 0,
-    count: int = 10_000,
+    count: int | None = 10_000,
+    pixels: int | None = None,
     file: str | PathLike[str] | None = None,
     origin: Tensor | None = None,
     stage: Stage = silent,
@@ -77,7 +78,9 @@ def initial_points(
             the SIFT points or else where the cameras look. "file": the points of a 3DGS PLY file, or of a cloud or
             mesh that trimesh reads, up to 1 GiB.
         seed: of the random draws.
-        count: how many points "random" gives, and "dense" at most; >= 1.
+        count: how many points "random" gives, and "dense" at most; >= 1. None: of "dense" one for every 3 pixels with
+            an agreed depth, 30 000 at least and 60 000 at most; of "random" 30 000.
+        pixels: how many pixels all images of the fit have, for a count of None; those of `views` unless given.
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world
             coordinates.
@@ -98,7 +101,7 @@ def initial_points(
         raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
     if draw not in DRAWS:
         raise ValueError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
-    if count < 1:
+    if count is not None and count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     if kind == "file":
         if file is None:
@@ -114,11 +117,12 @@ def initial_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = _sweep_range(points, views) if len(points) >= MIN_SIFT else (near, far)
-        dense, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw)
-        if agreed >= min(MIN_DENSE, count):
+        dense, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
+        if agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
             return InitialPoints(dense, colors, kind)
         message = f"initial points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
         warnings.warn(message, stacklevel=2)
+    count = FEWEST if count is None else count
     if kind in ("dense", "sift"):
         if len(points) >= MIN_SIFT:
             return InitialPoints(points.float(), _mean_colors(views, tracks.pixels, tracks.seen), "sift")

@@ -1,4 +1,9 @@
-"""Dense initial points: points of the training views' depth maps on which two views agree."""
+"""Dense initial points: points of the training views' depth maps on which two views agree.
+
+The sweep goes on to infinity, where the sky is: without points there a fit paints the sky with Gaussians among the
+things in front of it, which are fog for cameras beside the photos'. They are a minority of the points, so that the
+median of all depths stays that of the scene.
+"""
 
 import numpy as np
 import torch
@@ -6,50 +11,72 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.geometry import nearest_pixels, project_points, unproject
 from kgs.io.console import Stage, silent
 
+from .agreement import agreed_points, average_depths
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
-SCORE = 0.6  # least matching score of a point's patch
+SCORE = 0.35  # least matching score of a point's patch; noise has scores of up to 0.3 along a smooth surface
 MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000  # of one view, and of all views together
+SKY = 2.0  # times the depth where the scene ends: points beyond are those of a sky
+PER_SKY = 2  # points of the scene for each of a sky, at least
 SMALLEST = 64  # side of an image that is not halved just to need fewer planes
-# Two views agree on a point if their depths differ by less than this share, or its positions in the image by less than
-# so many pixels: where a point is far away or planes lie far apart, depths are less precise than positions.
-AGREEMENT, AGREEMENT_PIXELS = 0.01, 0.5
+# How many points where no number is given: one for so many pixels with an agreed depth, between two limits.
+PIXELS_OF_A_POINT, FEWEST, MOST = 3, 30_000, 60_000
 
 
 def dense_points(
     views: Views,
     near: float,
     far: float,
-    count: int,
+    count: int | None,
     generator: torch.Generator,
     stage: Stage = silent,
     backend: str = "auto",
     draw: str = "uniform",
+    pixels: int | None = None,
 ) -> tuple[Tensor, Tensor, int]:
-    """At most `count` points on which two views agree, between the depths `near` and `far`, drawn at random.
+    """At most `count` points on which two views agree, drawn at random.
 
-    Returns the points and RGB, both `(P, 3)`, and how many they were drawn from.
+    The scene lies between the depths `near` and `far`; what is farther gets points, too.
+
+    Returns the points and RGB, both `(P, 3)`, and from how many they were drawn, those of the sky not counted.
+
+    A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
+    `MOST`, in images that have together `pixels` pixels, or those of the views.
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
     where the pixels of both views are usable. To bound time and memory, images are halved until they are not too large
     together, and move by no more pixels than a sweep has planes.
     """
-    while (pixels := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * pixels > MOST_PIXELS_OF_ALL:
+    pixels = pixels or views.images[:, 0].numel()
+    while (size := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * size > MOST_PIXELS_OF_ALL:
         views = views.halved()
     while planes_wanted(views, near, far) > MOST_PLANES and min(views.images.shape[-2:]) >= 2 * SMALLEST:
         views = views.halved()
-    maps = sweep_depths(views, near, far, stage, backend)
+    maps = sweep_depths(views, near, far, stage, backend, to_infinity=True)
     certain = [there.is_inner & (there.scores > SCORE) for there in maps]
     if (usable := views.usable) is not None:
         certain = [good & there for good, there in zip(certain, usable.cpu(), strict=True)]
+    maps = average_depths(views, maps, certain)
     found = [_agreed(views, maps, certain, view) for view in range(len(views))]
     points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
+    if count is None:
+        agreed = round(pixels * len(points) / views.images[:, 0].numel())
+        count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), MOST)
+    view, x, y = places.unbind(1)
+    is_sky = torch.stack([there.depths for there in maps])[view, y, x] > SKY * far
     chosen = torch.randperm(len(points), generator=generator)
     chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
-    return points[chosen].float(), colors[chosen], len(points)
+    chosen = chosen[_with_less_sky(is_sky[chosen])]
+    return points[chosen].float(), colors[chosen], int((~is_sky).sum())
+
+
+def _with_less_sky(is_sky: Tensor) -> Tensor:
+    """The rows of all points but those of the sky, and of so many of these that there are `PER_SKY` others for each."""
+    most = int((~is_sky).sum()) // PER_SKY
+    rows: Tensor = (~is_sky | (is_sky.cumsum(0) <= most)).nonzero()[:, 0]
+    return rows
 
 
 def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
@@ -67,22 +94,8 @@ def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
 
 
 def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The points of one view's certain pixels that another view confirms, their colours, and their `(view, x, y)`."""
-    here, camera = maps[view].depths, views.camera(view)
-    rows, columns = certain[view].nonzero().unbind(1)
-    pixels = torch.stack([columns, rows], 1)
-    points = unproject(pixels, here[rows, columns].double(), torch.full_like(rows, view), views.cameras)
-    pixels, depths = project_points(points, views.cameras)
-    agreed = torch.zeros(len(points), dtype=torch.bool)
-    for other in set(range(len(views))) - {view}:
-        depth = depths[:, other]
-        x, y, inside = nearest_pixels(pixels[:, other], depth, *here.mT.shape)
-        there = maps[other].depths[y, x].double()
-        # The other view's pixel as this view sees it: at the other view's depth, and at that of the point.
-        seen, owners = torch.stack([x, y], 1), torch.full_like(x, other)
-        back = [project_points(unproject(seen, z, owners, views.cameras), camera)[0][:, 0] for z in (there, depth)]
-        apart = (back[0] - back[1]).norm(dim=1)
-        near = ((there / depth - 1).abs() < AGREEMENT) | (apart < AGREEMENT_PIXELS)
-        agreed |= inside & near & certain[other][y, x]
-    places = torch.stack([torch.full_like(rows, view), columns, rows], 1)[agreed]
-    return points[agreed], views.images[view].cpu()[:, rows, columns].mT[agreed], places
+    """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
+    points, pixels = agreed_points(views, maps, certain, view)
+    columns, rows = pixels.unbind(1)
+    places = torch.stack([torch.full_like(rows, view), columns, rows], 1)
+    return points, views.images[view].cpu()[:, rows, columns].mT, places

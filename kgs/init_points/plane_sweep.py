@@ -19,8 +19,10 @@ from kgs.io.console import Stage, silent
 from .sweep_costs import sweep_costs
 
 PLANES, MOST_PLANES = 128, 256  # limits; between them one plane for each pixel by which an image moves
+MOST_TO_INFINITY = 384  # planes of a sweep to infinity: these bound its memory
 NEIGHBOURS = 4  # at most
 BASELINE = 0.15  # of a neighbour, in units of the depth: shorter gives vague depths, longer more occlusion
+FARTHEST = 100.0  # what a sweep to infinity finds there is placed at so many times the depth where other sweeps end
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,20 @@ class DepthMap:
     is_inner: Tensor  # where the depth is not on the nearest or farthest plane
 
 
-def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, backend: str = "auto") -> list[DepthMap]:
+def sweep_depths(
+    views: Views,
+    near: float,
+    far: float,
+    stage: Stage = silent,
+    backend: str = "auto",
+    *,
+    to_infinity: bool = False,
+) -> list[DepthMap]:
     """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
+
+    With `to_infinity` planes go on beyond `far`, equally spaced, until one lies beyond infinity: an inverse depth below
+    0, so that infinity is not the last plane. There are at most `MOST_TO_INFINITY`, else farther apart. Depths are at
+    most `FARTHEST` times `far`.
 
     If all other views are at the place of a view, its depths are unknown and its scores -1.
     """
@@ -42,12 +56,16 @@ def sweep_depths(views: Views, near: float, far: float, stage: Stage = silent, b
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
     planes = min(max(math.ceil(planes_wanted(views, near, far)), PLANES), MOST_PLANES)
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
+    typical = 1 / float(inverse.mean())
+    if to_infinity:
+        spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MOST_TO_INFINITY - 2))
+        inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
-        if others := _neighbours(views, view, 1 / float(inverse.mean())):
+        if others := _neighbours(views, view, typical):
             homographies = torch.stack([_homographies(views.cameras, view, other, inverse) for other in others])
             costs, scores = sweep_costs(grey[view], grey[others], homographies, backend)
-            maps.append(_refine(costs, scores, inverse))
+            maps.append(_refine(costs, scores, inverse, FARTHEST * far))
         else:
             unknown = torch.full_like(grey[view], -1.0)
             maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
@@ -87,12 +105,15 @@ def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor
     return homographies
 
 
-def _refine(cost: Tensor, scores: Tensor, inverse: Tensor) -> DepthMap:
-    """The depth of the cheapest plane of each pixel, refined by the lowest point of a parabola through three planes."""
+def _refine(cost: Tensor, scores: Tensor, inverse: Tensor, most: float) -> DepthMap:
+    """The depth of the cheapest plane of each pixel, refined by the lowest point of a parabola through three planes.
+
+    It is at most `most`, also where the inverse depth is 0 or below.
+    """
     best = cost.argmin(0)
     inner = best.clamp(1, len(cost) - 2)
     left, middle, right = (cost.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
-    depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0]))
+    depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0])).clamp_min(1.0 / most)
     return DepthMap(depths, scores.gather(0, best[None])[0], (best > 0) & (best < len(cost) - 1))

@@ -14,8 +14,8 @@ from kgs.backends import takes_kernels
 
 WINDOW = 7  # pixels, the side of the patches that are compared
 # Prices of the smoothing, in units of 1 - NCC: of a step by one plane, and of a jump where the image has no edge.
-STEP, JUMP = 0.06, 0.5
-EDGE = 0.04  # the difference of grey values that halves the price of a jump
+STEP, JUMP = 0.1, 2.0
+EDGE = 0.02  # the difference of grey values that halves the price of a jump
 LEAST_JUMP = 1.5 * STEP
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
 _AT_ONCE = 8  # planes in a call of kernels; with 16, rows of scores and of volumes no longer fit into the cache

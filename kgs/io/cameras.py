@@ -16,6 +16,7 @@ from kgs.geometry import common_up
 from .ownership import MADE_BY
 
 _OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
+_DISTANT = 10.0  # times the median distance from the middle: a sky, which the bounds leave out before
 
 
 def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[dict[str, Any]]:
@@ -36,11 +37,14 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
     Returns:
         One dict per view: id (counted from 0), img_name, width, height, fx and fy (pixels), position (world units),
         rotation, bounds (two opposite corners of a box, in world units; beyond each of its sides lies a hundredth of
-        the centres; not without Gaussians), and generator, the version of kgs that wrote it.
+        the centres that are not in a sky; not without Gaussians), and generator, the version of kgs that wrote it.
     """
     box = dict[str, Any]()
     if len(means):
-        corners = np.quantile(means.detach().double().cpu().numpy(), [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+        places = means.detach().double().cpu().numpy()
+        distances = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        near = places[distances <= _DISTANT * np.median(distances)]
+        corners = np.quantile(near, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
         box["bounds"] = (corners + offset.double().cpu().numpy()).tolist()
     entries = list[dict[str, Any]]()
     for part in views:
