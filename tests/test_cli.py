@@ -58,7 +58,7 @@ def test_metrics_have_the_agreed_keys(fitted):
     assert metrics["test"]["lpips_vgg"] is None
     assert set(metrics["curve"][-1]) == {"step", "seconds", "test_psnr", "train_psnr"}
     assert metrics["curve"][-1]["test_psnr"] == pytest.approx(metrics["test"]["psnr"], abs=1e-2)  # before pruning
-    assert (metrics["steps"], metrics["drop"]) == (STEPS, 0.2)
+    assert (metrics["steps"], metrics["drop"]) == (STEPS, FitConfig().drop)
     assert metrics["init"] == {"kind": "random", "points": 10_000}
 
 
@@ -204,7 +204,7 @@ def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40, "--compare") == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
     assert set(runs) == {"generator", "without", "with"}
-    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, 0.2)
+    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, FitConfig().drop)
     assert runs["without"]["init"] == runs["with"]["init"]
     gain = runs["with"]["test"]["psnr"] - runs["without"]["test"]["psnr"]
     assert f"{gain:+.2f} dB" in capsys.readouterr().out

@@ -44,7 +44,7 @@ def test_a_reset_leaves_time_to_recover(steps):
 def test_the_default_leaves_out_resets_and_harmonics():
     times = timetable(PRESETS["auto"])
     assert (times.sh, times.reset) == ((), ())
-    assert times.densify == timetable(PAPER).densify
+    assert times.densify == timetable(replace(PAPER, steps=FitConfig().steps)).densify
 
 
 def test_plain_is_paper_without_dropping():
@@ -82,6 +82,12 @@ def test_values_out_of_range_or_of_another_kind_are_refused_by_name(name, value)
 def test_the_recipe_is_held_to_its_ranges_too(wrong):
     with pytest.raises(ValueError, match=rf"^{next(iter(wrong))}: expected"):
         Recipe(**wrong)
+
+
+def test_a_reset_may_not_remove_everything():
+    with pytest.raises(ValueError, match=r"^reset_opacity: expected a number above prune_opacity \(0.02\)"):
+        Recipe(reset_interval=3000)
+    assert Recipe(reset_interval=3000, prune_opacity=0.005).reset_opacity == 0.01
 
 
 def test_numpys_numbers_and_paths_as_text_become_pythons():

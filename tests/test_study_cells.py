@@ -58,12 +58,15 @@ def test_each_cell_is_there_once_and_is_a_fit(preset, data):
     for cell in cells:
         fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})
         config = FitConfig.from_dict(FitConfig().to_dict() | fit)
-        assert config.drop == METHODS[cell["method"]].get("drop", 0.2)
+        assert config.drop == METHODS[cell["method"]].get("drop", FitConfig().drop)
 
 
 def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
     cells = sparse_cells("field", data)
-    assert all(cell["downscale"] is None and cell["fit"]["steps"] == 2000 for cell in cells)
+    for cell in cells:
+        own = cell["method"] in (AUTO, AUTO_OFF)
+        assert cell["fit"]["steps"] == (FitConfig().steps if own else 2000)
+        assert cell["downscale"] is None
     forward, objects = cells[:27], cells[27:54]
     assert {cell["method"] for cell in cells[:54]} == {*MAIN}
     assert {(cell["scene"], cell["views"]) for cell in forward} == {*[*SCENES.items()][:3]}
@@ -183,8 +186,9 @@ def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
     for method in ("auto", "auto, off"):
         with pytest.raises(InterruptedError):
             sparse_cell(tiny_cell(method, start="random"))
-    assert drops == [0.2, 0.2]
-    assert [(config.drop, config.sh_degree) for config in configs] == [(0.2, 2), (0.0, 2)]
+    usual = FitConfig().drop
+    assert drops == [usual, usual]
+    assert [(config.drop, config.sh_degree) for config in configs] == [(usual, 2), (0.0, 2)]
 
 
 def test_a_scene_on_the_disk_and_its_own_points(folder):

@@ -66,7 +66,7 @@ def test_opacities_decay_or_are_reset_when_the_timetable_says(scene, points, mon
     trainer.fit()
     assert done == [("decay_opacity", step, 0.9) for step in range(16, 30)]  # the last step only looks
     done.clear()
-    recipe = Recipe(opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
+    recipe = Recipe(prune_opacity=0.005, opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
     trainer = Trainer(scene, replace(CONFIG, recipe=recipe), points)
     trainer.fit()
     assert done == [("reset_opacity", step, recipe.reset_opacity) for step in (9, 18)]
@@ -266,8 +266,9 @@ def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path)
 
 
 @pytest.mark.slow
-def test_nothing_is_dropped_in_the_last_tenth(scene, points):
-    trainer, active = Trainer(scene, replace(CONFIG, drop_until=0.9, evaluations=1), points), []
+@pytest.mark.parametrize(("undropped", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
+def test_nothing_is_dropped_in_the_last_steps(scene, points, undropped, last):
+    trainer, active = Trainer(scene, replace(CONFIG, undropped_steps=undropped, evaluations=1), points), []
 
     def note(trainer, _):
         active.append(trainer.drop.training)
@@ -275,7 +276,7 @@ def test_nothing_is_dropped_in_the_last_tenth(scene, points):
         return False
 
     trainer.fit(note)
-    assert active[:-1] == [True] * 27 + [False] * 2
+    assert active[:-1] == ([True] * last + [False] * (30 - last))[:-1]  # the curve is measured after the last one
 
 
 # -- backgrounds ------------------------------------------------------------------------------------------------------

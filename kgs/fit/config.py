@@ -58,12 +58,13 @@ class Recipe:
         densify_from: no densification up to this step.
         densify_interval: steps between two densifications.
         grad_threshold: least mean gradient, in normalised device coordinates, of a Gaussian that is densified.
+        absgrad: take gradients of each pixel by their absolute values (AbsGS), which are about four times as large.
         percent_dense: largest scale, as a fraction of the extent, of a Gaussian that is cloned; larger ones are split.
         prune_opacity: Gaussians below this opacity are removed.
         opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
         decay_from: share of the steps after which this decay begins, in [0, 1].
         reset_interval: steps between two resets of all opacities; 0: none.
-        reset_opacity: a reset lowers larger opacities to this.
+        reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
         near_plane: distance of the near plane, relative to the 1st percentile of the initial points' depths.
     """
@@ -78,12 +79,13 @@ class Recipe:
     lr_quats: _Weight = 0.004
     adam_eps: _Weight = 1e-15
     sh_interval: _Steps = 1000
-    dssim_weight: _Weight = 0.2
+    dssim_weight: _Weight = 0.4
     densify_from: _Count = 500
     densify_interval: _Steps = 100
-    grad_threshold: _Weight = 5e-4
+    grad_threshold: _Weight = 2e-3
+    absgrad: bool = True
     percent_dense: _Positive = 0.01
-    prune_opacity: _Share = 0.005
+    prune_opacity: _Share = 0.02
     opacity_decay: Annotated[float, _Range(0, 1, "(]")] = 0.995
     decay_from: _Share = 0.05
     reset_interval: _Count = 0
@@ -93,6 +95,9 @@ class Recipe:
 
     def __post_init__(self) -> None:
         _check(self)
+        if self.reset_interval and self.reset_opacity <= self.prune_opacity:
+            least = f"above prune_opacity ({self.prune_opacity:g}), or a reset would remove all Gaussians"
+            raise ValueError(f"reset_opacity: expected a number {least}, got {self.reset_opacity:g}")
 
 
 @dataclass(frozen=True)
@@ -106,7 +111,7 @@ class FitConfig:
         steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
-        drop_until: share of the steps, from the start, in which Gaussians are dropped; in [0, 1].
+        undropped_steps: in the last so many steps, a tenth of all at most, no Gaussian is dropped.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, short
             fits (probes) find out what the training views need.
         refine_poses: optimise the poses of the training cameras too. It helps where they are half a degree or more off,
@@ -118,7 +123,8 @@ class FitConfig:
             images see. scene: the random points that Blender's layout prescribes. model-points: points of a COLMAP
             model, which was refined with the test views too. file: points of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
-        init_points: the number of points of the init random, and the largest number of dense.
+        init_points: the number of points of the init random, and the largest number of dense. Unless given: of dense
+            one for every 3 pixels whose depth two views agree on, 30 000 to 60 000; of random 30 000.
         draw: how dense points are chosen. spread: one from each of as many equal cells of the images. uniform: each
             with the same probability.
         training_background: random: another colour in each step, so that a hole in the splat cannot pass for a surface
@@ -138,17 +144,17 @@ class FitConfig:
         ValueError: an entry is out of range or of the wrong type; the message begins with its name.
     """
 
-    steps: _Steps = 2000
-    drop: Annotated[float, _Range(0, 1, "[)")] = 0.2
+    steps: _Steps = 1500
+    drop: Annotated[float, _Range(0, 1, "[)")] = 0.3
     drop_schedule: Literal["linear", "constant"] = "linear"
-    drop_until: _Share = 0.9
+    undropped_steps: _Count = 50
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
     refine_poses: bool = False
     coarse: _Share = 0.0
     seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed has to fit torch's 64 bits
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"
     init_file: Path | None = None
-    init_points: Annotated[int, _Range(1, 10**9)] = 20_000
+    init_points: Annotated[int | None, _Range(1, 10**9)] = None
     draw: Literal["spread", "uniform"] = "spread"
     training_background: Literal["random", "scene"] = "random"
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
@@ -197,6 +203,7 @@ class Timetable(NamedTuple):
     densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
     reset: tuple[int, ...]  # after these all opacities are lowered
     evaluate: tuple[int, ...]  # after these the curve is measured (before a densification)
+    drop: int  # up to this one Gaussians are dropped
     coarse: int  # up to this one the training views are seen at half their width
 
 
@@ -216,6 +223,7 @@ def timetable(config: FitConfig) -> Timetable:
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
         reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
+        drop=steps - min(config.undropped_steps, round(0.1 * steps)),
         coarse=round(config.coarse * steps),
     )
 
@@ -253,13 +261,24 @@ def _convert(value: Any, hint: Any) -> tuple[Any, str]:
 
 # `paper`: the paper's rule and recipe, with its counts scaled. `plain`: the same without dropping.
 PAPER = FitConfig(
-    drop_until=1.0,
+    steps=2000,
+    drop=0.2,
+    undropped_steps=0,
     sh_degree=3,
     init_points=10_000,
     draw="uniform",
     training_background="scene",
     keep_all=True,
-    recipe=Recipe(lr_scales=0.005, lr_quats=0.001, opacity_decay=1.0, reset_interval=3000),
+    recipe=Recipe(
+        lr_scales=0.005,
+        lr_quats=0.001,
+        dssim_weight=0.2,
+        grad_threshold=5e-4,
+        absgrad=False,
+        prune_opacity=0.005,
+        opacity_decay=1.0,
+        reset_interval=3000,
+    ),
 )
 PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
 
@@ -271,8 +290,8 @@ class Detail(NamedTuple):
     entries: dict[str, Any]
 
 
-# Half the steps, a third of them on a quarter of the pixels; the default; and four times the pixels and Gaussians, for
-# half of the steps on a quarter of the pixels. docs/recipe.md has what each gains and costs.
+# Fewer steps, a third of them on a quarter of the pixels, and fewer points; the default; and four times the pixels, for
+# half of the steps on a quarter of them. docs/recipe.md has what each gains and costs.
 DETAILS = {
     "low": Detail(378, {"steps": 1000, "coarse": 0.3, "init_points": 12_000}),
     "normal": Detail(504, {}),

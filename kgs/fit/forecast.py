@@ -19,6 +19,7 @@ import torch
 from kgs.backends import resolve
 from kgs.camera import pinhole_cameras
 from kgs.errors import DataError
+from kgs.init_points.dense import FEWEST, MOST, PIXELS_OF_A_POINT
 from kgs.io.film import FRAMES, LONGEST
 from kgs.io.json_files import read_json, write_json
 from kgs.machine import check_device, versions
@@ -35,8 +36,9 @@ _KEYPOINT_SECONDS = 0.097
 _START = 3.0  # seconds until Python has loaded everything
 _CAMERAS = (12.0, 1.3, 0.55)  # seconds of finding cameras in photos of `_PHOTO_PIXELS`: once, for each photo and pair
 _PHOTO_PIXELS = 1.7e6
+_AGREED = 0.5  # of the pixels have a depth that two views agree on
 _VIEW = 1.5  # seconds of initial points for each view
-_STEP = (0.005, 5.2e-7, 1.6e-7)  # seconds of a training step: once, for each Gaussian and pixel
+_STEP = (0.005, 5.6e-7, 1.6e-7)  # seconds of a training step: once, for each Gaussian and pixel
 _PROBE = 1.3  # seconds of a probe's step, over those of a step of the fit with as many pixels
 _FRAME = (0.55, 2e-7)  # seconds of a frame of the film, over those of a step, and for each pixel besides
 _PAGE = 6.0  # seconds of measures, page and other files
@@ -70,9 +72,9 @@ def forecast(
         photo_pixels: pixels of one of these photos, as the cameras are found in it.
     """
     pixels = float(size[0] * size[1])
-    points = config.init_points
-    # The more initial points, the fewer are added; and few views do not have very many.
-    gaussians = min(0.5 * (points + most_gaussians(config, points)), 20_000 + 0.5 * points)
+    likely = _AGREED * views * pixels / PIXELS_OF_A_POINT
+    points = config.init_points or round(min(max(likely, FEWEST), MOST))
+    gaussians = min(most_gaussians(config, points), 1.1 * points)  # about as many fade as are added
     base, per_gaussian, per_pixel = _MEMORY
     memory = base + per_gaussian * gaussians + per_pixel * views * pixels
     device = check_device(config.device)

@@ -166,13 +166,18 @@ class Trainer:
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
         self.drop = self.make_drop(seed + 1)
         self.renderer = GaussianRenderer(
-            self.drop, near_plane=self.near_plane, max_bytes=config.max_bytes, backend=self.backend
+            self.drop,
+            near_plane=self.near_plane,
+            max_bytes=config.max_bytes,
+            absgrad=recipe.absgrad,
+            backend=self.backend,
         ).train()
         self.densifier = Densifier(
             self.model,
             self.optimizer,
             self.extent,
             grad_threshold=recipe.grad_threshold,
+            absgrad=recipe.absgrad,
             percent_dense=recipe.percent_dense,
             prune_opacity=recipe.prune_opacity,
             max_gaussians=self.max_gaussians,
@@ -356,7 +361,7 @@ class Trainer:
             target, moments = view.over(background)
         if self.drop is not None:
             self.drop.progress = progress
-            self.drop.train(progress <= config.drop_until)
+            self.drop.train(self.step <= self.times.drop)
         self.before_render(camera)
         gaussians = self.model()
         out = self.renderer(gaussians, camera, background)

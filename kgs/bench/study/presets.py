@@ -7,6 +7,7 @@ from typing import Any
 
 from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.errors import DataError
+from kgs.fit.config import FitConfig
 
 from .cells import FULL
 from .grid import Cell
@@ -47,8 +48,8 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     Args:
         preset: "quick": the synthetic scene, minutes. "cpu": the six scenes of `SCENES` in a quarter of the pixels of
             504x378, 2000 steps, and the synthetic one to be shown; hours. "field": the six scenes in full size, 2000
-            steps; hours. "field-long": the first three of them with 10 000 steps, one seed; hours. "paper": 10 000
-            steps in full size on every scene below `data`; days on a CPU.
+            steps, the default with its own number; hours. "field-long": the first three of them with 10 000 steps, one
+            seed; hours. "paper": 10 000 steps in full size on every scene below `data`; days on a CPU.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -61,9 +62,13 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
         raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
     else:
         blocks = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper}[preset](data)
+    fits = {method: _FITS[preset] | settings for method, settings in METHODS.items()}
+    if preset == "field":
+        for method in (AUTO, AUTO_OFF):
+            fits[method]["steps"] = FitConfig().steps
     return [
         {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
-        | {"downscale": 2.0 if preset == "cpu" else None, "fit": _FITS[preset] | METHODS[method]}
+        | {"downscale": 2.0 if preset == "cpu" else None, "fit": fits[method]}
         for block in blocks
         for seed, (scene, views), start, method in product(*block)
     ]
