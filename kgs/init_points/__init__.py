@@ -129,9 +129,9 @@ def initial_points(
         message = f"initial points: SIFT found {len(points)} in {len(views)} training views, fewer than {MIN_SIFT}; "
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
     points = _random_points(views, count, near, far, generator)
-    pixels, depths = project_points(points, views.cameras)
-    seen = inside_images(pixels, depths, views.cameras, near, far)
-    return InitialPoints(points.float(), _mean_colors(views, pixels, seen), "random")
+    places, depths = project_points(points, views.cameras)
+    seen = inside_images(places, depths, views.cameras, near, far)
+    return InitialPoints(points.float(), _mean_colors(views, places, seen), "random")
 
 
 def _within_typical_depths(points: Tensor, seen: Tensor, cameras: PinholeCamera) -> Tensor:
