@@ -74,7 +74,7 @@ def forecast(
     pixels = float(size[0] * size[1])
     likely = _AGREED * views * pixels / PIXELS_OF_A_POINT
     points = config.init_points or round(min(max(likely, FEWEST), MOST))
-    gaussians = min(most_gaussians(config, points), 1.1 * points)  # about as many fade as are added
+    gaussians = min(most_gaussians(config, points), 1.3 * points)
     base, per_gaussian, per_pixel = _MEMORY
     memory = base + per_gaussian * gaussians + per_pixel * views * pixels
     device = check_device(config.device)
