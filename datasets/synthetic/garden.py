@@ -21,9 +21,8 @@ FOCAL = 0.9  # focal length over the longer side of the image
 SUN, SKY = np.array([-0.5, -0.75, -0.45]), np.array([0.0, -1.0, 0.0])  # towards the sun and the middle of the sky
 DOME = 9.0  # m: radius of the sky
 HORIZON_DISTANCE = 900.0  # m: radius of a sky that is as good as infinitely far away
-PLAIN = (
-    8.0  # m from the middle at which the grass has lost half its contrast, under a far sky: less for pixels to alias
-)
+# Metres from the middle at which the grass has lost half its contrast, under a far sky: less for pixels to alias.
+PLAIN = 8.0
 TERRACE, SLAB, JOINT = 1.55, 0.42, 0.012  # radius of the terrace, side of a slab, half of the gap between two
 GRASS, MOSS = (96, 142, 62), (74, 96, 52)
 HORIZON, ZENITH, CLOUD = (222, 234, 242), (86, 146, 214), (255, 255, 255)

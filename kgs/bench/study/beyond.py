@@ -23,15 +23,13 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.synthetic import synthetic_depths, views_beyond
 from kgs.errors import DataError
-from kgs.fit.config import FitConfig
 from kgs.fit.run import choose_points
 from kgs.geometry import camera_centers
-from kgs.init_points import InitialPoints
 from kgs.metrics.coverage import views_that_show
 from kgs.metrics.evaluate import MEASURES
 from kgs.metrics.lpips import Lpips
 
-from .cells import fit_and_measure
+from .cells import fit_and_measure, fit_config
 from .grid import Cell
 from .presets import AUTO
 
@@ -91,9 +89,9 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
         What every cell stores of a fit; "test" and "train": the means of `evaluate`; "beyond": by distance, as text,
         what `measure_target` returns; of real scenes, whose test views are the outer ones, it is empty.
     """
-    settings = {name: value for name, value in cell["fit"].items() if name != "preset"}
-    config = FitConfig.from_dict(FitConfig().to_dict() | settings | {"seed": cell["seed"]})
-    scene, points = _start(cell["scene"], cell["views"], cell["downscale"], data, config)
+    config = fit_config("dense", cell["seed"], cell["fit"])
+    scene = _scene(cell["scene"], cell["views"], cell["downscale"], data)
+    points = choose_points(scene, config)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
     trainer, metrics, stored = fit_and_measure(scene, config, points, lpips)
     targets = synthetic_targets(cell["scene"], scene) if cell["scene"] in WORLDS else {}
@@ -170,10 +168,3 @@ def _scene(name: str, views: int, downscale: float | None, data: str | None) -> 
     if data is None:
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     return from_the_middle(load_scene(Path(data) / name, downscale=downscale, hold_out=0), views)
-
-
-def _start(
-    name: str, views: int, downscale: float | None, data: str | None, config: FitConfig
-) -> tuple[Scene, InitialPoints]:
-    scene = _scene(name, views, downscale, data)
-    return scene, choose_points(scene, config)

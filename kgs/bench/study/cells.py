@@ -50,7 +50,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     scene, points, seconds = _start(data, *known, preset)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
     settings, rival = _split(cell["fit"])
-    config = _config(cell["start"], cell["seed"], settings)
+    config = fit_config(cell["start"], cell["seed"], settings)
     probed = replace(config, drop=PRESETS[preset].drop)  # methods that differ in dropping decide alike
     trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed, rival)
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
@@ -114,7 +114,7 @@ def _start(
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
         scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
-    begin, config = time.process_time(), _config(start, seed, {"preset": preset})
+    begin, config = time.process_time(), fit_config(start, seed, {"preset": preset})
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback
         points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
     return scene, points, time.process_time() - begin
@@ -127,7 +127,8 @@ def _split(fit: dict[str, Any]) -> tuple[dict[str, Any], Rival | None]:
     return {name: value for name, value in fit.items() if name not in names}, Rival(**own) if own else None
 
 
-def _config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
+def fit_config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
+    """The configuration of a cell: a preset (paper unless `fit` names one), with a start, a seed and other settings."""
     values = {"preset": "paper", "init": "model-points" if start == FULL else start, "seed": seed, **fit}
     return replace(PRESETS[values.pop("preset")], **values)
 
