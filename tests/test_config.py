@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kgs import RasterOptions
-from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, timetable
+from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, number_of_steps, timetable
 
 
 def test_full_length_is_the_release():
@@ -44,7 +44,13 @@ def test_a_reset_leaves_time_to_recover(steps):
 def test_the_default_leaves_out_resets_and_harmonics():
     times = timetable(PRESETS["auto"])
     assert (times.sh, times.reset) == ((), ())
-    assert times.densify == timetable(replace(PAPER, steps=FitConfig().steps)).densify
+    assert times.densify == timetable(replace(PAPER, steps=times.steps)).densify
+
+
+@pytest.mark.parametrize(("views", "steps"), [(1, 1000), (3, 1000), (4, 1500), (12, 1500)])
+def test_more_than_three_views_take_more_steps_unless_a_number_is_given(views, steps):
+    assert number_of_steps(FitConfig(), views) == steps
+    assert number_of_steps(FitConfig(steps=7), views) == 7
 
 
 def test_plain_is_paper_without_dropping():
@@ -58,7 +64,7 @@ def test_config_survives_json():
 
 
 WRONG = {
-    "steps": (0, True, 2.0, "3", None, 10**8, 10**400, np.bool_(True)),
+    "steps": (0, True, 2.0, "3", 10**8, 10**400, np.bool_(True)),
     "drop": (1.0, -0.1, math.nan, None, "0.2", True),
     "sh_degree": (4, -1),
     "evaluations": (0,),

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kgs.errors import printable
-from kgs.fit.config import DEMO, Backend, FitConfig
+from kgs.fit.config import DEMO, DEMO_STEPS, Backend, FitConfig
 from kgs.io.console import VIEWER, as_line, each, say, say_next
 
 from .options import Out
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def demo(
     *,
     out: Out = Path("demo"),
-    steps: int = DEMO.steps,
+    steps: int = DEMO_STEPS,
     size: tuple[int, int] = (378, 504),
     compare: bool = False,
     seed: int = 0,

@@ -25,7 +25,7 @@ from kgs.io.json_files import is_number, parse_json
 from kgs.io.ownership import MADE_BY
 from kgs.io.results_folder import previous
 
-from .config import FitConfig
+from .config import FitConfig, timetable
 
 _FORMAT = f"checkpoint 4, {MADE_BY}"
 
@@ -125,18 +125,19 @@ def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig)
     Returns notes for the user, if a finished fit goes on for more steps.
     """
     steps, done, notes = state["config"]["steps"], state["step"], list[str]()
+    wanted = timetable(config).steps
     asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may continue on another device
     asked |= {"backend": state["backend"]} if config.backend == "auto" else {}
-    if steps == done < config.steps:
+    if steps == done < wanted:
         asked["steps"] = steps
         notes.append(
             f"trained on from step {done}, the end of a fit of {steps} steps: from here on learning rates, drop rate, "
-            f"densification and resets are those of {config.steps} steps, so that the result differs from a fit of "
-            f"{config.steps} steps from the start"
+            f"densification and resets are those of {wanted} steps, so that the result differs from a fit of "
+            f"{wanted} steps from the start"
         )
-    elif steps != config.steps or done > steps:
-        wanted = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
-        raise ValueError(f"steps: expected {wanted} got {config.steps}")
+    elif steps != wanted or done > steps:
+        expected = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
+        raise ValueError(f"steps: expected {expected} got {wanted}")
     _compare_settings(state["config"] | {"backend": state["backend"]}, asked)
     for part in ("training", "test"):
         for what, values in scene[part].items():

@@ -108,7 +108,7 @@ class FitConfig:
     last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0.
 
     Args:
-        steps: training steps; the counts of the recipe (10 000 steps) are scaled to it.
+        steps: training steps, to which the recipe's counts are scaled; None: 1000 for up to three views, 1500 for more.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
         undropped_steps: in the last so many steps, a tenth of all at most, no Gaussian is dropped.
@@ -144,7 +144,7 @@ class FitConfig:
         ValueError: an entry is out of range or of the wrong type; the message begins with its name.
     """
 
-    steps: _Steps = 1500
+    steps: Annotated[int | None, _Range(1, 10_000_000)] = None
     drop: Annotated[float, _Range(0, 1, "[)")] = 0.3
     drop_schedule: Literal["linear", "constant"] = "linear"
     undropped_steps: _Count = 50
@@ -196,9 +196,19 @@ class Choice(NamedTuple):
 CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3)}
 
 
+FEW_VIEWS = 3
+FEW_STEPS, MANY_STEPS = 1000, 1500  # of a fit to so few views, and to more
+
+
+def number_of_steps(config: FitConfig, views: int) -> int:
+    """The steps of a fit to so many training views."""
+    return config.steps or (FEW_STEPS if views <= FEW_VIEWS else MANY_STEPS)
+
+
 class Timetable(NamedTuple):
     """The steps at which things happen in a fit of a given length."""
 
+    steps: int  # all of them
     sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
     densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
     reset: tuple[int, ...]  # after these all opacities are lowered
@@ -212,13 +222,15 @@ def timetable(config: FitConfig) -> Timetable:
 
     A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
     10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.
+    A `steps` of None counts as that of a fit to more than three views.
     """
-    recipe, steps = config.recipe, config.steps
+    recipe, steps = config.recipe, config.steps or MANY_STEPS
     scale = steps / recipe.steps
     interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
     spacing = max(1, round(recipe.reset_interval * scale)) if recipe.reset_interval else steps
     resets, evaluations = [*range(spacing, steps, spacing), steps], range(1, config.evaluations + 1)
     return Timetable(
+        steps=steps,
         sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
         reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
@@ -230,7 +242,7 @@ def timetable(config: FitConfig) -> Timetable:
 
 def most_gaussians(config: FitConfig, points: int) -> int:
     """The number of Gaussians at which densification stops, in a fit from `points` initial points."""
-    return config.max_gaussians or max(10 * config.steps, 3 * points // 2)
+    return config.max_gaussians or max(10 * (config.steps or MANY_STEPS), 3 * points // 2)
 
 
 def _check(config: FitConfig | Recipe) -> None:
@@ -298,4 +310,5 @@ DETAILS = {
     "high": Detail(1000, {"coarse": 0.5, "init_points": 80_000}),
 }
 # A fit, its page and its film within a minute on two cores.
-DEMO = FitConfig(steps=350, coarse=0.3, init_points=12_000, max_gaussians=16_000, evaluations=4)
+DEMO_STEPS = 350
+DEMO = FitConfig(steps=DEMO_STEPS, coarse=0.3, init_points=12_000, max_gaussians=16_000, evaluations=4)

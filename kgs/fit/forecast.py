@@ -26,7 +26,7 @@ from kgs.machine import check_device, versions
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
-from .config import FitConfig, most_gaussians
+from .config import FitConfig, most_gaussians, number_of_steps
 from .probes import MIN_VIEWS, SHARE
 
 # Seconds of `_render` on the machine that the other constants are from, by backend; of torch so many that the ratio to
@@ -73,6 +73,7 @@ def forecast(
     """
     pixels = float(size[0] * size[1])
     likely = _AGREED * views * pixels / PIXELS_OF_A_POINT
+    steps = number_of_steps(config, views)
     points = config.init_points or round(min(max(likely, FEWEST), MOST))
     gaussians = min(most_gaussians(config, points), 1.3 * points)
     base, per_gaussian, per_pixel = _MEMORY
@@ -86,7 +87,7 @@ def forecast(
         once, per_gaussian, per_pixel = _STEP
         return renders * (once + per_gaussian * gaussians + per_pixel * pixels)
 
-    coarse = config.coarse * config.steps
+    coarse = config.coarse * steps
     film = min(1.0, LONGEST / max(size)) ** 2 * pixels
     seconds = {"start": _START * keypoints}
     if photos:
@@ -97,8 +98,8 @@ def forecast(
         seconds["initial points"] = renders * _VIEW * views
     if config.sh_degree is None and views >= MIN_VIEWS:
         small = min(gaussians, 0.1 * pixels)
-        seconds["probes"] = _PROBE * SHARE * config.steps * step(pixels / 4, small) + renders * _VIEW * views / 2
-    seconds["fit"] = coarse * step(pixels / 4) + (config.steps - coarse) * step(pixels)
+        seconds["probes"] = _PROBE * SHARE * steps * step(pixels / 4, small) + renders * _VIEW * views / 2
+    seconds["fit"] = coarse * step(pixels / 4) + (steps - coarse) * step(pixels)
     seconds["film and page"] = FRAMES * (_FRAME[0] * step(film) + _FRAME[1] * film * keypoints) + _PAGE * keypoints
     return Forecast(seconds, memory)
 

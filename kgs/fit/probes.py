@@ -21,7 +21,7 @@ from kgs.init_points import InitialPoints
 from kgs.io.console import Stage, silent
 from kgs.metrics.evaluate import BEST
 
-from .config import CHOICES, FitConfig, Recipe
+from .config import CHOICES, FitConfig, Recipe, number_of_steps
 from .trainer import Trainer
 
 MIN_VIEWS = 4  # training views, of which one can be left out
@@ -54,7 +54,7 @@ def decide(
     still_open = [name for name in CHOICES if getattr(config, name) is None]
     settled = replace(config, **{name: CHOICES[name].cheaper for name in still_open})
     views, fits = scene.train, 1 + len(still_open)
-    steps = math.floor(SHARE * config.steps / (FOLDS * fits))
+    steps = math.floor(SHARE * number_of_steps(config, len(views)) / (FOLDS * fits))
     why_not = ""
     if len(views) < MIN_VIEWS:
         why_not = "too few views to leave one out"

@@ -248,7 +248,7 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
             except OSError as error:
                 trainer.note(f"step {trainer.step}: no checkpoint: {error}")
 
-    with _interruptible() as stopped, progress(trainer.config.steps, title, trainer.step) as advance:
+    with _interruptible() as stopped, progress(trainer.times.steps, title, trainer.step) as advance:
 
         def after_step(trainer: Trainer, loss: float) -> bool:
             advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")

@@ -42,7 +42,7 @@ from .checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from .config import CHOICES, FitConfig, most_gaussians, timetable
+from .config import CHOICES, FitConfig, most_gaussians, number_of_steps, timetable
 from .divergence import gradient_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
 from .targets import targets
@@ -134,7 +134,7 @@ class Trainer:
     ) -> None:
         check_kind("scene", scene, Scene)
         self.scene = scene
-        self.config = config
+        self.config = config = replace(config, steps=number_of_steps(config, len(scene.train)))
         self.device = check_device(config.device)
         self.backend = resolve(config.backend, self.device)
         self.times = timetable(config)
@@ -149,7 +149,7 @@ class Trainer:
         self._background = scene.background.to(self.device, torch.float32) if scene.background.any() else None
         self._views = targets(scene.train, scene.background, self.device)
         self._halved = targets(scene.train.halved(), scene.background, self.device) if self.times.coarse else []
-        self.poses = MovingPoses(scene.train.cameras.extrinsics, config.steps) if config.refine_poses else None
+        self.poses = MovingPoses(scene.train.cameras.extrinsics, self.times.steps) if config.refine_poses else None
         self._build(points if isinstance(points, Start) else Start.from_points(scene, config, points))
 
     def _build(self, start: Start) -> None:
@@ -205,7 +205,7 @@ class Trainer:
         Raises:
             TrainingDiverged: something is not finite, and that step has changed no parameter; or a scale explodes.
         """
-        while self.step < self.config.steps:
+        while self.step < self.times.steps:
             loss = self.train_step()
             if callback is not None and callback(self, loss):
                 return
@@ -217,8 +217,8 @@ class Trainer:
             TrainingDiverged: see :meth:`fit`.
             ValueError: all steps of the configuration are done.
         """
-        if self.step >= self.config.steps:
-            raise ValueError(f"steps: expected a step of {self.config.steps} to be left, got none")
+        if self.step >= self.times.steps:
+            raise ValueError(f"steps: expected a step of {self.times.steps} to be left, got none")
         start = time.perf_counter()
         self.shown, self._part = self.model, {}
         loss, step = self._descend(), self.step
@@ -230,7 +230,7 @@ class Trainer:
         if step in self.times.densify:
             self._stop_if(scale_fault(self.model, self.extent))
             first, most = self.init["points"], self.max_gaussians
-            growing = self.config.growth * self.config.steps  # steps until the limit is reached
+            growing = self.config.growth * self.times.steps  # steps until the limit is reached
             share = min(1.0, step / growing) if growing else 1.0
             self.densifier.max_gaussians = first + round(share * (most - first))
             capped = self.densifier.step().capped
@@ -347,7 +347,7 @@ class Trainer:
     def _descend(self) -> float:
         config, recipe = self.config, self.config.recipe
         self.step += 1
-        progress = self.step / config.steps
+        progress = self.step / self.times.steps
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
         self.optimizer.param_groups[0]["lr"] = self.extent * rate
         degree = sum(self.step >= step for step in self.times.sh)
@@ -377,7 +377,7 @@ class Trainer:
             self._stop_if(gradient_fault(self.model))
             if out.projected.means2d.grad is not None:
                 self.densifier.observe(out.projected)
-            if self.step < config.steps:  # as in the official release, the last step changes no parameter
+            if self.step < self.times.steps:  # as in the official release, the last step changes no parameter
                 self.optimizer.step()
                 if recipe.opacity_decay < 1.0 and progress > recipe.decay_from:
                     self.densifier.decay_opacity(recipe.opacity_decay)

@@ -7,7 +7,6 @@ from typing import Any
 
 from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.errors import DataError
-from kgs.fit.config import FitConfig
 
 from .cells import FULL
 from .grid import Cell
@@ -65,7 +64,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     fits = {method: _FITS[preset] | settings for method, settings in METHODS.items()}
     if preset == "field":
         for method in (AUTO, AUTO_OFF):
-            fits[method]["steps"] = FitConfig().steps
+            fits[method]["steps"] = None  # their own number
     return [
         {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
         | {"downscale": 2.0 if preset == "cpu" else None, "fit": fits[method]}
