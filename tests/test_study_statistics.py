@@ -20,7 +20,7 @@ from kgs.bench.study.pairs import (
     paired_difference,
     wide,
 )
-from kgs.bench.study.published import PUBLISHED, benchmark_of, published, published_difference
+from kgs.bench.study.published import PUBLISHED, benchmark_of, priors, published, published_difference
 from kgs.bench.study.tables import BEST_OF_5, sparse_tables
 
 PAPER = "progressive 0.2"
@@ -279,6 +279,7 @@ def test_the_papers_figures():
     assert published_difference("Mip-NeRF 360", 24, PAPER, "off") == "+1.33 or +1.12"  # the second from the text
     assert published_difference("LLFF", 3, "fixed 0.1", PAPER) == "-0.28"  # of the same table
     assert published_difference("LLFF", 3, "near", "off") == "-1.73"
+    assert [priors("llff/fern", *of) for of in ((3, 504), (3, 252), (6, 504))] == ["23.84", "-", "-"]
     assert published_difference("Blender", 8, PAPER, "off") == "+3.86"
     assert published_difference("Blender", 8, "fixed 0.1", "off") == published_difference(None, 3, PAPER, "off") == "-"
     printed = PUBLISHED

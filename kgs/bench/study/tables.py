@@ -9,14 +9,14 @@ from kgs.bench.output import mean_sd
 from .findings import headline, regret
 from .pairs import KEYS, LPIPS, PSNR, difference, grouped, main_cells, noise_floor, wide
 from .presets import AUTO, AUTO_OFF, FAMILIES, MAIN, OFF, PAPER
-from .published import benchmark_of, published, published_difference
+from .published import benchmark_of, priors, published, published_difference
 
 QUALITY = {PSNR: "PSNR [dB]", "test.ssim_zero_padded": "SSIM", LPIPS: "LPIPS"}
 _COST = {"PSNR, training less test views [dB]": "gap", "wall clock [s]": "wall_seconds", "CPU [s]": "cpu_seconds"}
 _COST |= {"Gaussians": "gaussians", "peak memory [MiB]": "peak_rss_mb", "co-adaptation [1e-3]": "thousandths"}
 _HEADLINE = "Paired differences of the means over scenes; those of one scene have their interval over seeds"
 _TITLE = """Test views: mean (sd) over n seeds; paired differences over off with their 95 % intervals; the paper's \
-figures are means of all its scenes in other sizes, best of five runs: not comparable in level, only in direction"""
+figures are means of all its scenes after more steps, best of five runs: comparable in direction, not in level"""
 _REGRET = """Regret: the default against the best of a scene's other methods, picked after the fact on the same test \
 views; that flatters what is picked, the more so out of many"""
 BEST_OF_5 = 1.163  # how far the best of five runs lies over the mean on average, in standard deviations
@@ -83,6 +83,7 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
         return lines
     benchmark, names = _benchmark(cells), ", ".join(scene.rpartition("/")[2] for scene in scenes)
     name = mean.format(len(scenes), names) if mean else _setting(cells)
+    known = "-" if mean else priors(scenes[0], cells.views.iloc[0], max(cells["protocol.image_size"].iloc[0]))
     for method in methods:
         if cells[cells.method == method].scene.nunique() == len(scenes):
             psnr, ssim, lpips = (wide(cells, measure, method=method).dropna().mean(axis=1) for measure in QUALITY)
@@ -91,6 +92,7 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
             for base in bases:
                 line[f"over {base} [dB] (pairs)"] = _gain(cells, method, base)
                 line[f"LPIPS over {base}"] = difference(cells, "method", method, base, LPIPS).text(3)
+            line["pretrained priors: PSNR"] = known
             line["paper: PSNR / SSIM / LPIPS"] = published(*benchmark, method)
             lines.append(line | {f"paper: over {b}": published_difference(*benchmark, method, b) for b in bases})
     return lines
