@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kgs import RasterOptions
-from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, number_of_steps, timetable
+from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, timetable, with_pace
 
 
 def test_full_length_is_the_release():
@@ -48,9 +48,11 @@ def test_the_default_leaves_out_resets_and_harmonics():
 
 
 @pytest.mark.parametrize(("views", "steps"), [(1, 1000), (3, 1000), (4, 1500), (12, 1500)])
-def test_more_than_three_views_take_more_steps_unless_a_number_is_given(views, steps):
-    assert number_of_steps(FitConfig(), views) == steps
-    assert number_of_steps(FitConfig(steps=7), views) == 7
+def test_more_than_three_views_take_more_steps_and_fade_more_slowly(views, steps):
+    config = with_pace(FitConfig(), views)
+    assert (config.steps, config.recipe.opacity_decay) == (steps, 0.9925 if views <= 3 else 0.995)
+    given = FitConfig(steps=7, recipe=Recipe(opacity_decay=0.5))
+    assert with_pace(given, views) == given
 
 
 def test_plain_is_paper_without_dropping():

@@ -14,6 +14,7 @@ from kgs import GaussianModel
 from kgs.datasets import synthetic_scene
 from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit import probes as needs
+from kgs.fit.config import with_pace
 from kgs.fit.probes import decide
 from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
 from kgs.fit.run import choose_points
@@ -51,7 +52,7 @@ def test_too_few_views_to_leave_one_out_follow_the_rule(views):
     scene = synthetic_scene(train_views=views, size=(48, 64))
     config, found = decide(scene, OPEN, None)
     by_rule = {"chosen": 0, "by": "rule", "why": "too few views to leave one out"}
-    assert (config, found) == (replace(OPEN, sh_degree=0), {"sh_degree": by_rule})
+    assert (config, found) == (with_pace(replace(OPEN, sh_degree=0), views), {"sh_degree": by_rule})
 
 
 def test_without_steps_for_probes_the_rule_decides(eight):
@@ -65,7 +66,7 @@ def test_in_small_pictures_the_rule_decides(eight):
 
 
 def test_what_is_given_is_not_decided(eight):
-    config = replace(OPEN, sh_degree=2)
+    config = with_pace(replace(OPEN, sh_degree=2), 8)
     assert decide(eight, config, None) == (config, {})
 
 
@@ -82,7 +83,7 @@ def test_what_is_given_is_not_decided(eight):
 def test_the_dearer_choice_has_to_gain_more_than_noise(monkeypatch, eight, levels, chosen, gain, noise):
     monkeypatch.setattr(needs, "Trainer", Probes(levels))
     config, found = decide(eight, OPEN, choose_points)
-    assert config == replace(OPEN, sh_degree=chosen)
+    assert config == with_pace(replace(OPEN, sh_degree=chosen), 8)
     assert found["sh_degree"]["gain"] == pytest.approx(gain, abs=1e-3)
     assert found["sh_degree"]["noise"] == pytest.approx(noise, abs=1e-3)
     assert (found["sh_degree"]["chosen"], found["sh_degree"]["over"]) == (chosen, 3 - chosen)

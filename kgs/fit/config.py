@@ -62,6 +62,7 @@ class Recipe:
         percent_dense: largest scale, as a fraction of the extent, of a Gaussian that is cloned; larger ones are split.
         prune_opacity: Gaussians below this opacity are removed.
         opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
+            None: 0.9925 for up to three training views, 0.995 for more.
         decay_from: share of the steps after which this decay begins, in [0, 1].
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
@@ -86,7 +87,7 @@ class Recipe:
     absgrad: bool = True
     percent_dense: _Positive = 0.01
     prune_opacity: _Share = 0.02
-    opacity_decay: Annotated[float, _Range(0, 1, "(]")] = 0.995
+    opacity_decay: Annotated[float | None, _Range(0, 1, "(]")] = None
     decay_from: _Share = 0.05
     reset_interval: _Count = 0
     reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
@@ -196,13 +197,23 @@ class Choice(NamedTuple):
 CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3)}
 
 
+class Pace(NamedTuple):
+    """The length of a fit, and how fast opacities fade in it: with more views it takes longer until one comes again."""
+
+    steps: int
+    opacity_decay: float
+
+
 FEW_VIEWS = 3
-FEW_STEPS, MANY_STEPS = 1000, 1500  # of a fit to so few views, and to more
+FEW, MANY = Pace(1000, 0.9925), Pace(1500, 0.995)  # of a fit to so few training views, and to more
 
 
-def number_of_steps(config: FitConfig, views: int) -> int:
-    """The steps of a fit to so many training views."""
-    return config.steps or (FEW_STEPS if views <= FEW_VIEWS else MANY_STEPS)
+def with_pace(config: FitConfig, views: int) -> FitConfig:
+    """The configuration with the numbers for so many training views, where it leaves them open."""
+    pace, recipe = FEW if views <= FEW_VIEWS else MANY, config.recipe
+    if recipe.opacity_decay is None:
+        recipe = replace(recipe, opacity_decay=pace.opacity_decay)
+    return replace(config, steps=config.steps or pace.steps, recipe=recipe)
 
 
 class Timetable(NamedTuple):
@@ -224,7 +235,7 @@ def timetable(config: FitConfig) -> Timetable:
     10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.
     A `steps` of None counts as that of a fit to more than three views.
     """
-    recipe, steps = config.recipe, config.steps or MANY_STEPS
+    recipe, steps = config.recipe, config.steps or MANY.steps
     scale = steps / recipe.steps
     interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
     spacing = max(1, round(recipe.reset_interval * scale)) if recipe.reset_interval else steps
@@ -242,7 +253,7 @@ def timetable(config: FitConfig) -> Timetable:
 
 def most_gaussians(config: FitConfig, points: int) -> int:
     """The number of Gaussians at which densification stops, in a fit from `points` initial points."""
-    return config.max_gaussians or max(10 * (config.steps or MANY_STEPS), 3 * points // 2)
+    return config.max_gaussians or max(10 * (config.steps or MANY.steps), 3 * points // 2)
 
 
 def _check(config: FitConfig | Recipe) -> None:

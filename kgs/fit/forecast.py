@@ -26,7 +26,7 @@ from kgs.machine import check_device, versions
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians
 
-from .config import FitConfig, most_gaussians, number_of_steps
+from .config import FitConfig, most_gaussians, timetable, with_pace
 from .probes import MIN_VIEWS, SHARE
 
 # Seconds of `_render` on the machine that the other constants are from, by backend; of torch so many that the ratio to
@@ -73,7 +73,7 @@ def forecast(
     """
     pixels = float(size[0] * size[1])
     likely = _AGREED * views * pixels / PIXELS_OF_A_POINT
-    steps = number_of_steps(config, views)
+    steps = timetable(with_pace(config, views)).steps
     points = config.init_points or round(min(max(likely, FEWEST), MOST))
     gaussians = min(most_gaussians(config, points), 1.3 * points)
     base, per_gaussian, per_pixel = _MEMORY

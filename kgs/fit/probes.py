@@ -21,7 +21,7 @@ from kgs.init_points import InitialPoints
 from kgs.io.console import Stage, silent
 from kgs.metrics.evaluate import BEST
 
-from .config import CHOICES, FitConfig, Recipe, number_of_steps
+from .config import CHOICES, FitConfig, Recipe, timetable, with_pace
 from .trainer import Trainer
 
 MIN_VIEWS = 4  # training views, of which one can be left out
@@ -51,10 +51,11 @@ def decide(
         "probes"; for a rule "why"; for probes "over" (the other value), "gain" (of the more expensive value, in dB),
         "noise" (its standard error) and "n" (the number of left-out views).
     """
+    config = with_pace(config, len(scene.train))
     still_open = [name for name in CHOICES if getattr(config, name) is None]
     settled = replace(config, **{name: CHOICES[name].cheaper for name in still_open})
     views, fits = scene.train, 1 + len(still_open)
-    steps = math.floor(SHARE * number_of_steps(config, len(views)) / (FOLDS * fits))
+    steps = math.floor(SHARE * timetable(config).steps / (FOLDS * fits))
     why_not = ""
     if len(views) < MIN_VIEWS:
         why_not = "too few views to leave one out"
@@ -113,5 +114,6 @@ def _shortened(config: FitConfig, steps: int) -> FitConfig:
     """The same fit in few steps with higher learning rates."""
     recipe = config.recipe
     rates = {name: RATE_FACTOR * getattr(recipe, name) for name in Recipe.__annotations__ if name.startswith("lr_")}
-    recipe = replace(recipe, opacity_decay=recipe.opacity_decay**RATE_FACTOR, **rates)
+    decay = None if recipe.opacity_decay is None else recipe.opacity_decay**RATE_FACTOR
+    recipe = replace(recipe, opacity_decay=decay, **rates)
     return replace(config, steps=steps, evaluations=1, refine_poses=False, recipe=recipe)

@@ -42,7 +42,7 @@ from .checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from .config import CHOICES, FitConfig, most_gaussians, number_of_steps, timetable
+from .config import CHOICES, FitConfig, most_gaussians, timetable, with_pace
 from .divergence import gradient_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
 from .targets import targets
@@ -134,7 +134,7 @@ class Trainer:
     ) -> None:
         check_kind("scene", scene, Scene)
         self.scene = scene
-        self.config = config = replace(config, steps=number_of_steps(config, len(scene.train)))
+        self.config = config = with_pace(config, len(scene.train))
         self.device = check_device(config.device)
         self.backend = resolve(config.backend, self.device)
         self.times = timetable(config)
@@ -379,8 +379,9 @@ class Trainer:
                 self.densifier.observe(out.projected)
             if self.step < self.times.steps:  # as in the official release, the last step changes no parameter
                 self.optimizer.step()
-                if recipe.opacity_decay < 1.0 and progress > recipe.decay_from:
-                    self.densifier.decay_opacity(recipe.opacity_decay)
+                decay = recipe.opacity_decay
+                if decay is not None and decay < 1.0 and progress > recipe.decay_from:
+                    self.densifier.decay_opacity(decay)
                 if self.poses is not None:
                     self.scene = self.poses.step(self.scene, progress)
             self.optimizer.zero_grad(set_to_none=True)
