@@ -51,6 +51,7 @@ def test_the_default_leaves_out_resets_and_harmonics():
 def test_more_than_three_views_take_more_steps_and_fade_more_slowly(views, steps):
     config = with_pace(FitConfig(), views)
     assert (config.steps, config.recipe.opacity_decay) == (steps, 0.9925 if views <= 3 else 0.995)
+    assert with_pace(FitConfig(steps=1001), views).recipe.opacity_decay == 0.995
     given = FitConfig(steps=7, recipe=Recipe(opacity_decay=0.5))
     assert with_pace(given, views) == given
 

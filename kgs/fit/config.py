@@ -62,7 +62,7 @@ class Recipe:
         percent_dense: largest scale, as a fraction of the extent, of a Gaussian that is cloned; larger ones are split.
         prune_opacity: Gaussians below this opacity are removed.
         opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
-            None: 0.9925 for up to three training views, 0.995 for more.
+            None: 0.9925 for up to three training views and 1000 steps, else 0.995.
         decay_from: share of the steps after which this decay begins, in [0, 1].
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
@@ -198,7 +198,7 @@ CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3)}
 
 
 class Pace(NamedTuple):
-    """The length of a fit, and how fast opacities fade in it: with more views it takes longer until one comes again."""
+    """The length of a fit, and how fast opacities fade: with more views, what only some show is seen less often."""
 
     steps: int
     opacity_decay: float
@@ -210,10 +210,12 @@ FEW, MANY = Pace(1000, 0.9925), Pace(1500, 0.995)  # of a fit to so few training
 
 def with_pace(config: FitConfig, views: int) -> FitConfig:
     """The configuration with the numbers for so many training views, where it leaves them open."""
-    pace, recipe = FEW if views <= FEW_VIEWS else MANY, config.recipe
+    few, recipe = views <= FEW_VIEWS, config.recipe
+    steps = config.steps or (FEW if few else MANY).steps
     if recipe.opacity_decay is None:
+        pace = FEW if few and steps <= FEW.steps else MANY
         recipe = replace(recipe, opacity_decay=pace.opacity_decay)
-    return replace(config, steps=config.steps or pace.steps, recipe=recipe)
+    return replace(config, steps=steps, recipe=recipe)
 
 
 class Timetable(NamedTuple):
