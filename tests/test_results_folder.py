@@ -19,7 +19,7 @@ from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError, TrainingDiverged
 from kgs.fit import run
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
-from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.config import FitConfig, Recipe, with_pace
 from kgs.fit.run import fit_scene
 from kgs.fit.saved import load_fit
 from kgs.fit.trainer import Trainer
@@ -282,6 +282,7 @@ def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -
 
 def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
     saved, trainer = load_fit(done), Trainer.resume(scene, CONFIG, done / CHECKPOINT)
-    assert (saved.config, saved.step, saved.request["scene"]) == (CONFIG, 3, "/photos")
+    assert trainer.config == with_pace(CONFIG, len(scene.train))
+    assert (saved.config, saved.step, saved.request["scene"]) == (trainer.config, 3, "/photos")
     camera = scene.test.camera(0)
     assert torch.equal(saved.render(camera, scene.background), trainer.render(camera))
