@@ -147,7 +147,7 @@ def measure_target(
 
 
 def from_the_middle(scene: Scene, count: int) -> Scene:
-    """A scene without test views, split anew: the `count` most central views to train on, the outermost ones to test.
+    """A scene without test views, split again: the `count` most central views to train on, the outermost ones to test.
 
     The middle is the mean of all camera centres; views are ordered by the distance of their centre from it. The last
     `OUTER` of them, rounded up, are test views; what lies between the two groups is left out.
