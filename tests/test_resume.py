@@ -121,6 +121,9 @@ def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points
     again.fit()
     assert_same_bits(trainer, again)
     assert [point["step"] for point in again.curve] == [6, 9]
+    again.save(path)
+    many = Trainer.resume(scene, replace(CONFIG, steps=1001), path)
+    assert many.config.recipe == again.config.recipe  # of itself so long a fit would fade more slowly
 
 
 def test_a_loop_of_ones_own(scene, points):

@@ -331,6 +331,9 @@ class Trainer:
         state, damage = newest_checkpoint(Path(path))
         try:
             decided = {name: state["config"][name] for name in CHOICES if getattr(config, name) is None}
+            if config.recipe.opacity_decay is None:  # more steps may have another
+                decay = state["config"]["recipe"]["opacity_decay"]
+                decided["recipe"] = replace(config.recipe, opacity_decay=decay)
             config = replace(config, **decided)
             trainer = cls(scene, config, Start.from_state(state, config))
             trainer.load_state_dict(state)
