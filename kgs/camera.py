@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -136,8 +137,26 @@ def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
 
 
+_sizes: WeakKeyDictionary[PinholeCamera, tuple[tuple[Any, ...], tuple[int, int]]] = WeakKeyDictionary()
+
+
 def image_size(cameras: Cameras) -> tuple[int, int]:
-    """Height and width in pixels, the same for all cameras; checks what `cameras` is."""
+    """Height and width in pixels, the same for all cameras; checks what `cameras` is.
+
+    Reading the tensors of a camera on a GPU waits until all work is done, so the size is remembered until they change.
+    """
+    if not isinstance(cameras, PinholeCamera) or cameras.height.is_inference() or cameras.width.is_inference():
+        return _read_size(cameras)
+    tensors = (cameras.height, cameras.width)
+    state = (*map(id, tensors), *(x._version for x in tensors))
+    known, size = _sizes.get(cameras, ((), (0, 0)))
+    if known != state:
+        size = _read_size(cameras)
+        _sizes[cameras] = state, size
+    return size
+
+
+def _read_size(cameras: Cameras) -> tuple[int, int]:
     if isinstance(cameras, PosedCamera):
         sizes = {(int(cameras.model.height), int(cameras.model.width))}
     elif isinstance(cameras, PinholeCamera):

@@ -67,9 +67,11 @@ class DropGaussian(nn.Module):
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
         seed: None draws from torch's default generator of the tensor's device, as `nn.Dropout` does. An integer gives
-            the layer a stream of its own, the same on every device, kept through `.to`, deepcopy and pickle. Replicas
-            of `nn.DataParallel` draw from it; with `DistributedDataParallel` give each rank its own seed. Such a
-            layer must not run inside `torch.utils.checkpoint`, which restores only the default generators.
+            the layer a stream of its own, kept through `.to`, deepcopy and pickle. Replicas of `nn.DataParallel` draw
+            from it; with `DistributedDataParallel` give each rank its own seed. Such a layer must not run inside
+            `torch.utils.checkpoint`, which restores only the default generators.
+        device: where that stream draws. On the CPU it draws the same wherever the opacities are, and masks are copied
+            to them; on their own device nothing is copied.
 
     Raises:
         ValueError: p or the rate is outside [0, 1), the schedule is unknown, or the seed not from -2^63 to 2^64 - 1.
@@ -83,7 +85,11 @@ class DropGaussian(nn.Module):
     """
 
     def __init__(
-        self, p: float = 0.2, schedule: str | Callable[[float], float] = "linear", seed: int | None = None
+        self,
+        p: float = 0.2,
+        schedule: str | Callable[[float], float] = "linear",
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__()
         if not (schedule in SCHEDULES if isinstance(schedule, str) else callable(schedule)):
@@ -97,7 +103,7 @@ class DropGaussian(nn.Module):
         self._progress: float | None = None
         # mutable objects, which shallow copies such as the replicas of nn.DataParallel share and advance
         self._warned: set[str] = set()
-        self._stream = None if seed is None else torch.Generator("cpu").manual_seed(int(seed))
+        self._stream = None if seed is None else torch.Generator(device).manual_seed(int(seed))
 
     @property
     def progress(self) -> float:
@@ -136,7 +142,7 @@ class DropGaussian(nn.Module):
         return self._own_stream().get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
-        """Restore a state that `get_rng_state` returned; the opacities may be on any device."""
+        """Restore a state that `get_rng_state` of a layer with a stream on the same kind of device returned."""
         self._own_stream().set_state(state.cpu())
 
     def extra_repr(self) -> str:
@@ -159,8 +165,9 @@ class DropGaussian(nn.Module):
     def _replicate_for_data_parallel(self) -> Self:
         replica: Self = super()._replicate_for_data_parallel()
         if self._stream is not None and self.training:  # in order here; the replicas' threads would race for one stream
-            seed = int(torch.randint(2**62, (), generator=self._stream, device="cpu"))
-            replica._stream = torch.Generator("cpu").manual_seed(seed)
+            device = self._stream.device
+            seed = int(torch.randint(2**62, (), generator=self._stream, device=device))
+            replica._stream = torch.Generator(device).manual_seed(seed)
         return replica
 
     def __setattr__(self, name: str, value: Any) -> None:

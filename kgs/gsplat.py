@@ -104,7 +104,8 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         backgrounds: `(C, D)`, or None for 0.
         render_mode: "RGB" (the colours), "D" (sum of w z), "ED" (that over alpha), "RGB+D" or "RGB+ED".
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
-        backend: "auto", "torch", or "numba" (float32 on a CPU, tiles of 8), see `kgs.backends`.
+        backend: "auto", "torch", or in float32 with tiles of 8 "numba" (on a CPU) or "triton" (on a GPU), see
+            `kgs.backends`.
 
     Returns:
         Renders `(C, H, W, D)`, where a depth is the last channel; alphas `(C, H, W, 1)`; and a dict `meta` of the M
@@ -116,7 +117,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     Raises:
         TypeError: an argument is not a tensor, or of another dtype or device; gsplat has no such argument.
         ValueError: shapes do not match, an option is out of range, or kgs does not support what is asked for.
-        ModuleNotFoundError: the backend is numba, and it is not installed.
+        ModuleNotFoundError: the backend is numba or triton, and it is not installed.
 
     Examples:
         >>> import torch, kgs

@@ -38,10 +38,11 @@ def check_tools(device: str, backend: str, *packages: str) -> torch.device:
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects a result; without numba if it is not installed."""
+    """Versions of everything that affects a result; without numba or triton if they are not installed."""
     found = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
-    with contextlib.suppress(PackageNotFoundError):
-        found["numba"] = version("numba")
+    for package in ("numba", "triton"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
     return found | {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
 
 

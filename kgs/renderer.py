@@ -30,15 +30,15 @@ class GaussianRenderer(nn.Module):
 
     Args:
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
-        backend: "auto" (the fastest that covers the call), "torch", or "numba" (float32 on a CPU, tiles of 8), see
-            `kgs.backends`.
+        backend: "auto" (the fastest that covers the call), "torch", or in float32 with tiles of 8 "numba" (on a
+            CPU) or "triton" (on a GPU), see `kgs.backends`.
         options: how Gaussians become pixels; None for the defaults. `renderer.options` may be replaced later.
         fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Raises:
         TypeError: both `options` and fields of them are given, or a field does not exist.
         ValueError: an option is out of range, or the backend does not exist.
-        ModuleNotFoundError: the backend is numba, and it is not installed.
+        ModuleNotFoundError: the backend is numba or triton, and it is not installed.
 
     Examples:
         >>> import torch, kgs

@@ -65,7 +65,8 @@ def project(
     shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
     if shape[:-1] not in ((), (count,)):
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
-    chosen = choose(backend, "projection", lambda candidate: candidate.covers(gaussians.means))
+    device = gaussians.means.device
+    chosen = choose(backend, "projection", device, lambda candidate: candidate.covers(gaussians.means))
     return chosen.project(gaussians, cameras, size, options, colors)
 
 
@@ -120,6 +121,7 @@ def composite(
     chosen = choose(
         backend,
         "compositing",
+        features.device,
         lambda candidate: (
             candidate.covers(features) and candidate.covers_compositing(projected, features, given, chunk_size)
         ),

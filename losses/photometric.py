@@ -69,7 +69,7 @@ def photometric_loss(
             in the mask, 0 if there is none. Pixels outside get no gradient and may be NaN.
         fast: False uses Kornia's own operations, which have second derivatives.
         moments: `target_moments(target)` of this same target, to save that work. Only the fast path uses it.
-        backend: "auto", "torch" or "numba". Kernels run the fast path without a mask; torch does the rest.
+        backend: "auto", "torch", "numba" or "triton". Kernels run the fast path without a mask; torch does the rest.
 
     Returns:
         The loss, 0-d.
@@ -79,7 +79,7 @@ def photometric_loss(
             TargetMoments.
         ValueError: shapes do not match, the weight is out of range, the mask is empty or has values other than 0
             and 1, or the backend does not exist or does not cover the call.
-        ModuleNotFoundError: the backend is numba, and it is not installed.
+        ModuleNotFoundError: the backend is numba or triton, and it is not installed.
         RuntimeError: from `backward(create_graph=True)` through the fast path, which has no second derivative.
 
     Examples:
@@ -104,7 +104,7 @@ def photometric_loss(
     if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
         raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}")
     fast = fast and not target.requires_grad
-    chosen = choose(backend, "loss", lambda candidate: candidate.covers(image))
+    chosen = choose(backend, "loss", image.device, lambda candidate: candidate.covers(image))
     if not chosen.has_loss or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
         return _torch_loss(image, target, moments, dssim_weight, outside, fast)
     moments = target_moments(target) if moments is None else moments

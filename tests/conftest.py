@@ -20,6 +20,8 @@ from kgs.datasets import synthetic_scene
 from kgs.init_points import InitialPoints
 from kgs.io import film
 
+if not torch.cuda.is_available():  # before kernels are imported
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
@@ -75,9 +77,9 @@ def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
         yield request.param
 
 
-@pytest.fixture(params=[b.name for b in backends.BACKENDS if b.name != "torch" and b.is_installed()])
+@pytest.fixture(params=[b.name for b in backends.BACKENDS if "cpu" in (b.devices or ()) and b.is_installed()])
 def kernel_backend(request: pytest.FixtureRequest) -> str:
-    """The name of each backend beside torch, for tests that compare it with torch in float64."""
+    """The name of each backend of kernels for CPUs, for tests that compare it with torch in float64."""
     return request.param
 
 

@@ -35,12 +35,12 @@ def render(rows, backend, **options):
 
 
 def test_auto_is_torch_where_nothing_else_covers_the_call():
-    assert backends.available() == ("auto", "numba", "torch")
+    assert backends.available() == ("auto", "numba", "torch", "triton")
     assert torch.equal(render(8, "auto"), render(8, "torch"))
 
 
 def test_auto_takes_what_covers_the_call_and_torch_takes_the_rest(half):
-    assert backends.available() == ("auto", "half", "numba", "torch")
+    assert backends.available() == ("auto", "half", "numba", "torch", "triton")
     assert torch.allclose(render(8, "auto"), render(8, "torch") / 2)
     assert torch.equal(render(8, "auto"), render(8, "half"))
     assert torch.equal(render(9, "auto"), render(9, "torch"))
@@ -61,15 +61,17 @@ def test_a_backend_by_name_is_refused_where_it_does_not_cover_the_call(half):
 
 @pytest.mark.parametrize("make", [kgs.GaussianRenderer, lambda backend: render(8, backend)])
 def test_an_unknown_backend_is_told_what_there_is(make):
-    with pytest.raises(ValueError, match=r"backend: expected one of \('auto', 'numba', 'torch'\), got 'cuda'"):
+    with pytest.raises(
+        ValueError, match=r"backend: expected one of \('auto', 'numba', 'torch', 'triton'\), got 'cuda'"
+    ):
         make(backend="cuda")
 
 
-def test_kernels_beside_the_renderer_are_for_auto_and_numba_alone(half):
+def test_kernels_beside_the_renderer_are_numbas_unless_torch_is_named(half):
     pytest.importorskip("numba")
     rows = torch.zeros(3, 2)
     takes = {name: backends.takes_kernels(name, "rows", rows) for name in backends.available()}
-    assert takes == {"auto": True, "half": False, "numba": True, "torch": False}
+    assert takes == {"auto": True, "half": True, "numba": True, "torch": False, "triton": True}
     assert not backends.takes_kernels("auto", "rows", rows.double())
     with pytest.raises(ValueError, match="backend: 'numba' does not cover this call of rows"):
         backends.takes_kernels("numba", "rows", rows.double())

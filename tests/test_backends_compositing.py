@@ -6,7 +6,8 @@ from functools import partial
 
 import pytest
 import torch
-from compositing_checks import STOP, TH, drawn, footprints, leaves, many_bands  # noqa: F401 - a fixture for all
+from compositing_checks import STOP, TH, THRESHOLDS, assert_close, drawn, footprints, leaves, outcome, random, sample
+from compositing_checks import many_bands as many_bands  # a fixture for all
 from factories import random_camera, random_gaussians
 from oracles import near_threshold
 from tile_checks import scene
@@ -15,47 +16,11 @@ import kgs
 import kgs.reference
 from kgs import GaussianRenderer, composite
 
-THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
-
-
-def sample(n=300, size=(40, 56), thresholds=THRESHOLDS[0]):
-    """Projected Gaussians, and where float32 cannot change a decision."""
-    projected, gaussians, camera = drawn(n, size)
-    return projected, ~near_threshold(gaussians, camera, *thresholds)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def outcome(projected, features, certain, dtype=torch.float64, wanted=(True,) * 4, backend="torch", **options):
-    """Sums, light, median depth and the gradients of a loss over the pixels that are certain."""
-    options = {"backend": backend, "median_depth": True} | options
-    values = {k: getattr(projected, k).to(dtype) for k in ("means2d", "factors", "opacities", "depths")}
-    projected, inputs = leaves(dataclasses.replace(projected, **values), features.to(dtype))
-    for x, needed in zip(inputs, wanted, strict=True):
-        x.requires_grad_(needed)
-    out = composite(projected, inputs[-1], **options)
-    image = torch.cat([out.features, out.transmittance], 1)
-    loss = (image * (random(*image.shape) * certain).to(dtype)).sum()
-    gradients = torch.autograd.grad(loss, [x for x in inputs if x.requires_grad])
-    return [x.detach() for x in (out.features, out.transmittance, out.median_depth)], gradients
-
 
 @pytest.fixture
 def run(kernel_backend):
     """`outcome` by each backend beside torch."""
     return partial(outcome, dtype=torch.float32, backend=kernel_backend)
-
-
-def assert_close(got, expected, certain, bound=1e-5, image_bound=2e-6):
-    (*images, median), (*expected_images, expected_median) = got[0], expected[0]
-    for a, b in zip(images, expected_images, strict=True):
-        assert a.shape == b.shape
-        assert ((a - b).abs() * certain).max() <= image_bound if a.numel() else True
-    assert ((median - expected_median).abs() * certain > 1e-5).float().mean() <= 1e-3  # T may be near one half
-    for a, b in zip(got[1], expected[1], strict=True):
-        assert (a - b).abs().max() <= bound * b.abs().max() if a.numel() else True
 
 
 @pytest.mark.parametrize("thresholds", THRESHOLDS)

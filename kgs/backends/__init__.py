@@ -2,6 +2,7 @@
 
     "torch"   every call (`kgs.backends.pytorch`)
     "numba"   float32 on a CPU (`kgs.backends.cpu`, extra "fast")
+    "triton"  float32 on a GPU (`kgs.backends.gpu`; torch brings Triton on Linux)
 
 A backend is a class with its stages as methods, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`.
 """
@@ -13,11 +14,13 @@ from torch import Tensor
 
 from .base import Backend
 from .cpu import CpuBackend
+from .gpu import GpuBackend
 from .pytorch import TorchBackend
 
 __all__ = ["BACKENDS", "Backend", "available", "check_backend", "choose", "resolve", "takes_kernels"]
 
-BACKENDS: tuple[Backend, ...] = (CpuBackend(), TorchBackend())  # "auto" takes the first that covers a call
+# "auto" takes the first that covers a call and is trusted
+BACKENDS: tuple[Backend, ...] = (CpuBackend(), GpuBackend(), TorchBackend())
 
 
 def available() -> tuple[str, ...]:
@@ -31,8 +34,7 @@ def check_backend(name: str) -> None:
         raise ValueError(f"backend: expected one of {available()}, got {name!r}")
     for backend in BACKENDS:
         if backend.name == name and backend.package and not backend.is_installed():
-            package, extra = backend.package
-            how = f'run pip install "kgs-splat[{extra}]"'
+            package, how = backend.package
             raise ModuleNotFoundError(f'backend: "{name}" needs {package}, {how}', name=package)
 
 
@@ -45,18 +47,19 @@ def resolve(name: str, device: torch.device) -> str:
     """
     check_backend(name)
     for backend in BACKENDS:
-        if name in ("auto", backend.name) and backend.runs_on(device) and backend.is_installed():
+        if backend.runs_on(device) and backend.is_installed() and _may_take(backend, name, device):
             return backend.name
     where = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
     raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", which runs on {where} alone')
 
 
-def choose(name: str, stage: str, covers: Callable[[Backend], bool]) -> Backend:
-    """The backend for a call: the first that covers it for "auto", else the one that is named.
+def choose(name: str, stage: str, device: torch.device, covers: Callable[[Backend], bool]) -> Backend:
+    """The backend for a call: for "auto" the first that covers it and is trusted, else the one that is named.
 
     Args:
         name: what the user asked for.
         stage: what is to be done, for the error.
+        device: where.
         covers: whether a backend can do the call.
 
     Raises:
@@ -65,7 +68,7 @@ def choose(name: str, stage: str, covers: Callable[[Backend], bool]) -> Backend:
     """
     check_backend(name)
     for backend in BACKENDS:
-        if name in ("auto", backend.name) and covers(backend):
+        if name in ("auto", backend.name) and covers(backend) and _may_take(backend, name, device):
             return backend
     raise ValueError(f'backend: {name!r} does not cover this call of {stage}, expected "auto" or "torch"')
 
@@ -73,12 +76,21 @@ def choose(name: str, stage: str, covers: Callable[[Backend], bool]) -> Backend:
 def takes_kernels(name: str, stage: str, like: Tensor) -> bool:
     """Whether a stage outside the renderer runs on numba kernels; for stages that exist in numba and torch only.
 
+    These work on a CPU, also where the name is that of a backend of GPUs.
+
     Raises:
         ValueError: the backend does not exist, or numba is named and does not cover such a tensor.
         ModuleNotFoundError: numba is named and not installed.
     """
     check_backend(name)
-    if name not in ("auto", CpuBackend.name):
+    if name == TorchBackend.name:
         return False
+    name = name if name == CpuBackend.name else "auto"
     known = (CpuBackend.name, TorchBackend.name)
-    return choose(name, stage, lambda backend: backend.name in known and backend.covers(like)).name == CpuBackend.name
+    chosen = choose(name, stage, like.device, lambda backend: backend.name in known and backend.covers(like))
+    return chosen.name == CpuBackend.name
+
+
+def _may_take(backend: Backend, name: str, device: torch.device) -> bool:
+    """Whether this is the backend that is named, or one that "auto" may take on a device."""
+    return name == backend.name or (name == "auto" and backend.is_trusted(device))

@@ -48,7 +48,7 @@ class Backend(ABC):
         devices: the types of torch devices it runs on; None for all.
         dtypes: of the tensors it works on.
         tile_size: side of its tiles in pixels, where `RasterOptions.tile_size` is None.
-        package: what must be installed beside torch, and the extra of kgs that brings it; None for nothing.
+        package: what must be installed beside torch, and how to install it; None for nothing.
         has_loss: whether it has `loss_and_gradient`.
     """
 
@@ -66,6 +66,10 @@ class Backend(ABC):
     def runs_on(self, device: torch.device) -> bool:
         """Whether it runs on such a device."""
         return self.devices is None or device.type in self.devices
+
+    def is_trusted(self, device: torch.device) -> bool:
+        """Whether "auto" may take it on this device. The first call may take seconds, and say in a line why not."""
+        return True
 
     def covers(self, like: Tensor) -> bool:
         """Whether it works on tensors of this dtype, on this device; cheap, reads no values."""

@@ -231,7 +231,7 @@ def _is_point(value: Any) -> bool:
 
 # The plain values of a fit's state: what is expected of each in words, and the check.
 PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "backend": ("one of ['torch', 'numba']", lambda v: v in ("torch", "numba")),
+    "backend": ("one of ['torch', 'numba', 'triton']", lambda v: v in ("torch", "numba", "triton")),
     "init": ("kind and number of initial points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),
     "step": ("a number of steps", _is_count),
     "seconds": ("a number, not negative", lambda v: is_number(v, 0)),

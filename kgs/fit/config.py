@@ -35,7 +35,7 @@ _Count = Annotated[int, _Range(0, 10_000_000)]
 _Positive = Annotated[float, _Range(0, ends="(]")]
 _Weight = Annotated[float, _Range(0)]
 _Share = Annotated[float, _Range(0, 1)]
-Backend = Literal["auto", "torch", "numba"]
+Backend = Literal["auto", "torch", "numba", "triton"]
 Background = Literal["black", "white"]
 
 
@@ -138,7 +138,8 @@ class FitConfig:
         max_bytes: bound on the working memory of a render in bytes; it changes results only by rounding.
         evaluations: how often the PSNR curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
-        backend: numba: compiled, several times faster, only on a CPU. auto: numba where it is installed, else torch.
+        backend: numba: compiled, several times faster, only on a CPU. triton: compiled, only on a GPU. auto: the one
+            of these that is installed, else torch.
         recipe: all other numbers, a `kgs.fit.config.Recipe`.
 
     Raises:

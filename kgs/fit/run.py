@@ -93,7 +93,8 @@ def fit_scene(
         TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
         OSError: a result cannot be written.
         ValueError: the device cannot be used, or the backend does not run on it.
-        ModuleNotFoundError: the backend is numba, which is not installed; or a package of the extra `app` is missing.
+        ModuleNotFoundError: the backend is numba or triton, which is not installed; or a package of the extra `app` is
+            missing.
     """
     check_tools(config.device, config.backend, "jinja2", "matplotlib")  # even what is used only after training
     out = Path(out)

@@ -17,7 +17,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.backends import resolve
+from kgs.backends import BACKENDS, resolve
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
@@ -43,10 +43,11 @@ from .checkpoint import (
     save_checkpoint,
 )
 from .config import CHOICES, FitConfig, most_gaussians, timetable, with_pace
-from .divergence import gradient_fault, scale_fault, step_fault
+from .divergence import gradient_fault, parameter_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
 from .targets import targets
 
+_LOOK = 20  # steps between looks for faults on a GPU: reading a number waits until all work is done
 # for each parameter the name of its learning rate in the recipe, without `lr_`
 _LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
 
@@ -114,8 +115,9 @@ class Trainer:
         renderer: with the drop layer inside; `eval()` mode renders all Gaussians.
         step, seconds: the steps that are done and the time they took, evaluations not counted.
         curve: dicts of step, seconds, test_psnr and train_psnr.
-        backend: "numba" or "torch"; a resumed fit keeps it.
+        backend: "numba", "triton" or "torch"; a resumed fit keeps it on devices of the same kind.
         notes: lines that a user should read (a capped count, for instance).
+        look_every: steps between looks for what is not finite, 1 on a CPU.
         saved: the last checkpoint that was written or read, in words; "" before the first.
         shown: the Gaussians that :meth:`render` draws: the model, or after :meth:`show` a part of it.
         needs: what was decided about the scene, for metrics.json.
@@ -137,6 +139,7 @@ class Trainer:
         self.config = config = with_pace(config, len(scene.train))
         self.device = check_device(config.device)
         self.backend = resolve(config.backend, self.device)
+        self.look_every = 1 if self.device.type == "cpu" else _LOOK
         self.times = timetable(config)
         self.step = 0
         self.seconds = 0.0
@@ -184,13 +187,16 @@ class Trainer:
             generator=torch.Generator().manual_seed(seed + 2),
         )
         self.order = torch.Generator().manual_seed(seed + 3)
-        self.colors = torch.Generator().manual_seed(seed + 4)
+        self.colors = torch.Generator(self.device).manual_seed(seed + 4)
+        self._loss = float("nan")
         if self.poses is not None:
             self.poses.depth = start.depth
 
     def make_drop(self, seed: int) -> DropGaussian | None:
         """The layer on the opacities, None without dropping. A subclass may return another one."""
-        return DropGaussian(self.config.drop, self.config.drop_schedule, seed=seed) if self.config.drop else None
+        if not self.config.drop:
+            return None
+        return DropGaussian(self.config.drop, self.config.drop_schedule, seed=seed, device=self.device)
 
     def before_render(self, camera: PinholeCamera) -> None:
         """Called before each training render; for subclasses."""
@@ -203,7 +209,8 @@ class Trainer:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
 
         Raises:
-            TrainingDiverged: something is not finite, and that step has changed no parameter; or a scale explodes.
+            TrainingDiverged: something is not finite, and that step has changed no parameter; or a scale explodes. On a
+                GPU it may be up to 20 steps late, when parameters are damaged; no checkpoint has them.
         """
         while self.step < self.times.steps:
             loss = self.train_step()
@@ -212,6 +219,8 @@ class Trainer:
 
     def train_step(self) -> float:
         """One step and all that is due after it (curve, densification, reset of the opacities); returns the loss.
+
+        On a GPU the loss is that of the last of every 20 steps: reading a number waits until all work is done.
 
         Raises:
             TrainingDiverged: see :meth:`fit`.
@@ -287,8 +296,9 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`, bit for bit. Scene and configuration must be those of the state.
 
-        The device may differ; the backend is that of the state, and torch on a GPU. If all steps of the state are done,
-        `steps` may be larger; `notes` then says what that changes.
+        The device may differ: the backend is that of the state where it runs on the device, and what is drawn at random
+        begins anew on another kind of device, which `notes` says. If all steps of the state are done, `steps` may be
+        larger; `notes` then says what that changes.
 
         Raises:
             ValueError: scene or configuration differ, or an entry is missing or wrong; the message begins with its
@@ -297,7 +307,8 @@ class Trainer:
         with _state_errors():
             start = Start.from_state(state, self.config)
             longer = check_state(state, self._fingerprint, self.config)
-            self.backend = resolve(state["backend"] if self.device.type == "cpu" else "auto", self.device)
+            runs = next(x for x in BACKENDS if x.name == state["backend"]).runs_on(self.device)
+            self.backend = resolve(state["backend"] if runs else "auto", self.device)
             self._build(start)
             self.step = state["step"]
             self.seconds = state["seconds"]
@@ -308,16 +319,25 @@ class Trainer:
             load_moments(self.optimizer, copy.deepcopy(state["optimizer"]))
             self.densifier.load_state_dict(state["densifier"])
             self.order.set_state(state["order"])
-            self.colors.set_state(state["colors"])
             if state["shown"]:
                 self.show(**state["shown"])
-            if self.drop is not None:
-                self.drop.set_rng_state(state["drop"])
+            if self.colors.get_state().shape == state["colors"].shape:
+                self.colors.set_state(state["colors"])
+                if self.drop is not None:
+                    self.drop.set_rng_state(state["drop"])
+            else:  # their sizes are those of the kind of device
+                self.note("the checkpoint is of another kind of device: dropping and backgrounds draw anew")
             if self.poses is not None:
                 self.scene = self.poses.restore(self.scene, state["poses"])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write :meth:`state_dict` to a file; after an OSError the checkpoints that were there are untouched."""
+        """Write :meth:`state_dict` to a file; after an OSError the checkpoints that were there are untouched.
+
+        Raises:
+            TrainingDiverged: on a GPU, a parameter is not finite.
+        """
+        if self.look_every > 1:
+            self._stop_if(parameter_fault(self.model))
         save_checkpoint(Path(path), self.state_dict())
         self.saved = f"{path} of step {self.step}"
 
@@ -360,7 +380,7 @@ class Trainer:
         camera = view.camera if self.poses is None else self.poses.camera(view.camera, index)
         target, moments = view.image, view.moments
         if config.training_background == "random":
-            background = torch.rand(3, generator=self.colors, dtype=torch.float32).to(self.device)
+            background = torch.rand(3, generator=self.colors, dtype=torch.float32, device=self.device)
             target, moments = view.over(background)
         if self.drop is not None:
             self.drop.progress = progress
@@ -373,11 +393,14 @@ class Trainer:
         penalty = self.penalty(gaussians, camera)
         if penalty is not None:
             loss = loss + penalty
-        value = float(loss.detach())
-        self._stop_if(step_fault(self.model, out.projected.num_nonfinite, value))
+        looks = self.step % self.look_every == 0 or self.step in (1, self.times.steps)
+        if looks:
+            self._loss = float(loss.detach())
+            self._stop_if(step_fault(self.model, out.projected.num_nonfinite, self._loss))
         if loss.requires_grad:
             loss.backward()
-            self._stop_if(gradient_fault(self.model))
+            if looks:
+                self._stop_if(gradient_fault(self.model))
             if out.projected.means2d.grad is not None:
                 self.densifier.observe(out.projected)
             if self.step < self.times.steps:  # as in the official release, the last step changes no parameter
@@ -388,7 +411,7 @@ class Trainer:
                 if self.poses is not None:
                     self.scene = self.poses.step(self.scene, progress)
             self.optimizer.zero_grad(set_to_none=True)
-        return value
+        return self._loss
 
     def _stop_if(self, fault: str) -> None:
         if fault:

@@ -34,7 +34,7 @@ class CpuBackend(Backend):
     devices = ("cpu",)
     dtypes = (torch.float32,)
     tile_size = 8  # a constant of the kernels
-    package = ("numba", "fast")
+    package = ("numba", 'run pip install "kgs-splat[fast]"')
     has_loss = True
 
     def covers(self, like: Tensor) -> bool:

@@ -1,0 +1,95 @@
+"""How far a backend is from torch on a small scene: whether "auto" trusts it, and what `kgs check` shows."""
+
+import torch
+from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
+from kornia.losses import ssim_loss
+from torch import Tensor
+
+from kgs.camera import image_size, pinhole_cameras
+from kgs.types import Gaussians, RasterOptions
+
+from .base import Backend
+from .pytorch import TorchBackend
+
+BOUND = 5e-5  # a larger disagreement is no rounding
+_WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
+# thresholds: a layer that counts for one backend alone must not matter
+_OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1e-6)
+
+
+@torch.inference_mode(False)
+@torch.enable_grad()
+def disagreement(backend: Backend, device: torch.device) -> float:
+    """The largest difference from torch in float64, over the largest value of its kind.
+
+    Of a training step of 40 Gaussians before one camera: harmonics of degree 2, colours and depths, the loss; the
+    gradients of all Gaussians, of pose and intrinsics, and of the image.
+
+    Args:
+        backend: works in float32 on the device.
+        device: where; torch is on the CPU where it has no float64 there.
+    """
+    place = device if device.type in ("cpu", "cuda") else torch.device("cpu")
+    pairs = list(zip(_drawn(backend, device), _drawn(TorchBackend(), place), strict=True))
+    if backend.has_loss:
+        pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
+    return max(_relative(found, expected) for found, expected in pairs)
+
+
+def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) -> Tensor:
+    """Numbers of float32 in float64, so that both backends start from the same."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(shape, generator=generator, dtype=torch.float32, device="cpu")
+    return (drawn * (high - low) + low).double()
+
+
+def _drawn(backend: Backend, device: torch.device) -> list[Tensor]:
+    """Image, depth and transmittance, and the gradients of all inputs; float64 from torch, else float32."""
+    dtype = torch.float64 if isinstance(backend, TorchBackend) else torch.float32
+    n, (height, width) = 40, (16, 20)
+    means = (_random(n, 3) + torch.tensor([0.0, 0.0, 3.0], device="cpu")).float()
+    scales, opacities = _random(n, 3, low=0.02, high=0.25, seed=1), _random(n, low=0.1, seed=2)
+    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 9, 3, seed=4), torch.eye(4, device="cpu"))
+    focal = torch.tensor([[18.0, 0.0, 9.5], [0.0, 18.0, 7.5], [0.0, 0.0, 1.0]], device="cpu")
+    leaves = [x.to(device, dtype).requires_grad_() for x in (*values, focal)]
+    camera = pinhole_cameras(leaves[5], leaves[6], width, height)
+    seen = backend.project(Gaussians(*leaves[:5]), camera, image_size(camera), _OPTIONS, True)
+    features = torch.cat([seen.colors, seen.depths[:, None]], 1)
+    inputs = (seen.means2d, seen.factors, seen.opacities, features)
+    with torch.no_grad():
+        compositor = backend.compositor(seen, features, _OPTIONS, False, None)
+        (sums, light, _), kept = compositor.forward(inputs, True)
+        by_sums, by_light = (_random(*x.shape, seed=5).to(device, dtype) for x in (sums, light))
+        *found, _ = compositor.backward(inputs, kept, by_sums, by_light, (True,) * 4)
+    return [sums, light, *torch.autograd.grad(inputs, leaves, found)]
+
+
+def _pictures() -> tuple[Tensor, Tensor]:
+    return _random(1, 3, 16, 20, low=0.0, seed=6), _random(1, 3, 16, 20, low=0.0, seed=7)
+
+
+def _loss(backend: Backend, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The loss of a backend and its gradient."""
+    image, target = _pictures()
+    mean, square = (gaussian_blur2d(x, (_WINDOW, _WINDOW), (_SIGMA, _SIGMA)) for x in (target, target * target))
+    cpu, kind = torch.device("cpu"), torch.float32
+    x, y, mean, variance = (each.to(device, kind) for each in (image, target, mean, square - mean * mean))
+    taps: list[float] = get_gaussian_kernel1d(_WINDOW, _SIGMA, device=cpu, dtype=kind).flatten().tolist()
+    loss, gradient = backend.loss_and_gradient(x, y, mean, variance, taps, _WEIGHT, True)
+    assert gradient is not None
+    return loss, gradient
+
+
+def _exact_loss() -> tuple[Tensor, Tensor]:
+    """The same by Kornia."""
+    image, target = _pictures()
+    image = image.requires_grad_()
+    loss = (image - target).abs().mean() + 2 * _WEIGHT * ssim_loss(image, target, _WINDOW)
+    return loss, torch.autograd.grad(loss, image)[0]
+
+
+def _relative(found: Tensor, expected: Tensor) -> float:
+    """The largest difference over the largest value; infinite where something is not a number."""
+    expected = expected.detach().cpu()
+    worst = float((found.detach().cpu() - expected).abs().max() / expected.abs().max())
+    return worst if worst == worst else float("inf")

@@ -1,0 +1,114 @@
+"""The backend of Triton kernels, for float32 on GPUs.
+
+Each `X_kernels.py` has the kernels of a stage, and `X.py` beside it brings them to torch. Torch defines what is right;
+a kernel gives the same within the rounding of float32, and its formulas are explained in the torch code that it
+follows. `import kgs` does not import triton: a stage is imported when it is first used.
+
+With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
+
+Rules:
+
+1. A program writes what no other program writes, and nothing is added atomically: the same bits in each run.
+2. A number is read from the device only where the size of a tensor follows from it: reading waits for all work.
+3. What a kernel is called with is checked before; it clamps nothing but the indices of masked lanes.
+4. Constants of a module stand to the right of operators; block shapes are powers of two; a loop whose end depends on
+   data is a `while` on a scalar.
+"""
+
+import functools
+import os
+import warnings
+
+import torch
+from torch import Tensor
+
+from kgs.backends.base import Backend, Compositor
+from kgs.camera import Cameras
+from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+
+
+class GpuBackend(Backend):
+    """Kernels for pinhole cameras, tiles of 8 x 8 pixels and the loss; other cameras go to torch, inside the call."""
+
+    name = "triton"
+    devices = ("cuda", "xpu")  # "cuda" are AMD's, too
+    dtypes = (torch.float32,)
+    tile_size = 8  # a constant of the kernels
+    package = ("triton", "torch brings it on Linux; on Windows: pip install triton-windows")
+    has_loss = True
+
+    def runs_on(self, device: torch.device) -> bool:
+        """On GPUs, and on CPUs in Triton's interpreter."""
+        interpreted = device.type == "cpu" and os.environ.get("TRITON_INTERPRET") == "1"
+        return interpreted or super().runs_on(device)
+
+    def is_trusted(self, device: torch.device) -> bool:
+        """Whether the kernels pass :func:`self_check`, once for each GPU; never on a CPU."""
+        return device.type != "cpu" and self_check(device)
+
+    def covers(self, like: Tensor) -> bool:
+        """Float32 on a GPU, while no graph is traced."""
+        return not torch.compiler.is_compiling() and super().covers(like)
+
+    def covers_compositing(
+        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, chunk_size: int | None
+    ) -> bool:
+        """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
+        one_block = not options.absgrad or features.shape[1] <= 4
+        return options.tile_size in (None, self.tile_size) and chunk_size is None and one_block
+
+    def project(
+        self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
+    ) -> ProjectedGaussians:
+        """See `Backend`."""
+        from .projection import project
+
+        return project(gaussians, cameras, size, options, colors)
+
+    def compositor(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool,
+        chunk_size: int | None,
+    ) -> Compositor:
+        """See `Backend`."""
+        from .compositing import GpuCompositing
+
+        return GpuCompositing(projected, features, options, median_depth)
+
+    def loss_and_gradient(
+        self,
+        image: Tensor,
+        target: Tensor,
+        mean: Tensor,
+        variance: Tensor,
+        taps: list[float],
+        dssim_weight: float,
+        gradient: bool,
+    ) -> tuple[Tensor, Tensor | None]:
+        """See `Backend`."""
+        from .loss import loss_and_gradient
+
+        return loss_and_gradient(image, target, mean, variance, taps, dssim_weight, gradient)
+
+
+@functools.cache
+def self_check(device: torch.device) -> bool:
+    """Whether a small scene comes out as in torch on a device; a warning says what is wrong.
+
+    The first time on a machine the kernels are compiled, which takes seconds.
+    """
+    from kgs.backends.agreement import BOUND, disagreement
+
+    try:
+        found = disagreement(GpuBackend(), device)
+    except Exception as error:  # a compiler that does not know the card, a driver: kgs can do without
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    else:
+        if found <= BOUND:
+            return True
+        reason = f"they differ from torch by {found:.1e}, more than {BOUND:g}"
+    warnings.warn(f"kgs: Triton's kernels are not used on {device}, torch is: {reason}", stacklevel=2)
+    return False

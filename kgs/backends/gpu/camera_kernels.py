@@ -1,0 +1,80 @@
+"""What kernels read of a pinhole camera, as one row of numbers; and the gradients of cameras.
+
+A row, `WIDTH` numbers: world to camera (3, 4), intrinsics (2, 3), limits of x / z, then of y / z, the centre (3,), and
+whether the kernels can draw it.
+"""
+
+import triton
+import triton.language as tl
+
+from .footprints import is_finite
+
+WIDTH = 32
+PLAIN = 25  # where in a row it says that intrinsics and pose are affine, and the pose rigid where it must be
+
+_WIDTH: tl.constexpr = tl.constexpr(WIDTH)
+_PLAIN: tl.constexpr = tl.constexpr(PLAIN)
+
+
+@triton.jit
+def _product(pose, i, j):
+    """The product of two rows of the 3x3 block of a pose."""
+    a, b = pose + 4 * i, pose + 4 * j
+    total = tl.load(a) * tl.load(b) + tl.load(a + 1) * tl.load(b + 1)
+    return total + tl.load(a + 2) * tl.load(b + 2)
+
+
+@triton.jit
+def _cofactor(pose, i, j):
+    """Cofactor of the 3x3 block of a pose."""
+    r0, r1 = pose + (i + 1) % 3 * 4, pose + (i + 2) % 3 * 4
+    c0, c1 = (j + 1) % 3, (j + 2) % 3
+    return tl.load(r0 + c0) * tl.load(r1 + c1) - tl.load(r0 + c1) * tl.load(r1 + c0)
+
+
+@triton.jit
+def _store_limits(out, focal, centre, low, high, margin):
+    """The limits of a tangent, see `kgs.camera.tangent_limits`."""
+    first = -(centre - low + margin) / focal
+    last = (high - centre + margin) / focal
+    tl.store(out, tl.minimum(first, last))
+    tl.store(out + 1, tl.maximum(first, last))
+
+
+@triton.jit
+def describe_cameras(
+    intrinsics, extrinsics, left, top, right, bottom, margin_x, margin_y, rows, MUST_TURN: tl.constexpr
+):  # fmt: skip
+    """Fill the row of a camera from its matrices `(4, 4)`; with `MUST_TURN` only rigid poses count as plain."""
+    c = tl.program_id(0)
+    matrix, pose, out = intrinsics + c * 16, extrinsics + c * 16, rows + c * _WIDTH
+    i = tl.arange(0, 16)
+    k, e = tl.load(matrix + i), tl.load(pose + i)
+    unit = tl.where(i % 5 == 0, 1.0, 0.0)
+    plain = is_finite(k) & is_finite(e) & ((k == unit) | ((i < 8) & (i % 4 < 3))) & ((e == unit) | (i < 12))
+    plain &= (k != 0.0) | ((i != 0) & (i != 5))
+    plain = tl.min(plain.to(tl.int32), 0)
+    off = tl.maximum(tl.abs(_product(pose, 0, 1)), tl.abs(_product(pose, 0, 2)))
+    off = tl.maximum(off, tl.abs(_product(pose, 1, 2)))
+    off = tl.maximum(off, tl.abs(_product(pose, 0, 0) - 1.0))
+    off = tl.maximum(off, tl.abs(_product(pose, 1, 1) - 1.0))
+    off = tl.maximum(off, tl.abs(_product(pose, 2, 2) - 1.0))
+    turned = off <= 1e-3  # as in `kgs.projection.inverse_turn`
+    if MUST_TURN:
+        plain = tl.where(turned, plain, 0)
+    for j in tl.static_range(12):
+        tl.store(out + j, tl.load(pose + j))
+    for j in tl.static_range(3):
+        tl.store(out + 12 + j, tl.load(matrix + j))
+        tl.store(out + 15 + j, tl.load(matrix + 4 + j))
+    _store_limits(out + 18, tl.load(matrix), tl.load(matrix + 2), left, right, margin_x)
+    _store_limits(out + 20, tl.load(matrix + 5), tl.load(matrix + 6), top, bottom, margin_y)
+    det = tl.load(pose) * _cofactor(pose, 0, 0) + tl.load(pose + 1) * _cofactor(pose, 0, 1)
+    det += tl.load(pose + 2) * _cofactor(pose, 0, 2)
+    for j in tl.static_range(3):
+        moved = tl.load(pose + 3) * 0.0
+        for m in tl.static_range(3):
+            inverse = tl.where(turned, tl.load(pose + 4 * m + j), _cofactor(pose, m, j) / det)
+            moved -= inverse * tl.load(pose + 4 * m + 3)
+        tl.store(out + 22 + j, moved)
+    tl.store(out + _PLAIN, plain.to(tl.float32))

@@ -1,0 +1,174 @@
+"""Training on Triton's kernels: the gradients of numba, and how often a step calls the GPU and waits for it."""
+
+import collections
+import warnings
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+import kgs
+from kgs import backends
+from kgs.backends import gpu
+from kgs.backends.agreement import BOUND, disagreement
+from kgs.backends.gpu import compositing, loss, projection
+from kgs.datasets import synthetic_scene
+from kgs.fit import FitConfig, Trainer
+from kgs.init_points import InitialPoints
+
+CPU = torch.device("cpu")
+MOST_LAUNCHES, MOST_WAITS = 150, 4  # of a training step on a GPU
+# operators that compute nothing, and those that wait for a number
+_VIEWS = (
+    "alias as_strided detach empty empty_like empty_strided expand lift_fresh new_empty permute reshape select slice"
+)
+_VIEWS += " split split_with_sizes squeeze t transpose unbind unsqueeze view _reshape_alias _unsafe_view"
+_WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal")
+
+
+class Operators(TorchDispatchMode):
+    """Counts the operators that a GPU would have to be called for."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = collections.Counter()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.overloadpacket.__name__
+        if name not in _VIEWS.split() and not name.startswith("_record_function"):
+            self.names[name] += 1
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Two tiny pictures to train on, one to test."""
+    return synthetic_scene(train_views=2, test_views=1, size=(16, 18), seed=1)
+
+
+@pytest.fixture
+def few(points):
+    return InitialPoints(points.points[:25], points.colors[:25], "random")
+
+
+def trainer(scene, points, backend, **options):
+    return Trainer(scene, FitConfig(steps=50, sh_degree=1, backend=backend, **options), points)
+
+
+def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
+    fit = trainer(scene, few, "triton")
+    fit.look_every = 20  # as on a GPU
+    fit.train_step()
+    kernels, waits, real = collections.Counter(), [], torch.Tensor.tolist
+
+    def launch(kernel, *arguments, **options):
+        kernels[kernel] += 1
+        with _disable_current_modes():
+            launched(kernel, *arguments, **options)
+
+    launched = compositing.launch
+    for stage in (compositing, loss, projection):
+        monkeypatch.setattr(stage, "launch", launch)
+    monkeypatch.setattr(torch.Tensor, "tolist", lambda x: waits.append(1) or real(x))
+    with Operators() as operators:
+        fit.train_step()
+    found = operators.names
+    only_here = 2  # the layer looks at opacities where that costs nothing
+    waited = len(waits) + sum(found[name] for name in _WAITS) - only_here
+    assert sum(kernels.values()) >= 10
+    assert sum(kernels.values()) + sum(found.values()) <= MOST_LAUNCHES
+    assert 1 <= waited <= MOST_WAITS
+
+
+def test_gradients_of_three_steps_are_numbas(scene, few):
+    pytest.importorskip("numba")
+    fits = [trainer(scene, few, backend) for backend in ("triton", "numba")]
+    with torch.no_grad():
+        fits[1].model.log_scales += 0.5 * torch.randn(25, 3)  # a sphere has no turn
+    for _ in range(3):
+        fits[0].model.load_state_dict(fits[1].model.state_dict())  # equal parameters
+        found = []
+        for fit in fits:
+            caught = []
+            for parameter in fit.model.parameters():
+                parameter.register_post_accumulate_grad_hook(lambda p, caught=caught: caught.append(p.grad.clone()))
+            fit.train_step()
+            found.append(caught)
+        assert len(found[0]) == 5  # the first steps have no harmonics but the constant
+        for a, b in zip(*found, strict=True):
+            assert (a - b).abs().max() <= 5e-5 * b.abs().max()
+    images = [fit.render(scene.test.camera(0)) for fit in fits]
+    assert (images[0] - images[1]).abs().max() <= 1e-3
+
+
+def test_a_resumed_fit_on_another_kind_of_device_draws_anew_and_says_so(scene, few):
+    fit = trainer(scene, few, "torch")
+    fit.train_step()
+    state = fit.state_dict()
+    state |= {"drop": state["drop"][:16], "colors": state["colors"][:16]}  # what a generator of a GPU has
+    other = trainer(scene, few, "torch")
+    other.load_state_dict(state)
+    assert other.notes == ["the checkpoint is of another kind of device: dropping and backgrounds draw anew"]
+    assert other.train_step() > 0
+
+
+def test_a_fit_that_looks_seldom_finds_what_is_not_finite_and_never_saves_it(scene, few, tmp_path):
+    fit = trainer(scene, few, "torch")
+    fit.look_every = 20
+    fit.train_step()
+    fit.save(tmp_path / "checkpoint.safetensors")
+    with torch.no_grad():
+        fit.model.means[3] = torch.nan
+    with pytest.raises(kgs.TrainingDiverged, match="expected finite parameters, got others in means of Gaussian 3"):
+        fit.save(tmp_path / "checkpoint.safetensors")
+    with pytest.raises(kgs.TrainingDiverged, match=r"step 20: expected finite parameters"):
+        fit.fit()
+
+
+# -- trust ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_kernels_agree_with_torch():
+    assert disagreement(gpu.GpuBackend(), CPU) <= BOUND / 10
+
+
+def test_auto_never_takes_the_interpreter():
+    assert backends.resolve("auto", CPU) in ("numba", "torch")
+    assert backends.resolve("triton", CPU) == "triton"
+    assert not gpu.GpuBackend().is_trusted(CPU)
+
+
+@pytest.fixture
+def unchecked():
+    gpu.self_check.cache_clear()
+    yield
+    gpu.self_check.cache_clear()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_kernels_that_fail_or_differ_are_not_used_and_a_line_says_so(monkeypatch):
+    monkeypatch.setattr(projection, "launch", lambda *a, **k: 1 / 0)
+    with pytest.warns(UserWarning, match="Triton's kernels are not used on cpu, torch is: ZeroDivisionError"):
+        assert not gpu.self_check(CPU)
+    with warnings.catch_warnings():  # once
+        warnings.simplefilter("error")
+        assert not gpu.self_check(CPU)
+    gpu.self_check.cache_clear()
+    monkeypatch.undo()
+    real = compositing.launch
+    monkeypatch.setattr(compositing, "FEATURES", 3)  # leaves out every fourth feature
+    monkeypatch.setattr(compositing, "launch", real)
+    with pytest.warns(UserWarning, match=r"they differ from torch by .*, more than 5e-05"):
+        assert not gpu.self_check(CPU)
+
+
+def test_without_triton_a_clear_error(monkeypatch):
+    monkeypatch.setattr("kgs.backends.base._is_found", lambda package: False)
+    with pytest.raises(ModuleNotFoundError, match='"triton" needs triton, torch brings it on Linux'):
+        kgs.GaussianRenderer(backend="triton")
+
+
+def test_on_a_cpu_without_the_interpreter_it_is_refused(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET")
+    with pytest.raises(ValueError, match='expected "auto" or "torch" on cpu, got "triton", which runs on cuda and xpu'):
+        backends.resolve("triton", CPU)

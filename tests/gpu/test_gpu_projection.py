@@ -1,0 +1,150 @@
+"""Projection by Triton's kernels: the same list as torch, its values and gradients in float64."""
+
+import pytest
+import torch
+from factories import leaves, random_camera, replace, with_camera
+from kornia.sensors.camera import CameraModelType
+from projection_checks import DIFFERENTIABLE, assert_alike, posed, wide_scene
+
+import kgs
+from kgs import project
+from kgs.backends.gpu import projection
+
+
+@pytest.fixture
+def handed_over(monkeypatch):
+    """How often the kernels ask torch."""
+    calls, real = [], projection.project_torch
+    monkeypatch.setattr(projection, "project_torch", lambda *a: calls.append(1) or real(*a))
+    return calls
+
+
+@pytest.mark.parametrize(("degree", "cameras"), [(None, 1), (0, 1), (1, 2), (2, 1), (3, 2)])
+def test_harmonics_of_every_degree_and_features(degree, cameras, handed_over):
+    got, _ = assert_alike(*wide_scene(degree, cameras=cameras), "triton")
+    assert 100 < len(got) < 300 * cameras
+    assert not handed_over
+
+
+def test_features_of_any_width_no_colors_and_opacities_of_each_camera():
+    gaussians, cameras = wide_scene(None, cameras=2)
+    for width in (0, 1, 17):
+        assert_alike(replace(gaussians, colors=torch.rand(400, width)), cameras, "triton")
+    got, gradients = assert_alike(*wide_scene(3), "triton", colors=False)
+    assert got.colors.shape == (len(got), 0)
+    assert gradients["colors"] is None
+    assert_alike(replace(gaussians, opacities=torch.rand(2, 400)), cameras, "triton")
+
+
+@pytest.mark.parametrize("largest", [1.9, 50.0])
+@pytest.mark.parametrize("threshold", [1 / 255, 0.0])
+def test_large_opacities_widen_what_is_seen_unless_they_belong_to_one_that_is_not_finite(largest, threshold):
+    gaussians, cameras = wide_scene()
+    opacities, means = gaussians.opacities.clone(), gaussians.means.clone()
+    opacities[3] = largest
+    assert_alike(replace(gaussians, opacities=opacities), cameras, "triton", alpha_threshold=threshold)
+    means[3, 0] = torch.inf
+    broken = replace(gaussians, opacities=opacities, means=means)
+    assert len(project(broken, cameras, backend="triton")) == len(project(broken, cameras, backend="torch"))
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "colors"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30])
+def test_what_is_not_finite_or_overflows_is_left_out(field, value):
+    gaussians, cameras = wide_scene()
+    changed = getattr(gaussians, field).clone()
+    changed.view(-1)[7] = value
+    broken = replace(gaussians, **{field: changed})
+    got, listed = (project(broken, cameras, backend=backend) for backend in ("triton", "torch"))
+    assert torch.equal(got.gaussian_ids, listed.gaussian_ids)
+    assert torch.equal(got.num_nonfinite, listed.num_nonfinite)
+    assert torch.allclose(got.factors, listed.factors, rtol=1e-5, atol=1e-5)
+
+
+def test_zero_quaternions_and_flat_gaussians():
+    gaussians, cameras = wide_scene()
+    quats, scales = gaussians.quats.clone(), gaussians.scales.clone()
+    quats[::3] = 0.0
+    quats[1::3] *= 1e-30
+    scales[::2, 1] = 0.0
+    got, gradients = assert_alike(replace(gaussians, scales=scales), cameras, "triton")
+    found = project(replace(gaussians, quats=quats), cameras, backend="triton")
+    expected = project(replace(gaussians, quats=quats), cameras, backend="torch")
+    assert torch.allclose(found.factors, expected.factors, rtol=1e-5, atol=1e-5)
+    assert gradients["scales"].isfinite().all()
+    assert len(got) > 100
+
+
+@pytest.mark.parametrize("options", [{"near_plane": 4.0}, {"eps2d": 0.0}, {"frame": (10.0, 8.0, 40.0, 30.0)}])
+def test_options(options):
+    assert_alike(*wide_scene(), "triton", **options)
+
+
+@pytest.mark.parametrize("block", [[[50.0, 4.0], [0.0, 60.0]], [[-50.0, 0.0], [0.0, 60.0]]])
+def test_cameras_with_skew_and_negative_focal_lengths(block, handed_over):
+    gaussians, cameras = wide_scene()
+    k = cameras.intrinsics[0].clone()
+    k[:2, :2] = torch.tensor(block)
+    assert_alike(gaussians, with_camera(cameras, intrinsics=k), "triton")
+    assert not handed_over
+
+
+def test_poses_that_are_scaled_or_sheared(handed_over):
+    gaussians, cameras = wide_scene(3)
+    for change in (torch.eye(3) * 1.7, torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.9, -0.1], [0.1, 0.0, 1.2]])):
+        pose = cameras.extrinsics[0].clone()
+        pose[:3, :3] = change @ pose[:3, :3]
+        assert_alike(gaussians, with_camera(cameras, extrinsics=pose), "triton")
+    assert not handed_over
+
+
+@pytest.mark.parametrize("degree", [None, 3])
+@pytest.mark.parametrize("wanted", [("pose",), ("pose", "lens", "Gaussians")])
+def test_gradients_of_cameras(degree, wanted, handed_over):
+    gaussians, cameras = wide_scene(degree, 60, cameras=2)
+    found = []
+    for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
+        matrices = {"pose": cameras.extrinsics, "lens": cameras.intrinsics}
+        leaf = {name: x.to(dtype).clone().requires_grad_(name in wanted) for name, x in matrices.items()}
+        values, inputs = leaves(gaussians.to(dtype)) if "Gaussians" in wanted else (gaussians.to(dtype), [])
+        seen = type(cameras)(leaf["lens"], leaf["pose"], cameras.height, cameras.width)
+        fields = [getattr(project(values, seen, backend=backend), name) for name in DIFFERENTIABLE]
+        generator = torch.Generator().manual_seed(2)
+        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
+        used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
+        torch.autograd.backward(*zip(*used, strict=True))
+        found.append(([x.requires_grad for x in fields], [x.grad for x in (*leaf.values(), *inputs)]))
+    assert not handed_over
+    assert found[0][0] == found[1][0]
+    for got, exact in zip(found[0][1], found[1][1], strict=True):
+        assert (got is None) == (exact is None)
+        assert got is None or (got - exact).abs().max() <= 3e-6 * exact.abs().max()
+
+
+def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
+    gaussians, cameras = wide_scene()
+    bent = cameras.intrinsics[0].clone()
+    bent[2, 0] = 0.1
+    pose = (cameras.extrinsics[0] * torch.tensor([1.7, 1.7, 1.7, 1.0])[:, None]).requires_grad_()
+    lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), cameras.extrinsics)
+    for camera in (with_camera(cameras, intrinsics=bent), with_camera(cameras, extrinsics=pose), lens):
+        got, expected = (project(gaussians, camera, backend=backend) for backend in ("triton", "torch"))
+        assert torch.equal(got.means2d, expected.means2d)
+    assert len(handed_over) == 3
+    assert len(project(gaussians[:0], cameras, backend="triton")) == 0
+    assert len(handed_over) == 4
+
+
+def test_without_gradients_and_once_differentiable():
+    gaussians, cameras = wide_scene()
+    with torch.inference_mode():
+        assert not project(gaussians, cameras, backend="triton").means2d.requires_grad
+    moved, inputs = leaves(gaussians)
+    loss = project(moved, cameras, backend="triton").factors.square().sum()
+    first = torch.autograd.grad(loss, inputs[:3], retain_graph=True)
+    with pytest.raises(RuntimeError, match="expected backward without create_graph"):
+        torch.autograd.grad(loss, inputs[:3], create_graph=True)
+    assert all(torch.equal(a, b) for a, b in zip(first, torch.autograd.grad(loss, inputs[:3]), strict=True))
+    with pytest.raises(ValueError, match="does not cover this call of projection"):
+        project(gaussians.to(torch.float64), random_camera(8, 8, 0), backend="triton")
+    assert kgs.GaussianRenderer(backend="triton").backend == "triton"
