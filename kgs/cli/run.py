@@ -26,6 +26,7 @@ _COMMANDS = {
     "render": ("render", "render"),
     "eval": ("evaluate", "evaluate"),
     "page": ("page", "page"),
+    "check": ("check", "check"),
     "bench speed": ("bench", "speed"),
     "bench precision": ("bench", "precision"),
     "bench extremes": ("bench", "extremes"),
@@ -102,6 +103,8 @@ def _of_a_missing_package(error: ModuleNotFoundError) -> str:
     package = (error.name or "").partition(".")[0]
     if package == "kgs":
         raise error
+    if package == "triton":  # torch brings it
+        return str(error)
     extra = _EXTRAS.get(package, "app")
     return (
         f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '

@@ -1,0 +1,56 @@
+"""`kgs check`: what it prints, and its exit code."""
+
+import pytest
+import torch
+
+from kgs import backends
+from kgs.bench import check
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch):
+    monkeypatch.setattr(check, "COUNTS", (20, 40))
+    monkeypatch.setattr(check, "SIZE", (24, 32))
+
+
+def test_it_says_versions_devices_and_which_backend_is_taken(capsys):
+    assert check.check(device="cpu") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"torch {torch.__version__}" in lines[0]
+    rows = {line.split()[0]: line for line in lines if line.startswith("  ") and line.strip()}
+    assert set(rows) >= {backend.name for backend in backends.BACKENDS}
+    taken = [name for name, row in rows.items() if "auto takes it" in row]
+    assert taken == [backends.resolve("auto", torch.device("cpu"))]
+    assert "not for cpu" in rows["triton"] or "not installed" in rows["triton"]
+    assert max(map(len, lines)) <= 120
+    assert len(lines) <= 24  # one screen
+
+
+def test_a_backend_that_is_wrong_or_fails_is_told_and_is_a_failure(monkeypatch, capsys):
+    real = check.GaussianRenderer.forward
+
+    def brighter(self, *arguments, **options):
+        out = real(self, *arguments, **options)
+        object.__setattr__(out, "image", out.image * 1.01)
+        return out
+
+    monkeypatch.setattr(check.GaussianRenderer, "forward", brighter)
+    assert check.check(device="cpu") == 1
+    assert "WRONG: expected at most 5e-05 (off by" in capsys.readouterr().out
+    monkeypatch.setattr(check.GaussianRenderer, "forward", lambda *a, **k: 1 / 0)
+    assert check.check(device="cpu") == 1
+    assert "WRONG: ZeroDivisionError: division by zero" in capsys.readouterr().out
+
+
+def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
+    real = check.find_spec
+    monkeypatch.setattr(check, "find_spec", lambda name: None if name == "pycolmap" else real(name))
+    assert check.check(device="cpu") == 0
+    assert 'photos without cameras (pip install "kgs-splat[sfm]")' in capsys.readouterr().out
+
+
+def test_apples_gpus_are_answered_in_a_line(capsys):
+    assert check.check(device="mps") == 0
+    assert capsys.readouterr().out.startswith("kgs: Apple's GPUs have no Triton")
+    with pytest.raises(ValueError, match="device: expected cpu or a GPU of this machine, got 'nothing'"):
+        check.check(device="nothing")
