@@ -93,7 +93,7 @@ def _record() -> None:
         found[kernel.fn.__name__] = (kernel.fn.__module__, kernel.fn.__name__, signature, constants, warps)
         real(kernel, grid, *arguments, warps=warps, **constants)
 
-    stages = [import_module(f"kgs.backends.gpu.{name}") for name in STAGES]
+    stages: list[Any] = [import_module(f"kgs.backends.gpu.{name}") for name in STAGES]
     real = stages[0].launch
     for stage in stages:
         stage.launch = launch
