@@ -89,8 +89,10 @@ def _record() -> None:
 
     def launch(kernel: Any, grid: Any, *arguments: Any, warps: int = 4, **constants: Any) -> None:
         names = [name for name in kernel.arg_names if name not in constants]
-        signature = dict(zip(names, map(_type_of, arguments), strict=True))
-        found[kernel.fn.__name__] = (kernel.fn.__module__, kernel.fn.__name__, signature, constants, warps)
+        given = dict(zip(names, arguments, strict=True))
+        ones = {name: 1 for name, value in given.items() if type(value) is int and value == 1}  # as Triton does
+        signature = {name: _type_of(value) for name, value in given.items() if name not in ones}
+        found[kernel.fn.__name__] = (kernel.fn.__module__, kernel.fn.__name__, signature, constants | ones, warps)
         real(kernel, grid, *arguments, warps=warps, **constants)
 
     stages: list[Any] = [import_module(f"kgs.backends.gpu.{name}") for name in STAGES]
