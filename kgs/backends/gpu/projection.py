@@ -88,7 +88,7 @@ class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         means, quats, scales, opacities, colors, _, _, rows, places, count, (near, eps2d), harmonics = arguments
-        ctx.save_for_backward(*arguments[:7])
+        ctx.save_for_backward(*arguments[:5])  # not the cameras: they may have been made in inference mode
         ctx.rest = rows, places, harmonics
         n, views = len(means), opacities.numel() // len(means)
         bands = colors.shape[1] if harmonics else 0
@@ -113,7 +113,7 @@ class _Projection(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
         inputs, (rows, places, harmonics) = ctx.saved_tensors, ctx.rest
-        means, quats, scales, opacities, colors, *_ = inputs
+        means, quats, scales, opacities, colors = inputs
         n, views, needs = len(means), opacities.numel() // len(means), list(ctx.needs_input_grad[:7])
         needs[4] = needs[4] and harmonics
         found = [x.new_empty(x.shape) for x in inputs[:4]]
