@@ -12,7 +12,7 @@ the radial polynomial is not drawn.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -137,7 +137,16 @@ def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
 
 
-_sizes: WeakKeyDictionary[PinholeCamera, tuple[tuple[Any, ...], tuple[int, int]]] = WeakKeyDictionary()
+class _Size(NamedTuple):
+    """The size that was read from two tensors of a camera, and their versions then."""
+
+    height: Tensor
+    width: Tensor
+    versions: tuple[int, int]
+    size: tuple[int, int]
+
+
+_sizes: WeakKeyDictionary[PinholeCamera, _Size] = WeakKeyDictionary()
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
@@ -147,13 +156,11 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
     """
     if not isinstance(cameras, PinholeCamera) or cameras.height.is_inference() or cameras.width.is_inference():
         return _read_size(cameras)
-    tensors = (cameras.height, cameras.width)
-    state = (*map(id, tensors), *(x._version for x in tensors))
-    known, size = _sizes.get(cameras, ((), (0, 0)))
-    if known != state:
-        size = _read_size(cameras)
-        _sizes[cameras] = state, size
-    return size
+    height, width = cameras.height, cameras.width
+    versions, known = (height._version, width._version), _sizes.get(cameras)
+    if known is None or known.height is not height or known.width is not width or known.versions != versions:
+        known = _sizes[cameras] = _Size(height, width, versions, _read_size(cameras))
+    return known.size
 
 
 def _read_size(cameras: Cameras) -> tuple[int, int]:

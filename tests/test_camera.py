@@ -10,7 +10,7 @@ from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 
 from kgs import PosedCamera
-from kgs.camera import image_size, lenses
+from kgs.camera import image_size, lenses, pinhole_cameras
 
 HEIGHT, WIDTH = 48, 64
 INTRINSICS = [50.0, 55.0, 30.0, 25.0]  # fx fy cx cy, off centre
@@ -270,3 +270,12 @@ def test_size_errors():
 def test_other_cameras_are_a_type_error(wrong):
     with pytest.raises(TypeError, match="cameras: expected a kornia PinholeCamera or a kgs.PosedCamera"):
         image_size(wrong)
+
+
+def test_a_size_that_changes_in_place_or_is_replaced_is_read_again():
+    camera = pinhole_cameras(torch.eye(4), torch.eye(3), width=32, height=24)
+    assert [image_size(camera) for _ in range(2)] == [(24, 32)] * 2
+    camera.width += 8
+    assert image_size(camera) == (24, 40)
+    camera.height = torch.tensor([12])
+    assert image_size(camera) == (12, 40)

@@ -5,6 +5,7 @@ the same views in the same order.
 """
 
 import copy
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -393,7 +394,7 @@ class Trainer:
         penalty = self.penalty(gaussians, camera)
         if penalty is not None:
             loss = loss + penalty
-        looks = self.step % self.look_every == 0 or self.step in (1, self.times.steps)
+        looks = self.step % self.look_every == 0 or self.step == self.times.steps or math.isnan(self._loss)
         if looks:
             self._loss = float(loss.detach())
             self._stop_if(step_fault(self.model, out.projected.num_nonfinite, self._loss))
