@@ -7,8 +7,9 @@ from kornia.losses import ssim_loss
 from kgs.losses import photometric_loss, target_moments
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 11, 11), (2, 3, 11, 17), (1, 3, 25, 12), (1, 2, 13, 40)])
-@pytest.mark.parametrize("weight", [0.2, 3.0])
+@pytest.mark.parametrize(
+    ("shape", "weight"), [((1, 1, 11, 11), 0.2), ((2, 3, 11, 17), 0.2), ((1, 3, 25, 12), 0.2), ((1, 2, 13, 40), 3.0)]
+)
 def test_value_and_gradient_are_kornias(shape, weight):
     image, target = torch.rand(shape), torch.rand(shape)
     image[..., ::2, 3:5] = target[..., ::2, 3:5]  # no slope where they are equal
