@@ -126,3 +126,23 @@ def assert_alike(gaussians, cameras, backend, accuracy=3e-6, **options):
     ]
     assert [grads[name] is None for name in FIELDS] == [same[name] is None for name in FIELDS]
     return got, grads
+
+
+def assert_camera_gradients(gaussians, cameras, backend, wanted):
+    """Gradients of "pose", "lens" and "Gaussians", as far as they are wanted: what torch says in float64."""
+    found = []
+    for name, dtype in ((backend, torch.float32), ("torch", torch.float64)):
+        matrices = {"pose": cameras.extrinsics, "lens": cameras.intrinsics}
+        leaf = {part: x.to(dtype).clone().requires_grad_(part in wanted) for part, x in matrices.items()}
+        values, inputs = leaves(gaussians.to(dtype)) if "Gaussians" in wanted else (gaussians.to(dtype), [])
+        seen = type(cameras)(leaf["lens"], leaf["pose"], cameras.height, cameras.width)
+        fields = [getattr(project(values, seen, backend=name), field) for field in DIFFERENTIABLE]
+        generator = torch.Generator().manual_seed(2)
+        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
+        used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
+        torch.autograd.backward(*zip(*used, strict=True))
+        found.append(([x.requires_grad for x in fields], [x.grad for x in (*leaf.values(), *inputs)]))
+    assert found[0][0] == found[1][0]
+    for got, exact in zip(found[0][1], found[1][1], strict=True):
+        assert (got is None) == (exact is None)
+        assert got is None or (got - exact).abs().max() <= 3e-6 * exact.abs().max()

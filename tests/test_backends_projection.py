@@ -6,7 +6,7 @@ import importlib
 import pytest
 import torch
 from factories import FIELDS, leaves, pinhole, random_gaussians, replace, with_camera
-from projection_checks import DIFFERENTIABLE, assert_alike, list_and_gradients, wide_scene
+from projection_checks import DIFFERENTIABLE, assert_alike, assert_camera_gradients, list_and_gradients, wide_scene
 
 import kgs
 from kgs import GaussianRenderer, project
@@ -88,23 +88,8 @@ def test_poses_that_are_scaled_or_sheared(kernel_backend):
 def test_gradients_of_cameras(kernel_backend, degree, wanted, handed_over):
     gaussians, cameras = wide_scene(degree, cameras=2)
     lens = cameras.intrinsics + torch.tensor([[0.0, 3.0], [-2.0, 0.0]]).repeat(2, 2) * torch.eye(4)[:, [1, 0, 2, 3]]
-    found = []
-    for backend, dtype in ((kernel_backend, torch.float32), ("torch", torch.float64)):
-        matrices = {"pose": cameras.extrinsics, "lens": lens}
-        leaf = {name: x.to(dtype).clone().requires_grad_(name in wanted) for name, x in matrices.items()}
-        values, inputs = leaves(gaussians.to(dtype)) if "Gaussians" in wanted else (gaussians.to(dtype), [])
-        seen = type(cameras)(leaf["lens"], leaf["pose"], cameras.height, cameras.width)
-        fields = [getattr(project(values, seen, backend=backend), name) for name in DIFFERENTIABLE]
-        generator = torch.Generator().manual_seed(2)
-        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
-        used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
-        torch.autograd.backward(*zip(*used, strict=True))
-        found.append(([x.requires_grad for x in fields], [x.grad for x in (*leaf.values(), *inputs)]))
+    assert_camera_gradients(gaussians, with_camera(cameras, intrinsics=lens), kernel_backend, wanted)
     assert not handed_over
-    assert found[0][0] == found[1][0]
-    for got, exact in zip(found[0][1], found[1][1], strict=True):
-        assert (got is None) == (exact is None)
-        assert got is None or (got - exact).abs().max() <= 3e-6 * exact.abs().max()
 
 
 @pytest.mark.parametrize("options", [{"near_plane": 4.0}, {"eps2d": 0.0}, {"eps2d": 2.5, "near_plane": 1e-6}])

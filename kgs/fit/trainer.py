@@ -297,9 +297,9 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`, bit for bit. Scene and configuration must be those of the state.
 
-        The device may differ: the backend is that of the state where it runs on the device, and what is drawn at random
-        begins anew on another kind of device, which `notes` says. If all steps of the state are done, `steps` may be
-        larger; `notes` then says what that changes.
+        The device may differ: the backend is that of the state where it runs on the device, and on another kind of
+        device random numbers start a new sequence, which `notes` says. If all steps of the state are done, `steps` may
+        be larger; `notes` then says what that changes.
 
         Raises:
             ValueError: scene or configuration differ, or an entry is missing or wrong; the message begins with its
@@ -327,7 +327,9 @@ class Trainer:
                 if self.drop is not None:
                     self.drop.set_rng_state(state["drop"])
             else:  # their sizes are those of the kind of device
-                self.note("the checkpoint is of another kind of device: dropping and backgrounds draw anew")
+                self.note(
+                    "the checkpoint is of another kind of device: dropping and backgrounds start new random sequences"
+                )
             if self.poses is not None:
                 self.scene = self.poses.restore(self.scene, state["poses"])
 

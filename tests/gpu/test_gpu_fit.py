@@ -108,7 +108,9 @@ def test_a_resumed_fit_on_another_kind_of_device_draws_anew_and_says_so(scene, f
     state |= {"drop": state["drop"][:16], "colors": state["colors"][:16]}  # what a generator of a GPU has
     other = trainer(scene, few, "torch")
     other.load_state_dict(state)
-    assert other.notes == ["the checkpoint is of another kind of device: dropping and backgrounds draw anew"]
+    assert other.notes == [
+        "the checkpoint is of another kind of device: dropping and backgrounds start new random sequences"
+    ]
     assert other.train_step() > 0
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from factories import leaves, random_camera, replace, with_camera
 from kornia.sensors.camera import CameraModelType
-from projection_checks import DIFFERENTIABLE, assert_alike, posed, wide_scene
+from projection_checks import assert_alike, assert_camera_gradients, posed, wide_scene
 
 import kgs
 from kgs import project
@@ -102,23 +102,8 @@ def test_poses_that_are_scaled_or_sheared(handed_over):
 @pytest.mark.parametrize("wanted", [("pose",), ("pose", "lens", "Gaussians")])
 def test_gradients_of_cameras(degree, wanted, handed_over):
     gaussians, cameras = wide_scene(degree, 60, cameras=2)
-    found = []
-    for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
-        matrices = {"pose": cameras.extrinsics, "lens": cameras.intrinsics}
-        leaf = {name: x.to(dtype).clone().requires_grad_(name in wanted) for name, x in matrices.items()}
-        values, inputs = leaves(gaussians.to(dtype)) if "Gaussians" in wanted else (gaussians.to(dtype), [])
-        seen = type(cameras)(leaf["lens"], leaf["pose"], cameras.height, cameras.width)
-        fields = [getattr(project(values, seen, backend=backend), name) for name in DIFFERENTIABLE]
-        generator = torch.Generator().manual_seed(2)
-        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
-        used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
-        torch.autograd.backward(*zip(*used, strict=True))
-        found.append(([x.requires_grad for x in fields], [x.grad for x in (*leaf.values(), *inputs)]))
+    assert_camera_gradients(gaussians, cameras, "triton", wanted)
     assert not handed_over
-    assert found[0][0] == found[1][0]
-    for got, exact in zip(found[0][1], found[1][1], strict=True):
-        assert (got is None) == (exact is None)
-        assert got is None or (got - exact).abs().max() <= 3e-6 * exact.abs().max()
 
 
 def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
