@@ -218,6 +218,16 @@ def test_it_stops_where_scales_explode(scene, points):
         trainer.fit()
 
 
+def test_scales_that_grow_without_end_are_bounded(scene, points):
+    """As those of the sky do in a long fit: no photo tells them from larger ones, and the fit goes on."""
+    trainer = Trainer(scene, replace(CONFIG, steps=60), points)
+    with torch.no_grad():
+        trainer.model.log_scales[3, 1] = math.log(5e5 * trainer.extent)
+    trainer.fit(lambda trainer, _: trainer.step == 20)
+    assert trainer.model.log_scales.max() <= math.log(1.0001e4 * trainer.extent)
+    trainer.fit()
+
+
 @pytest.mark.parametrize("factor", [10, 1000])
 def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, factor):
     rates = {

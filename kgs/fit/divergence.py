@@ -8,6 +8,7 @@ from torch import Tensor
 from kgs.model import GaussianModel
 
 _LARGEST = 1e6  # of a scale, in extents of the camera rig: a larger one means that the fit explodes
+_BOUND = 1e4  # extents: no photo tells a larger scale from this one
 
 
 def parameter_fault(model: GaussianModel) -> str:
@@ -45,6 +46,16 @@ def scale_fault(model: GaussianModel, extent: float) -> str:
         return ""
     largest = float(model.log_scales.detach()[row].max())
     return f"expected scales below {_LARGEST:g} times the extent, got e^{largest:.1f} in log_scales of Gaussian {row}"
+
+
+@torch.no_grad()
+def bound_scales(model: GaussianModel, extent: float) -> None:
+    """Limit scales to ten thousand extents.
+
+    An axis along the rays, or across the whole sky, changes no pixel as it grows, and Adam's steps do not become small
+    with their gradient: in a long fit its scale would grow without end.
+    """
+    model.log_scales.clamp_(max=math.log(_BOUND * extent))
 
 
 def _first_row(is_wrong: Tensor) -> int | None:

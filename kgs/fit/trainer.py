@@ -44,11 +44,11 @@ from .checkpoint import (
     save_checkpoint,
 )
 from .config import CHOICES, FitConfig, most_gaussians, timetable, with_pace
-from .divergence import gradient_fault, parameter_fault, scale_fault, step_fault
+from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
 from .poses import MovingPoses, decayed
 from .targets import targets
 
-_LOOK = 20  # steps between looks for faults on a GPU: reading a number waits until all work is done
+_LOOK = 20  # steps between looks at scales, and on a GPU for faults: reading a number waits until all work is done
 # for each parameter the name of its learning rate in the recipe, without `lr_`
 _LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
 
@@ -248,6 +248,8 @@ class Trainer:
                 self.note(f"max_gaussians: {most} leaves little room beside the {first} initial points")
         if step in self.times.reset:
             self.densifier.reset_opacity(self.config.recipe.reset_opacity)
+        if step % _LOOK == 0:
+            bound_scales(self.model, self.extent)
         self.seconds += time.perf_counter() - start
         return loss
 
