@@ -8,7 +8,7 @@ import torch
 
 from kgs import backends
 from kgs.backends import Backend
-from kgs.backends.agreement import BOUND
+from kgs.backends.agreement import BOUND, disagreement
 from kgs.camera import move_camera
 from kgs.machine import check_device, versions
 from kgs.renderer import GaussianRenderer
@@ -100,6 +100,8 @@ def _examine(backend: Backend, device: torch.device) -> _Found:
     """Agreement and times; what is wrong in one line."""
     try:
         off = _off_by(backend.name, device)
+        if backend.has_loss:  # kernels
+            off = max(off, disagreement(backend, device))
         milliseconds = [1e3 * _seconds(count, backend.name, device) for count in COUNTS]
     except Exception as error:  # whatever a compiler, a driver or a broken package does
         return _Found(float("nan"), [], f"{type(error).__name__}: {error}".splitlines()[0])
@@ -131,7 +133,7 @@ def _row(backend: Backend, device: torch.device, found: _Found, taken: bool) -> 
         return f"WRONG: {found.wrong}" + (f" (off by {found.agreement:.1e})" if found.milliseconds else "")
     if not found.milliseconds:
         package, how = backend.package or ("", "")
-        if not backend.is_installed():
+        if backend.runs_on(device) and not backend.is_installed():
             return f"not installed: {package}; {how}"
         return f"not for {device.type}"
     times = "".join(f"{value:>8.1f} ms" for value in found.milliseconds)

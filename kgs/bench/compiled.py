@@ -13,13 +13,16 @@ import re
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
+from kgs.camera import pinhole_cameras
 from kgs.raster.binning import bin_to_tiles
+from kgs.renderer import GaussianRenderer
 from kgs.stages import project
 
 from .output import markdown_table
@@ -73,26 +76,32 @@ class Compiled(NamedTuple):
     instructions: int
 
 
-def kernels() -> list[Kernel]:
-    """The kernels of a training step, with the types of their arguments: from a step in the interpreter."""
-    program = "from kgs.bench.compiled import _record; _record()"
+def kernels(every_form: bool = False) -> list[Kernel]:
+    """The kernels of a training step, with the types of their arguments: from a step in the interpreter.
+
+    With `every_form` also the forms that other calls use: several cameras, their gradients, features, row slices.
+    """
+    program = f"from kgs.bench.compiled import _record; _record({every_form})"
     environment = os.environ | {"TRITON_INTERPRET": "1"}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=True, text=True)
     return [Kernel(*each) for each in json.loads(done.stdout.splitlines()[-1])]
 
 
-def _record() -> None:
-    """Print the kernels of a step as JSON; in the interpreter."""
+def _record(every_form: bool) -> None:
+    """Print the kernels as JSON; in the interpreter."""
     from kgs.bench.speed import Cases
 
-    found: dict[str, tuple[Any, ...]] = {}
+    found: dict[Any, tuple[Any, ...]] = {}
 
     def launch(kernel: Any, grid: Any, *arguments: Any, warps: int = 4, **constants: Any) -> None:
         names = [name for name in kernel.arg_names if name not in constants]
         given = dict(zip(names, arguments, strict=True))
+        as_they_are = kernel.kwargs["do_not_specialize"] or ()
         ones = {name: 1 for name, value in given.items() if type(value) is int and value == 1}  # as Triton does
+        ones = {name: value for name, value in ones.items() if name not in as_they_are}
         signature = {name: _type_of(value) for name, value in given.items() if name not in ones}
-        found[kernel.fn.__name__] = (kernel.fn.__module__, kernel.fn.__name__, signature, constants | ones, warps)
+        form = (kernel.fn.__name__, *sorted((constants | ones).items())) if every_form else kernel.fn.__name__
+        found[form] = (kernel.fn.__module__, kernel.fn.__name__, signature, constants | ones, warps)
         real(kernel, grid, *arguments, warps=warps, **constants)
 
     stages: list[Any] = [import_module(f"kgs.backends.gpu.{name}") for name in STAGES]
@@ -100,7 +109,27 @@ def _record() -> None:
     for stage in stages:
         stage.launch = launch
     Cases(40, (16, 16), torch.device("cpu"), "triton").train()
+    if every_form:
+        _draw_everything()
     print(json.dumps(list(found.values())))
+
+
+def _draw_everything() -> None:
+    """What a training step does not ask for."""
+    model, camera = layered_scene(40, (24, 24))
+    single = model()
+    pose = camera.extrinsics.repeat(2, 1, 1).requires_grad_()
+    cameras = pinhole_cameras(pose, camera.intrinsics[0], 24, 24)
+    opacities = single.opacities.repeat(2, 1)
+    for gaussians, max_bytes in ((single, 2**17), (replace(single, opacities=opacities), 2**30)):
+        renderer = GaussianRenderer(backend="triton", absgrad=True, max_bytes=max_bytes)
+        out = renderer(gaussians, cameras, outputs=("image", "median_depth"))
+        assert out.image is not None
+        out.image.square().sum().backward()
+    features = replace(single, colors=torch.rand(40, 9, requires_grad=True))
+    out = GaussianRenderer(backend="triton")(features, cameras)
+    assert out.image is not None
+    out.image.square().sum().backward()
 
 
 def _type_of(argument: Any) -> str:

@@ -199,15 +199,20 @@ def row_slices(needs: list[int], max_bytes: int) -> list[tuple[int, int]]:
     """Consecutive rows of tiles that need at most `max_bytes` together; an error where one needs more."""
     slices, begin, total = [], 0, 0
     for row, need in enumerate(needs):
-        if need > max_bytes:
-            got = f"expected at least that, got {max_bytes} for it"
-            ways = "raise max_bytes, or render fewer or smaller Gaussians"
-            raise ValueError(f"max_bytes: one row of tiles needs {need} bytes, {got}; {ways}")
+        check_fits(need, max_bytes)
         if total + need > max_bytes:
             slices.append((begin, row))
             begin, total = row, 0
         total += need
     return [*slices, (begin, len(needs))]
+
+
+def check_fits(need: int, max_bytes: int) -> None:
+    """Raise a ValueError where one row of tiles needs more than `max_bytes`."""
+    if need > max_bytes:
+        got = f"expected at least that, got {max_bytes} for it"
+        ways = "raise max_bytes, or render fewer or smaller Gaussians"
+        raise ValueError(f"max_bytes: one row of tiles needs {need} bytes, {got}; {ways}")
 
 
 def bin_to_tiles(

@@ -9,11 +9,17 @@ from oracles import near_threshold
 
 import kgs
 import kgs.reference
-from kgs import GaussianRenderer
+from kgs import GaussianRenderer, backends
 from kgs.bench import extremes
 
 BOUNDS = {torch.float32: 1e-5, torch.float64: 1e-11}
 DTYPES = pytest.mark.parametrize("dtype", list(BOUNDS))
+
+
+@pytest.mark.cuda
+def test_auto_takes_the_kernels():
+    """Else all tests of this folder would pass in torch."""
+    assert backends.resolve("auto", torch.device("cuda")) == "triton"
 
 
 def cotangents(*values):

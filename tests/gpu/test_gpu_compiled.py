@@ -11,7 +11,7 @@ from kgs.bench.compiled import CARDS, TARGETS, kernels
 pytestmark = pytest.mark.slow
 
 
-def test_all_kernels_compile_and_none_spills(tmp_path):
+def test_the_kernels_of_a_training_step_compile_and_none_spills(tmp_path):
     compiler = pytest.importorskip("triton.compiler")
     if not hasattr(compiler, "ASTSource"):
         pytest.skip("another version of Triton")
@@ -23,6 +23,25 @@ def test_all_kernels_compile_and_none_spills(tmp_path):
     assert not [row for row in rows if row[3] != "0"]
     tables = (tmp_path / "compiled.md").read_text()
     assert all(f"An estimate from below for one {card}" in tables for card in CARDS)
+
+
+def test_every_form_of_every_kernel_compiles_and_none_spills():
+    """Several cameras and their gradients, absolute gradients, median depths, features, row slices."""
+    compiler = pytest.importorskip("triton.compiler")
+    if not hasattr(compiler, "ASTSource"):
+        pytest.skip("another version of Triton")
+    names = [kernel.name for kernel in kernels()]
+    program = (
+        "from kgs.bench.compiled import build, kernels\n"
+        "for kernel in kernels(every_form=True):\n"
+        "    print(kernel.name, *(build(kernel, target).spills for target in ('sm_90', 'gfx942')))"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    found = [line.split() for line in done.stdout.splitlines()]
+    assert {name for name, *_ in found} == set(names)
+    assert len(found) >= len(names) + 8
+    assert not [row for row in found if row[1:] != ["0", "0"]]
 
 
 def test_the_oldest_version_that_torch_brings_draws_the_same(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import weakref
 from functools import partial
 
 import pytest
@@ -10,6 +11,7 @@ from compositing_checks import STOP, TH, THRESHOLDS, assert_close, footprints, l
 from factories import batch, random_camera, random_gaussians
 
 from kgs import composite, project
+from kgs.backends.gpu import compositing
 
 SIZE = (12, 13)  # tiles that the picture ends in
 run = partial(outcome, dtype=torch.float32, backend="triton")
@@ -50,6 +52,22 @@ def test_several_cameras_in_row_slices():
         assert_close(got, expected, torch.ones(()))
     with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 500 for it"):
         composite(projected, features, max_bytes=500, backend="triton")
+
+
+def test_a_row_slice_is_freed_before_the_next_is_drawn(monkeypatch):
+    """In the backward pass too: `max_bytes` is for one of them."""
+    projected, certain = sample(10, (24, 9))
+    held, real = [], compositing.GpuCompositing._draw
+
+    def draw(self, *arguments):
+        assert not [1 for reference in held if reference() is not None]
+        found = real(self, *arguments)
+        held[:] = [weakref.ref(x) for x in (found.entries, found.places, found.offsets, found.starts)]
+        return found
+
+    monkeypatch.setattr(compositing.GpuCompositing, "_draw", draw)
+    run(projected, random(len(projected), 3), certain, max_bytes=2**13)
+    assert held
 
 
 def test_no_gaussians_and_no_entries():

@@ -1,7 +1,8 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
-Each `X_kernels.py` has the kernels of a stage, and `X.py` beside it brings them to torch. Torch defines what is right;
-a kernel gives the same within the rounding of float32, and its formulas are explained in the torch code that it
+`projection_kernels`, `compositing_kernels` and `loss_kernels` have the kernels of a stage, and `projection`,
+`compositing` and `loss` bring them to torch; the other files of kernels are parts of these. Torch defines what is
+right; a kernel gives the same within the rounding of float32, and its formulas are explained in the torch code that it
 follows. `import kgs` does not import triton: a stage is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
@@ -9,7 +10,8 @@ With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so 
 Rules:
 
 1. A program writes what no other program writes, and nothing is added atomically: the same bits in each run.
-2. A number is read from the device only where the size of a tensor follows from it: reading waits for all work.
+2. A number is read from the device only where the size of a tensor follows from it, and with it whether torch must
+   do the call: reading waits for all work.
 3. What a kernel is called with is checked before; it clamps nothing but the indices of masked lanes.
 4. Constants of a module stand to the right of operators; block shapes are powers of two; a loop whose end depends on
    data is a `while` on a scalar.
@@ -39,12 +41,17 @@ class GpuBackend(Backend):
 
     def runs_on(self, device: torch.device) -> bool:
         """On GPUs, and on CPUs in Triton's interpreter."""
-        interpreted = device.type == "cpu" and os.environ.get("TRITON_INTERPRET") == "1"
-        return interpreted or super().runs_on(device)
+        return (device.type == "cpu" and _is_interpreted()) or super().runs_on(device)
 
     def is_trusted(self, device: torch.device) -> bool:
-        """Whether the kernels pass :func:`self_check`, once for each GPU; never on a CPU."""
-        return device.type != "cpu" and self_check(device)
+        """Whether the kernels pass :func:`self_check`, once for each GPU; never in the interpreter."""
+        if device.type == "cpu" or _is_interpreted():
+            return False
+        index = torch.get_device_module(device).current_device() if device.index is None else device.index
+        try:
+            return self_check(torch.device(device.type, index))
+        except torch.OutOfMemoryError:  # says nothing about the kernels
+            return False
 
     def covers(self, like: Tensor) -> bool:
         """Float32 on a GPU, while no graph is traced."""
@@ -94,16 +101,25 @@ class GpuBackend(Backend):
         return loss_and_gradient(image, target, mean, variance, taps, dssim_weight, gradient)
 
 
+def _is_interpreted() -> bool:
+    return os.environ.get("TRITON_INTERPRET") == "1"
+
+
 @functools.cache
 def self_check(device: torch.device) -> bool:
     """Whether a small scene comes out as in torch on a device; a warning says what is wrong.
 
     The first time on a machine the kernels are compiled, which takes seconds.
+
+    Raises:
+        torch.OutOfMemoryError: there is no room for it now; what is raised is not remembered.
     """
     from kgs.backends.agreement import BOUND, disagreement
 
     try:
         found = disagreement(GpuBackend(), device)
+    except torch.OutOfMemoryError:
+        raise
     except Exception as error:  # a compiler that does not know the card, a driver: kgs can do without
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
     else:

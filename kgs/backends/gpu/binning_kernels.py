@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 
 from .compositing_kernels import SIZE
-from .footprints import load_factors, variances
+from .footprint_kernels import load_factors, variances
 
 _S: tl.constexpr = tl.constexpr(SIZE)
 _ROOT: tl.constexpr = tl.constexpr(0.8493218002880191)  # sqrt(log2(e) / 2): exp(-q / 2) = 2^-(ROOT^2 q)
@@ -28,7 +28,7 @@ def fill_table(order, means2d, factors, opacities, depths, eps2d, n, table, BLOC
     # LDL^T with the larger variance as pivot: the exponent keeps its accuracy for needles
     pivot = tl.maximum(xx, yy)
     slope = -xy / pivot
-    opaque = opacity > 3e38  # everywhere, if it is infinite
+    opaque = opacity == float("inf")  # everywhere
     along = tl.where(opaque, 0.0, 1.0 / tl.sqrt(pivot) * _ROOT)
     across = tl.where(opaque, 0.0, tl.sqrt(pivot / det) * _ROOT)
     wide = xx >= yy
@@ -82,7 +82,7 @@ def _span(row, active, x, y, half, cut, slope, across, inverse, rightmost, width
     return first, tl.where(some, last - first + 1, 0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["begin", "end"])
 def count_entries(
     order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
     counts,
@@ -107,13 +107,16 @@ def count_entries(
     tl.store(counts + i, total, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["begin", "end"])
 def fill_entries(
     order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
     columns, begins, tiles, ranks,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tiles that each Gaussian reaches, from `begins[i]` on, and beside them its place in depth order."""
+    """The tiles that each Gaussian reaches, from `begins[i]` on, and beside them its place in depth order.
+
+    At most as many as were counted: a compiler may round one of the two kernels otherwise, at the edge of a tile.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
     g = tl.load(order + i, mask=inside, other=0)
@@ -123,6 +126,7 @@ def fill_entries(
         means2d, factors, opacities, g, inside, eps2d, log2_threshold, height, first_row, last_row
     )
     at = tl.load(begins + i, mask=inside, other=0)
+    full = tl.load(begins + i + 1, mask=inside, other=0)
     left = tl.max(stop - row, 0)
     while left > 0:
         first, count = _span(row, row < stop, x, y, half, cut, slope, across, inverse, rightmost, width)
@@ -130,7 +134,7 @@ def fill_entries(
         most = tl.max(count, 0)
         c = 0
         while c < most:
-            some = c < count
+            some = (c < count) & (at + c < full)
             tl.store(tiles + at + c, tile + c, mask=some)
             tl.store(ranks + at + c, i, mask=some)
             c += 1

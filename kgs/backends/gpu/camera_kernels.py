@@ -7,7 +7,7 @@ whether the kernels can draw it.
 import triton
 import triton.language as tl
 
-from .footprints import is_finite
+from .footprint_kernels import is_finite
 
 WIDTH = 32
 PLAIN = 25  # where in a row it says that intrinsics and pose are affine, and the pose rigid where it must be
@@ -71,6 +71,7 @@ def describe_cameras(
     _store_limits(out + 20, tl.load(matrix + 5), tl.load(matrix + 6), top, bottom, margin_y)
     det = tl.load(pose) * _cofactor(pose, 0, 0) + tl.load(pose + 1) * _cofactor(pose, 0, 1)
     det += tl.load(pose + 2) * _cofactor(pose, 0, 2)
+    plain = tl.where(turned | ((det != 0.0) & is_finite(det)), plain, 0)  # torch says that it has no inverse
     for j in tl.static_range(3):
         moved = tl.load(pose + 3) * 0.0
         for m in tl.static_range(3):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kgs.backends.base import Inputs
-from kgs.raster.binning import row_slices
+from kgs.raster.binning import check_fits
 from kgs.types import ProjectedGaussians, RasterOptions
 
 from .binning_kernels import count_entries, fill_entries, fill_table
@@ -86,20 +86,20 @@ class GpuCompositing:
         absolute = found[0].new_empty(found[0].shape if needs_absolute else (0,))
         values = features.contiguous()
         factors, opacities, grads, behind = (x.contiguous() for x in (*inputs[1:3], grad_features, grad_transmittance))
-        for rows in self._slices:
-            drawn = self._draw(rows, features, None, True) if kept is None else kept
-            kept, later_slice = None, rows is not self._slices[0]
+
+        def add(rows: _Rows, drawn: _Drawn) -> None:
+            """Add the gradients of a row slice; what it needs is freed before the next is drawn."""
+            later_slice = rows is not self._slices[0]
             lists = (drawn.entries, drawn.places, drawn.offsets, *self._tiles(rows), channels, *self._stops)
-            moments = features.new_zeros(rows.entries, ROW)
+            given = (self._table, values, self._order, *lists, drawn.starts, drawn.reached, grads, behind)
+            moments, tiles = features.new_zeros(rows.entries, ROW), (len(drawn.reached),)
             for first in self._features:
-                given = (self._table, values, self._order, *lists, drawn.starts, drawn.reached, grads, behind)
-                tiles = (len(drawn.reached),)
                 launch(composite_backward, tiles, *given, first, moments, ABSOLUTE=needs_absolute, warps=1)
-                given = (self._order, rows.begins, moments, factors, opacities, self._eps2d, n, channels, first)
                 launch(
                     sum_entries,
                     (blocks(n, 8),),
-                    *(*given, *found, absolute),
+                    *(self._order, rows.begins, moments, factors, opacities, self._eps2d, n, channels, first),
+                    *(*found, absolute),
                     MOMENTS=any(needs[:3]),
                     WITH_FEATURES=needs[3],
                     ABSOLUTE=needs_absolute,
@@ -108,7 +108,10 @@ class GpuCompositing:
                     BLOCK=8,
                     STRIDE=16,
                 )
-            del drawn  # before the next is made
+
+        for rows in self._slices:
+            add(rows, self._draw(rows, features, None, True) if kept is None else kept)
+            kept = None
         wanted = (x if needed else None for x, needed in zip(found, needs, strict=True))
         return *wanted, absolute if needs_absolute else None
 
@@ -125,7 +128,7 @@ class GpuCompositing:
             middle = (begin + end) // 2
             del counts, begins
             return self._fitting(begin, middle, max_bytes) + self._fitting(middle, end, max_bytes)
-        row_slices([need], max_bytes)
+        check_fits(need, max_bytes)
         return [_Rows(begin, end, begins, entries)]
 
     def _tiles(self, rows: _Rows) -> tuple[int, ...]:
@@ -136,9 +139,9 @@ class GpuCompositing:
         """Fill sums, transmittance and median depth; without images only compute what `backward` needs again."""
         n, tiles = len(self._order), (rows.end - rows.begin) * self._columns
         kind = torch.int16 if tiles < 2**15 else torch.int32  # sorted in half the time
-        keys = self._order.new_empty(rows.entries, dtype=kind)
+        keys = self._order.new_full((rows.entries,), tiles, dtype=kind)  # behind all tiles
         ranks = self._order.new_empty(rows.entries, dtype=torch.int32)
-        where = (rows.begin, rows.end, n, self._columns, rows.begins, keys, ranks)
+        where = (rows.begin, rows.end, n, self._columns, rows.begins, keys, ranks)  # as many as were counted, or fewer
         launch(fill_entries, (blocks(n, _LANES),), *self._ellipses, *where, BLOCK=_LANES, warps=1)
         keys, places = torch.sort(keys, stable=True)
         offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=kind, device=keys.device))

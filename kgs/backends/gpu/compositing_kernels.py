@@ -6,23 +6,23 @@ each chunk is kept, and the backward pass computes the alphas of a chunk again. 
 entry, where no other program writes, in the order of the Gaussians: `sum_entries` adds up neighbouring rows in a fixed
 order. There are no atomics.
 
-Arrays, for n Gaussians in depth order and E entries:
+Arrays, for M projected Gaussians, T tiles and E entries:
 
-    table        (n, 8)   log2 o, x, y, two whitening vectors, depth
+    table        (M, 8)   in depth order: log2 o, x, y, two whitening vectors, depth
     features     (M, F)   as they were given
-    order        (n,)     the rows of the M projected Gaussians in depth order
+    order        (M,)     their rows in depth order
     entries      (E,)     for each tile its Gaussians from front to back, as places in `order`
     places       (E,)     which place each entry has if they are sorted by Gaussian
     offsets      (T + 1,) where the entries of each tile begin
     starts       (E / K + T, P) T at the beginning of each chunk
     reached      (T,)     how many entries of a tile were composited
-    rows         (E, ROW) six moments of dL/d ln alpha about the centre, dL/d features, |dL/d mean|
+    moments      (E, ROW) six moments of dL/d ln alpha about the centre, dL/d features, |dL/d mean|
 """
 
 import triton
 import triton.language as tl
 
-from .footprints import is_finite, load_factors, put, variances
+from .footprint_kernels import is_finite, load_factors, put, variances
 
 SIZE = 8  # side of a tile
 K = 8  # entries in a chunk: more spill registers
@@ -58,7 +58,7 @@ def _pixels(tile, columns, rows):
     inside = tile % (columns * rows)
     x = (inside % columns) * _S + p % _S
     y = (inside // columns) * _S + p // _S
-    return tile // (columns * rows), x, y
+    return (tile // (columns * rows)).to(tl.int64), x, y
 
 
 @triton.jit
@@ -100,7 +100,7 @@ def _feature(features, ids, listed, f, width):
     return tl.load(features + ids * width + f, mask=listed & _exists(f, width, ids), other=0.0)[:, None]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_tile"])
 def composite_forward(
     table, features, order, entries, offsets, first_tile, columns, rows, height, width, channels, threshold, stop,
     starts, reached, sums, transmittance, depths,
@@ -156,27 +156,27 @@ def composite_forward(
             tl.store(transmittance + camera * size + pixel, light, mask=shown)
             if MEDIAN:
                 tl.store(depths + camera * size + pixel, median, mask=shown)
-        image = sums + (camera * channels + f0).to(tl.int64) * size + pixel
+        image = sums + (camera * channels + f0) * size + pixel
         tl.store(image, sum0, mask=shown & _exists(f0, channels, pixel))
         tl.store(image + size, sum1, mask=shown & _exists(f0 + 1, channels, pixel))
         tl.store(image + size * 2, sum2, mask=shown & _exists(f0 + 2, channels, pixel))
         tl.store(image + size * 3, sum3, mask=shown & _exists(f0 + 3, channels, pixel))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_tile", "f0"])
 def composite_backward(
     table, features, order, entries, places, offsets, first_tile, columns, rows, height, width, channels, threshold,
-    stop, starts, reached, grads, grad_transmittance, f0, found,
+    stop, starts, reached, grads, grad_transmittance, f0, moments,
     ABSOLUTE: tl.constexpr,
 ):  # fmt: skip
-    """For each entry the moments, dL/d features of the block that begins at `f0`, and |dL/d mean|, into `found`."""
+    """For each entry the moments, dL/d features of the block that begins at `f0`, and |dL/d mean|: `moments`."""
     t = tl.program_id(0)
     camera, column, row = _pixels(first_tile + t, columns, rows)
     x, y = column.to(tl.float32), row.to(tl.float32)
     shown = (column < width) & (row < height)
     pixel = row * width + column
     size = height * width
-    image = grads + (camera * channels + f0).to(tl.int64) * size + pixel
+    image = grads + (camera * channels + f0) * size + pixel
     grad0 = tl.load(image, mask=shown & _exists(f0, channels, pixel), other=0.0)
     grad1 = tl.load(image + size, mask=shown & _exists(f0 + 1, channels, pixel), other=0.0)
     grad2 = tl.load(image + size * 2, mask=shown & _exists(f0 + 2, channels, pixel), other=0.0)
@@ -209,7 +209,7 @@ def composite_backward(
         behind = tl.sum(tl.where(k[:, None] == 0, m * behind[None, :] + b, 0.0), 0)
         slope = tl.where(alpha < _ALPHA_MAX, weight * (value - later), 0.0)
         by_x, by_y = slope * dx, slope * dy
-        out = found + tl.load(places + e + k, mask=listed, other=0) * _ROW
+        out = moments + tl.load(places + e + k, mask=listed, other=0) * _ROW
         tl.store(out, tl.sum(slope, 1), mask=listed)
         tl.store(out + 1, tl.sum(by_x, 1), mask=listed)
         tl.store(out + 2, tl.sum(by_y, 1), mask=listed)
@@ -233,9 +233,9 @@ def composite_backward(
         chunk -= 1
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["f0"])
 def sum_entries(
-    order, begins, rows, factors, opacities, eps2d, n, channels, f0, d_means2d, d_factors, d_opacities, d_features,
+    order, begins, moments, factors, opacities, eps2d, n, channels, f0, d_means2d, d_factors, d_opacities, d_features,
     d_absolute,
     MOMENTS: tl.constexpr, WITH_FEATURES: tl.constexpr, ABSOLUTE: tl.constexpr,
     ADD: tl.constexpr, ADD_FEATURES: tl.constexpr, BLOCK: tl.constexpr, STRIDE: tl.constexpr,
@@ -255,7 +255,7 @@ def sum_entries(
     at = begin[:, None] + tl.arange(0, STRIDE)[None, :]
     left = tl.max(end - begin, 0)
     while left > 0:
-        row = rows + at * _ROW
+        row = moments + at * _ROW
         there = at < end[:, None]
         if MOMENTS:
             s0 += tl.sum(tl.load(row, mask=there, other=0.0), 1)

@@ -25,6 +25,11 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
         kernel[grid](*arguments, **constants, num_warps=warps, enable_fp_fusion=True)
 
 
+def wide_sum(values: Tensor, dim: int) -> Tensor:
+    """The sum along a dimension in float64; in float32 on Intel's GPUs, some of which have no float64."""
+    return values.sum(dim, dtype=torch.float32 if values.device.type == "xpu" else torch.float64)
+
+
 def blocks(count: int, size: int) -> int:
     """How many blocks of a size cover a count."""
     return -(-count // size)

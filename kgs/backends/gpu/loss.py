@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .launch import blocks, launch
+from .launch import blocks, launch, wide_sum
 from .loss_kernels import fold_down, gradient_across, ssim_maps, sum_across
 
 _BLOCK = 256  # pixels of a program
@@ -27,7 +27,7 @@ def loss_and_gradient(
     launch(sum_across, (count,), x, y, pixels, width, *half, across, BLOCK=_BLOCK)
     shape = (pixels, height, width)
     launch(ssim_maps, (count,), x, y, mean_y, variance_y, *shape, *half, across, maps, sums, count, BLOCK=_BLOCK)
-    absolute, ssim = sums.sum(1, dtype=torch.float64) / pixels
+    absolute, ssim = wide_sum(sums, 1) / pixels
     loss = (absolute + dssim_weight * (1.0 - ssim)).to(image.dtype)
     if not gradient:
         return loss, None

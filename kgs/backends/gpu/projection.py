@@ -1,5 +1,6 @@
 """Projection by the kernels: pinhole cameras; others go to torch."""
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from kgs.projection import project_torch, seen_within
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from .camera_kernels import PLAIN, WIDTH, describe_cameras
-from .launch import blocks, launch
+from .launch import blocks, launch, wide_sum
 from .projection_kernels import check_gaussians, find_seen, footprint_gradients, list_seen
 
 _BLOCK = 128  # Gaussians of a program
@@ -21,27 +22,29 @@ def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`kgs.projection.project_torch` on the kernels, where they can do the call; reads how many are seen."""
-    if not isinstance(cameras, PinholeCamera) or options.near_plane < 1e-8:  # Kornia does not divide by less
+    small = options.near_plane < 1e-8  # Kornia does not divide by less
+    if not isinstance(cameras, PinholeCamera) or gaussians.quats.ndim == 3 or small:
         return project_torch(gaussians, cameras, size, options, colors)
     seen = _find(gaussians, cameras, size, options)
     if seen is None:
         return project_torch(gaussians, cameras, size, options, colors)
-    rows, places, broken, count = seen
+    rows, places, broken, counts = seen
     harmonics = colors and gaussians.colors.ndim == 3
     rules = (options.near_plane, options.eps2d)
     inputs = (*vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics)
-    fields = _Projection.apply(*inputs, rows, places, count, rules, harmonics)
+    fields = _Projection.apply(*inputs, rows, places, sum(counts), rules, harmonics)
     means2d, factors, depths, alphas, rgb, radii, camera_ids, ids = fields
     if colors and not harmonics:
-        rgb = gaussians.colors.index_select(0, ids)
+        # camera by camera: the gradients of equal rows would be added up in any order
+        rgb = torch.cat([gaussians.colors.index_select(0, part) for part in ids.split(counts)])
     tensors = (camera_ids, ids, means2d, factors, depths, radii, alphas, rgb)
     return ProjectedGaussians(*tensors, size, len(cameras.extrinsics), len(gaussians), broken, options.eps2d)
 
 
 def _find(
     gaussians: Gaussians, cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions
-) -> tuple[Tensor, Tensor, Tensor, int] | None:
-    """Rows that describe the cameras, places of what they see, how many Gaussians are not finite, how many are seen.
+) -> tuple[Tensor, Tensor, Tensor, list[int]] | None:
+    """Rows that describe the cameras, places of what they see, how many Gaussians are not finite, how many each sees.
 
     None where the kernels cannot draw one of the cameras, or there are no Gaussians.
     """
@@ -58,8 +61,9 @@ def _find(
     rules = (cutoff, options.near_plane, options.eps2d, *size, n, seen)
     launch(find_seen, (blocks(n, _BLOCK), len(rows)), *values, finite, rows, *rules, BLOCK=_BLOCK)
     places = torch.cumsum(seen.view(-1), 0)
-    count, plain = torch.stack([places[-1], rows[:, PLAIN].amin().long()]).tolist()
-    return (rows, places, n - finite.sum(), count) if plain else None
+    *ends, plain = torch.cat([places[n - 1 :: n], rows[:, PLAIN].amin().long()[None]]).tolist()
+    counts = [end - begin for begin, end in pairwise([0, *ends])]
+    return (rows, places, n - finite.sum(), counts) if plain else None
 
 
 def _describe(cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions) -> Tensor:
@@ -134,7 +138,7 @@ class _Projection(torch.autograd.Function):
                 BLOCK=_BLOCK,
             )
             if any(needs[5:]):
-                total = totals.sum(0, dtype=torch.float64).float()
+                total = wide_sum(totals, 0).float()
                 matrices[0, c, :3], matrices[1, c, :3, :3] = total[:12].view(3, 4), total[12:].view(3, 3)
         found += matrices
         return *(x if needed else None for x, needed in zip(found, needs, strict=True)), None, None, None, None, None

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 
 from .camera_kernels import WIDTH
-from .footprints import is_finite, load_factors, put, variances
+from .footprint_kernels import is_finite, load_factors, put, variances
 from .harmonics_kernels import basis, basis_gradient, evaluate
 
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
@@ -128,10 +128,10 @@ def _turned(a0, a1, a2, b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
 
 @triton.jit
 def _footprint(camera, means, quats, scales, g, inside, near):
-    """Whether a Gaussian is before the near plane, its depth, pixel and factors."""
+    """Whether a Gaussian lies beyond the near plane, its depth, pixel and factors."""
     _, _, _, x, y, z = _camera_point(camera, means, g, inside)
-    before = z > near
-    inverse = 1.0 / tl.where(before, z, 1.0)
+    beyond = z > near
+    inverse = 1.0 / tl.where(beyond, z, 1.0)
     j00, j01, j02, j10, j11, j12, _, _ = _jacobian(camera, x, y, inverse)
     a0, a1, a2 = _to_world(camera, j00, j01, j02)
     b0, b1, b2 = _to_world(camera, j10, j11, j12)
@@ -142,7 +142,7 @@ def _footprint(camera, means, quats, scales, g, inside, near):
     s2 = tl.load(scales + g * 3 + 2, mask=inside, other=0.0)
     u = (tl.load(camera + 12) * x + tl.load(camera + 13) * y) * inverse + tl.load(camera + 14)
     v = (tl.load(camera + 15) * x + tl.load(camera + 16) * y) * inverse + tl.load(camera + 17)
-    return before, z, u, v, a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
+    return beyond, z, u, v, a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
 
 
 @triton.jit
@@ -162,11 +162,11 @@ def find_seen(
     c = tl.program_id(1)
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
-    before, _, u, v, a0, a1, a2, b0, b1, b2 = _footprint(cameras + c * _WIDTH, means, quats, scales, g, inside, near)
+    beyond, _, u, v, a0, a1, a2, b0, b1, b2 = _footprint(cameras + c * _WIDTH, means, quats, scales, g, inside, near)
     xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
     reach = tl.load(cutoff)
     rx, ry = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
-    some = inside & before & (tl.load(finite + g, mask=inside, other=0) > 0)
+    some = inside & beyond & (tl.load(finite + g, mask=inside, other=0) > 0)
     some &= (det > 0.0) & is_finite(det + _largest(xx, xy, yy) + u + v)
     some &= (u + rx > -0.5) & (u - rx < width - 0.5) & (v + ry > -0.5) & (v - ry < height - 0.5)
     tl.store(seen + c * n + g, some.to(tl.int32), mask=inside)
@@ -317,7 +317,7 @@ def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, 
     _total(out + 4 * i + 3, moved + turned, seen)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["c"])
 def footprint_gradients(
     c, means, quats, scales, colors, cameras, places, n, views, g_means2d, g_factors, g_depths, g_alphas, g_rgb,
     d_means, d_quats, d_scales, d_opacities, d_colors, totals,
