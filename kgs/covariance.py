@@ -20,10 +20,12 @@ from torch import Tensor
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices `(N, 3, 3)` of quaternions w, x, y, z of any norm, `(N, 4)`.
+    """Rotation matrices `(N, 3, 3)` of quaternions w, x, y, z of any norm, `(N, 4)`; matrices are returned as they are.
 
     The columns are the Gaussian's local axes in the world. The zero quaternion gives the identity with zero gradient.
     """
+    if quats.ndim == 3:
+        return quats
     peak = quats.detach().abs().amax(-1, keepdim=True)
     return quaternion_to_rotation_matrix(quats / torch.where(peak > 0, peak, 1.0))
 
@@ -32,7 +34,12 @@ def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     """The factors M = (J W) R S `(M, 2, 3)` in pixels; `rows` are J W, from the world point to the pixel, `(M, 2, 3)`.
 
     Differentiable once, in closed form on columns of numbers: batched products of tiny matrices are ten times slower.
+    `quats` are quaternions, or the matrices R themselves.
     """
+    if quats.ndim == 3:
+        axes = quats * scales[:, None]
+        turned: Tensor = (rows[:, :, :, None] * axes[:, None]).sum(2)
+        return turned
     factors: Tensor = _FootprintFactors.apply(rows, quats, scales)
     return factors
 
@@ -71,6 +78,47 @@ class _FootprintFactors(torch.autograd.Function):
             d_rotations = (a.unflatten(0, (2, 3, 1)) * g.unflatten(0, (2, 1, 3))).sum(0)
             found[1] = _quaternion_gradient(q, d_rotations).mul_(inverse_norm).t()
         return tuple(found)
+
+
+def half_axes(covariances: Tensor) -> Tensor:
+    """Matrices A with A A^T = Sigma for covariances Sigma `(N, 3, 3)`: `quats` of Gaussians whose scales are 1.
+
+    A Cholesky factorisation in float64: of needles it adds no error to that which Sigma was rounded with. Where a
+    variance is zero, or negative by rounding, it is taken as the rounding of its entry.
+
+    The gradient is (G A^-1 + (G A^-1)^T) / 4 of a gradient G by A: right for every function of A A^T. In float32 its
+    error is about 1e-7 times the ratio of the longest to the shortest axis.
+    """
+    found: Tensor = _HalfAxes.apply(covariances)
+    return found
+
+
+class _HalfAxes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, covariances: Tensor) -> Tensor:
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = covariances.double().flatten(1).unbind(1)
+        xy, xz, yz = (xy + yx) / 2, (xz + zx) / 2, (yz + zy) / 2
+        rounding = torch.finfo(covariances.dtype).eps
+        a = xx.clamp_min(0.0).sqrt()
+        into_a = torch.where(a > 0, 1.0 / a, 0.0)
+        b, c = xy * into_a, xz * into_a
+        d = torch.maximum(yy - b * b, rounding * yy).clamp_min(0.0).sqrt()
+        e = (yz - b * c) * torch.where(d > 0, 1.0 / d, 0.0)
+        f = torch.maximum(zz - c * c - e * e, rounding * zz).clamp_min(0.0).sqrt()
+        zero = torch.zeros_like(a)
+        factors = torch.stack([a, zero, zero, b, d, zero, c, e, f], 1).unflatten(1, (3, 3))
+        ctx.save_for_backward(factors)
+        rounded: Tensor = factors.to(covariances.dtype)
+        return rounded
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (factors,) = ctx.saved_tensors
+        flat = factors.diagonal(dim1=1, dim2=2) == 0  # the gradient is 0 there, too
+        whole = factors + torch.diag_embed(flat.double())
+        solved = torch.linalg.solve_triangular(whole, grad.double(), upper=False, left=False)
+        found: Tensor = ((solved + solved.mT) / 4).to(grad.dtype)
+        return found
 
 
 def columns(rows: Tensor) -> Tensor:
@@ -117,6 +165,22 @@ def conics(factors: Tensor, eps2d: float) -> Tensor:
     """Inverse covariances (a, b, c) of a dx^2 + 2 b dx dy + c dy^2, `(M, 3)`."""
     xx, xy, yy, det = variances(factors, eps2d)
     return torch.stack([yy / det, -xy / det, xx / det], 1)
+
+
+def compensations(factors: Tensor, eps2d: float) -> Tensor:
+    """sqrt(det M M^T / det(M M^T + eps2d I)), `(M,)`: what keeps the sum of a footprint that is widened by eps2d.
+
+    The numerator is the norm of a x b for the rows a, b of M, so nothing is cancelled; its gradient is 0 where it is 0.
+    """
+    a, b = factors.unbind(1)
+    found: Tensor = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=1) * variances(factors, eps2d)[3].rsqrt()
+    return found
+
+
+def reach(factors: Tensor, eps2d: float) -> Tensor:
+    """How far footprints reach along x and y in pixels, `(M, 2)`: 3.33 standard deviations, rounded up."""
+    xx, _, yy, _ = variances(factors, eps2d)
+    return (3.33 * torch.stack([xx, yy], 1).sqrt()).ceil()
 
 
 def whitening(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -36,15 +36,19 @@ def project_torch(
     return ProjectedGaussians(*tensors, size, len(parts), len(gaussians), (~finite).sum(), options.eps2d)
 
 
-def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:
-    """The shortest axis of each projected Gaussian, turned towards its camera; unit vectors in world axes, `(M, 3)`.
+def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians, axis: int | None = None) -> Tensor:
+    """An axis of each projected Gaussian, turned towards its camera; unit vectors in world axes, `(M, 3)`.
 
-    Differentiable with respect to the quaternions. At right angles to the view either direction is correct.
+    The axis is the local one of this number, or the shortest for None. Differentiable with respect to the quaternions.
+    At right angles to the view either direction is correct.
     """
     ids = projected.gaussian_ids
-    axis = gaussians.scales.detach().index_select(0, ids).argmin(1)
     turned = rotation_matrices(gaussians.quats.index_select(0, ids))
-    normal = turned.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    if axis is None:
+        shortest = gaussians.scales.detach().index_select(0, ids).argmin(1)
+        normal = turned.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    else:
+        normal = turned[:, :, axis]
     with torch.no_grad():
         means, away = gaussians.means.index_select(0, ids), []
         for c, lens in enumerate(lenses(cameras, projected.image_size)):

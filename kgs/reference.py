@@ -142,6 +142,8 @@ def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> T
 
 def _covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """R S S R^T with R = ((w^2 - |v|^2) I + 2 v v^T + 2 w [v]_x) / |q|^2; the zero quaternion gives the identity."""
+    if quats.ndim == 3:  # R itself
+        return quats @ torch.diag_embed(scales**2) @ quats.mT
     eye = torch.eye(3).to(quats)
     quats = torch.where((quats == 0).all(1, keepdim=True), torch.eye(4).to(quats)[0], quats)
     w, v = quats[:, :1, None], quats[:, None, 1:]

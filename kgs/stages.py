@@ -1,5 +1,7 @@
 """The two stages of a render, `project` and `composite`: arguments are checked here, and a backend does the work."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Unpack
 
@@ -10,6 +12,7 @@ from torch import Tensor
 from .backends import choose
 from .backends.base import Compositor
 from .camera import Cameras, image_size, intrinsics
+from .covariance import compensations, reach
 from .types import (
     Composited,
     Gaussians,
@@ -41,8 +44,8 @@ def project(
     Args:
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
-        options: None for the defaults. Only near_plane, eps2d and alpha_threshold matter here (at a threshold of 0 all
-            Gaussians in front of the camera are seen).
+        options: None for the defaults. near_plane, far_plane, radius_clip, eps2d, antialiased, frame and
+            alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are seen).
         colors: whether colours are computed.
         backend: "auto", or the name of one, see `kgs.backends`.
         fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
@@ -67,7 +70,25 @@ def project(
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
     device = gaussians.means.device
     chosen = choose(backend, "projection", device, lambda candidate: candidate.covers(gaussians.means))
-    return chosen.project(gaussians, cameras, size, options, colors)
+    return _with_options(chosen.project(gaussians, cameras, size, options, colors), options)
+
+
+def _with_options(projected: ProjectedGaussians, options: RasterOptions) -> ProjectedGaussians:
+    """Without what lies behind the far plane or is too small, and antialiased: what few renders ask for."""
+    if options.far_plane < math.inf or options.radius_clip > 0:
+        kept = projected.depths < options.far_plane
+        if options.radius_clip > 0:
+            kept &= reach(projected.factors.detach(), options.eps2d).amax(1) > options.radius_clip
+        projected = _rows(projected, kept.nonzero()[:, 0])
+    if options.antialiased and options.eps2d > 0:
+        factor = compensations(projected.factors, options.eps2d)
+        projected = replace(projected, opacities=projected.opacities * factor)
+    return projected
+
+
+def _rows(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
+    names = ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
+    return replace(projected, **{name: getattr(projected, name).index_select(0, rows) for name in names})
 
 
 def composite(
@@ -117,21 +138,35 @@ def composite(
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
+    return draw(projected, features, given, median_depth=median_depth, chunk_size=chunk_size, backend=backend)
+
+
+def draw(
+    projected: ProjectedGaussians,
+    features: Tensor,
+    options: RasterOptions,
+    *,
+    median_depth: bool = False,
+    chunk_size: int | None = None,
+    backend: str = "auto",
+    keep_absgrad: Callable[[Tensor], None] | None = None,
+) -> Composited:
+    """:func:`composite`, where the caller may say what becomes of the absolute gradients, `(M, 2)`."""
     _check_projected(projected, features)
     chosen = choose(
         backend,
         "compositing",
         features.device,
         lambda candidate: (
-            candidate.covers(features) and candidate.covers_compositing(projected, features, given, chunk_size)
+            candidate.covers(features) and candidate.covers_compositing(projected, features, options, chunk_size)
         ),
     )
-    tile_size = given.tile_size or chosen.tile_size
-    given = replace(given, tile_size=tile_size)
-    compositor = chosen.compositor(projected, features, given, median_depth, chunk_size)
+    tile_size = options.tile_size or chosen.tile_size
+    options = replace(options, tile_size=tile_size)
+    compositor = chosen.compositor(projected, features, options, median_depth, chunk_size)
     inputs = (projected.means2d, projected.factors, projected.opacities, features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    sums, transmittance, median = _Composite.apply(*inputs, compositor, keep)
+    sums, transmittance, median = _Composite.apply(*inputs, compositor, keep, keep_absgrad)
     return Composited(sums, transmittance, median if median_depth else None, tile_size)
 
 
@@ -170,10 +205,11 @@ class _Composite(torch.autograd.Function):
         features: Tensor,
         compositor: Compositor,
         keep: bool,
+        keep_absgrad: Callable[[Tensor], None] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = (means2d, factors, opacities, features)
         images, ctx.kept = compositor.forward(inputs, keep)
-        ctx.compositor = compositor
+        ctx.compositor, ctx.keep_absgrad = compositor, keep_absgrad
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(images[2])
         return images
@@ -186,9 +222,11 @@ class _Composite(torch.autograd.Function):
         # what was kept is freed as soon as it has been used; a second backward computes it again
         inputs = ctx.saved_tensors
         *found, absolute = ctx.compositor.backward(inputs, _taken(ctx), grad_sums, grad_transmittance, needs)
-        if absolute is not None:
+        if absolute is not None and ctx.keep_absgrad is not None:
+            ctx.keep_absgrad(absolute)
+        elif absolute is not None:
             inputs[0].absgrad = absolute  # the tensor that was given, not a copy of it
-        return *found, None, None
+        return *found, None, None, None
 
 
 def _taken(ctx: Any) -> Any:

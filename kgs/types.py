@@ -39,6 +39,12 @@ class RasterOptions:
         absgrad: `backward` also sets `projected.means2d.absgrad`, `(M, 2)` in units of `means2d.grad`: the sums, over
             pixels, of the absolute values of what each pixel says of a centre. Where pixels pull a Gaussian apart the
             gradient vanishes, and these sums do not (AbsGS, Ye et al., ACM MM 2024).
+        far_plane: Gaussians with z >= far_plane are left out; in world units, beyond the near plane.
+        radius_clip: Gaussians whose footprint reaches no farther than this along x and along y, in pixels, are left
+            out; >= 0. It reaches 3.33 standard deviations, rounded up.
+        antialiased: multiply opacities by sqrt(det Sigma / det(Sigma + eps2d I)), so that the low-pass filter widens
+            small footprints without making them brighter (Mip-Splatting, Yu et al., CVPR 2024; there with eps2d 0.1).
+            Choose it before a fit: a splat that was fitted without it is too faint with it.
 
     Raises:
         ValueError: an option is out of range.
@@ -52,23 +58,36 @@ class RasterOptions:
     max_bytes: int = 2**30
     frame: tuple[float, float, float, float] | None = None
     absgrad: bool = False
+    far_plane: float = math.inf
+    radius_clip: float = 0.0
+    antialiased: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.absgrad, bool):
-            raise ValueError(f"absgrad: expected True or False, got {self.absgrad!r}")
+        for name in ("absgrad", "antialiased"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: expected True or False, got {getattr(self, name)!r}")
         for name in ("tile_size", "max_bytes"):
             value: Any = getattr(self, name)
             if name == "tile_size" and value is None:
                 continue
             if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
                 raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
-        ends = {"near_plane": math.inf, "eps2d": math.inf, "alpha_threshold": 1, "transmittance_stop": 1}
+            object.__setattr__(self, name, int(value))
+        ends = {"near_plane": math.inf, "radius_clip": math.inf, "eps2d": math.inf}
+        ends |= {"alpha_threshold": 1, "transmittance_stop": 1}
         for name, most in ends.items():
             value = getattr(self, name)
             if not isinstance(value, Real) or not 0.0 <= float(value) < most:
                 raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
-        if self.frame is not None and not _is_frame(self.frame):
-            raise ValueError(f"frame: expected (left, top, right, bottom) with a positive size, got {self.frame!r}")
+            object.__setattr__(self, name, float(value))  # NumPy's numbers are not for compiled kernels
+        far: Any = self.far_plane
+        if not isinstance(far, Real) or not self.near_plane < float(far):
+            raise ValueError(f"far_plane: expected more than the near plane, {self.near_plane}, got {far!r}")
+        object.__setattr__(self, "far_plane", float(far))
+        if self.frame is not None:
+            if not _is_frame(self.frame):
+                raise ValueError(f"frame: expected (left, top, right, bottom) with a positive size, got {self.frame!r}")
+            object.__setattr__(self, "frame", tuple(map(float, self.frame)))
 
 
 def _is_frame(frame: Any) -> bool:
@@ -90,6 +109,9 @@ class RasterFields(TypedDict, total=False):
     max_bytes: int
     frame: tuple[float, float, float, float] | None
     absgrad: bool
+    far_plane: float
+    radius_clip: float
+    antialiased: bool
 
 
 def raster_options(options: RasterOptions | None, fields: RasterFields) -> RasterOptions:
@@ -120,7 +142,8 @@ class Gaussians:
 
     Args:
         means: centres in world units, shape `(N, 3)`.
-        quats: rotations as quaternions in the order w, x, y, z, of any norm from 1e-38 on, shape `(N, 4)`.
+        quats: rotations as quaternions in the order w, x, y, z, of any norm from 1e-38 on, shape `(N, 4)`. Or matrices
+            A `(N, 3, 3)` in their place: rotations, or any others, where the covariance is A S S A^T.
         scales: standard deviations along the local axes in world units, > 0, shape `(N, 3)`.
         opacities: shape `(N,)`, or `(C, N)` for one value per camera. In [0, 1], or above 1 after `DropGaussian`.
         colors: spherical harmonics `(N, K, 3)` with K = 1, 4, 9 or 16 (degree 0 to 3); or features `(N, D)` that are
@@ -145,7 +168,8 @@ class Gaussians:
             check_tensor(name, value, self.means, " as means")
         n = self.means.shape[0] if self.means.ndim else 0
         for name, width in (("means", 3), ("quats", 4), ("scales", 3)):
-            if (got := tuple(getattr(self, name).shape)) != (n, width):
+            got = tuple(getattr(self, name).shape)
+            if got != (n, width) and (name, got) != ("quats", (n, 3, 3)):
                 raise ValueError(f"{name}: expected shape {(n, width)}, got {got}")
         if self.opacities.ndim not in (1, 2) or self.opacities.shape[-1] != n:
             raise ValueError(f"opacities: expected shape ({n},) or (C, {n}), got {tuple(self.opacities.shape)}")
@@ -190,7 +214,7 @@ class ProjectedGaussians:
         factors: `(M, 2, 3)`, the product J W R S in pixels: the covariance is `factors @ factors.mT + eps2d I`.
         depths: z in the camera frame, `(M,)`.
         radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.
-        opacities: `(M,)`.
+        opacities: `(M,)`; those of an antialiased render are multiplied by its factor.
         colors: `(M, 3)`, or features `(M, D)`, or `(M, 0)` if no image was requested.
         image_size: (height, width) in pixels.
         num_cameras: C.

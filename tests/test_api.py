@@ -105,6 +105,11 @@ SIGNATURES = {
         "alpha_threshold": 1 / 255,
         "transmittance_stop": 1e-4,
         "max_bytes": 2**30,
+        "frame": None,
+        "absgrad": False,
+        "far_plane": math.inf,
+        "radius_clip": 0.0,
+        "antialiased": False,
     },
     "kgs.GaussianRenderer.forward": {
         "self": ...,

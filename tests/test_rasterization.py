@@ -6,6 +6,7 @@ import inspect
 import pytest
 import torch
 from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
 import kgs
 import kgs.reference
@@ -14,12 +15,7 @@ from kgs import GaussianRenderer, rasterization
 pytestmark = pytest.mark.usefixtures("each_backend")
 
 SIZE = (24, 32)
-POSITIONAL = [  # gsplat's, in its order
-    *("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"),
-    *("width", "height", "near_plane", "far_plane", "radius_clip", "eps2d", "sh_degree"),
-    *("packed", "tile_size", "backgrounds", "render_mode", "sparse_grad", "absgrad"),
-    *("rasterize_mode", "channel_chunk", "distributed", "camera_model"),
-]
+REQUIRED = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height"]
 
 
 class RollingShutter(enum.Enum):
@@ -29,7 +25,7 @@ class RollingShutter(enum.Enum):
     GLOBAL = 4
 
 
-GSPLAT_DEFAULTS = {  # of 1.6
+GSPLAT_DEFAULTS = {  # of 1.6, in its order
     **{"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3, "sh_degree": None, "packed": True},
     **{"tile_size": None, "backgrounds": None, "render_mode": "RGB", "sparse_grad": False, "absgrad": False},
     **{"rasterize_mode": "classic", "distributed": False, "camera_model": "pinhole", "segmented": False},
@@ -52,12 +48,16 @@ def call(gaussians, cameras, half=True, **options):
     k[:, :2, 2] += 0.5 if half else 0.0
     arguments = {name: getattr(gaussians, name) for name in FIELDS} | options
     centers = {} if half else {"pixel_centers": "integer"}
-    return rasterization(viewmats=cameras.extrinsics, Ks=k, width=32, height=24, **centers, **arguments)
+    return rasterization(**{"viewmats": cameras.extrinsics, "Ks": k} | arguments, width=32, height=24, **centers)
 
 
 @pytest.mark.usefixtures("torch_alone")
 def test_the_names_and_their_order_are_gsplats():
-    assert list(inspect.signature(rasterization).parameters)[: len(POSITIONAL)] == POSITIONAL
+    parameters = inspect.signature(rasterization).parameters
+    names = [name for name, value in parameters.items() if value.kind is value.POSITIONAL_OR_KEYWORD]
+    assert names == [*REQUIRED, *GSPLAT_DEFAULTS]
+    for name, value in GSPLAT_DEFAULTS.items():
+        assert parameters[name].default == (None if name == "rolling_shutter" else value)
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
@@ -178,28 +178,37 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("rasterize_mode", "antialiased"),
+        ("rasterize_mode", "sharp"),
         ("sparse_grad", True),
-        ("absgrad", True),
         ("distributed", True),
-        ("camera_model", "fisheye"),
-        ("radius_clip", 0.5),
-        ("far_plane", 100.0),
-        ("covars", torch.eye(3).expand(60, 3, 3)),
+        ("camera_model", "ftheta"),
+        ("radius_clip", -0.5),
+        ("far_plane", 0.001),
+        ("far_plane", float("nan")),
+        ("covars", torch.eye(3).double().expand(59, 3, 3)),
         ("with_ut", True),
+        ("with_eval3d", True),
         ("global_z_order", False),
-        ("return_normals", True),
         ("rays", torch.zeros(2, 24, 32, 6)),
-        ("extra_signals", torch.zeros(60, 2)),
+        ("extra_signals", torch.zeros(59, 2).double()),
+        ("extra_signals_sh_degree", 3),
+        ("viewmats_rs", torch.eye(4).expand(2, 4, 4)),
         ("rolling_shutter", RollingShutter.ROLLING_TOP_TO_BOTTOM),
         ("radial_coeffs", torch.zeros(2, 4)),
         ("render_mode", "RGBD"),
+        ("render_mode", "RGB-Ed"),
         ("pixel_centers", "corner"),
         ("sh_degree", 4),
         ("sh_degree", 0),
         ("colors", torch.zeros(59, 3).double()),
         ("colors", torch.zeros(3, 60, 3).double()),
         ("backgrounds", torch.zeros(2, 4).double()),
+        ("means", torch.zeros(0, 60, 3).double()),
+        ("means", torch.zeros(60, 2).double()),
+        ("viewmats", torch.eye(4).double()),
+        ("viewmats", torch.eye(4).double().expand(1, 2, 4, 4)),
+        ("Ks", torch.eye(3).double()),
+        ("scales", torch.zeros(60).double()),
         ("near_plane", -1.0),
         ("tile_size", 0),
         ("backend", "cuda"),
@@ -208,16 +217,24 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
 def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
     gaussians, cameras = scene()
     named = "colors" if (name, value) == ("sh_degree", 0) else name
-    with pytest.raises(ValueError, match=rf"^{named}: expected"):
+    with pytest.raises(ValueError, match=rf"^{named}: expected .*got"):
         call(gaussians, cameras, **{name: value})
+
+
+@pytest.mark.usefixtures("torch_alone")
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"])
+def test_what_is_no_tensor_is_named(name):
+    gaussians, cameras = scene()
+    with pytest.raises(TypeError, match=rf"^{name}: expected a torch.Tensor, got NoneType"):
+        call(gaussians, cameras, **{name: None})
 
 
 @pytest.mark.usefixtures("torch_alone")
 def test_what_does_nothing_is_accepted_and_unknown_names_are_not():
     gaussians, cameras = scene()
-    harmless = {"packed": False, "channel_chunk": 8, "segmented": True, "far_plane": 1e12, "radial_coeffs": None}
+    harmless = {"packed": False, "channel_chunk": 8, "segmented": True, "far_plane": 1e12, "macro_tile": True}
     assert torch.equal(call(gaussians, cameras, **harmless)[0], call(gaussians, cameras)[0])
-    with pytest.raises(TypeError, match="unexpected argument 'near'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'near'"):
         call(gaussians, cameras, near=0.1)
 
 
@@ -250,62 +267,127 @@ def test_radii_are_those_of_each_axis():
     assert torch.equal(radii, (3.33 * covariances.diagonal(dim1=1, dim2=2).sqrt()).ceil().int())
 
 
-def small_gaussians_inside(n=200):
-    """Parameters as gsplat's trainers have them, of Gaussians well inside the image, some large on the screen."""
-    generator = torch.Generator().manual_seed(0)
-    depths = 3 + torch.rand(n, generator=generator)
-    places = (torch.rand(n, 2, generator=generator) - 0.5) * torch.tensor([0.4, 0.3]) * depths[:, None]
-    values = {
-        "means": torch.cat([places, depths[:, None]], 1),
-        "scales": torch.log(0.02 + 0.1 * torch.rand(n, 3, generator=generator)),
-        "quats": torch.randn(n, 4, generator=generator),
-        "opacities": torch.randn(n, generator=generator),
-        "colors": torch.rand(n, 3, generator=generator),
-    }
-    return {name: torch.nn.Parameter(value) for name, value in values.items()}
+# -- what gsplat's call has beyond the renderer's --------------------------------------------------------------------
 
 
-def test_gsplats_strategy_sees_what_it_sees_with_gsplats_projection(monkeypatch):
-    """The state of DefaultStrategy and the number of Gaussians are those that gsplat's own torch projection gives."""
-    pytest.importorskip("gsplat")
-    from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
-    from gsplat.strategy import DefaultStrategy
+def test_the_dense_layout_says_what_the_packed_one_does():
+    gaussians, cameras = scene(dtype=torch.float32)
+    found = []
+    for packed in (True, False):
+        leaf, inputs = leaves(gaussians)
+        renders, alphas, meta = call(leaf, cameras, packed=packed, absgrad=True)
+        renders.square().sum().backward()
+        found.append((renders, alphas, meta, inputs))
+    (renders, alphas, packed, inputs), (again, alphas_again, dense, inputs_again) = found
+    assert torch.equal(renders, again)
+    assert torch.equal(alphas, alphas_again)
+    for one, other in zip(inputs, inputs_again, strict=True):
+        assert torch.equal(one.grad, other.grad)
+    seen = (packed["camera_ids"], packed["gaussian_ids"])
+    assert not packed["batch_ids"].any()
+    assert [dense[name] for name in ("batch_ids", "camera_ids", "gaussian_ids")] == [None] * 3
+    dense |= {"grad": dense["means2d"].grad, "absgrad": dense["means2d"].absgrad}
+    packed |= {"grad": packed["means2d"].grad, "absgrad": packed["means2d"].absgrad}
+    for name in ("means2d", "radii", "depths", "conics", "opacities", "grad", "absgrad"):
+        assert dense[name].shape == (2, 60, *packed[name].shape[1:])
+        assert torch.equal(dense[name][seen], packed[name])
+        rest = dense[name].detach().clone()
+        rest[seen] = 0
+        assert not rest.any()
+    assert packed["absgrad"].sum() > 1.1 * packed["grad"].abs().sum()
 
-    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
-    size = (64, 48)
-    k = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])
-    pose = torch.eye(4)[None]
-    target = torch.rand(1, 48, 64, 3, generator=torch.Generator().manual_seed(1))
 
-    def fit(own_projection):
-        torch.manual_seed(0)
-        params = small_gaussians_inside()
-        optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
-        strategy = DefaultStrategy(
-            refine_start_iter=10, refine_every=10, refine_scale2d_stop_iter=60, grow_grad2d=1e-5, grow_scale2d=0.12
-        )
-        state = strategy.initialize_state(scene_scale=1.0)
-        counts = []
-        for step in range(45):
-            quats = torch.nn.functional.normalize(params["quats"], dim=1)
-            shown = (params["means"], quats, params["scales"].exp(), params["opacities"].sigmoid(), params["colors"])
-            renders, _, info = rasterization(*shown, pose, k, *size)
-            if own_projection:
-                covariances, _ = _quat_scale_to_covar_preci(quats, params["scales"].exp(), True, False, triu=False)
-                radii = _fully_fused_projection(params["means"], covariances, pose, k, *size)[0]
-                assert (radii > 0).all()
-                info["radii"] = radii[0].index_select(0, info["gaussian_ids"])
-            strategy.step_pre_backward(params, optimizers, state, step, info)
-            (renders - target).square().mean().backward()
-            strategy.step_post_backward(params, optimizers, state, step, info, packed=True)
-            for optimizer in optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
-            counts.append(len(params["means"]))
-        return counts, state
+def test_absolute_gradients_are_those_of_the_renderer():
+    gaussians, cameras = scene(dtype=torch.float32)
+    leaf, _ = leaves(gaussians)
+    out = GaussianRenderer(absgrad=True)(leaf, cameras)
+    out.image.square().sum().backward()
+    leaf, _ = leaves(gaussians)
+    renders, _, meta = call(leaf, cameras, absgrad=True)
+    renders.square().sum().backward()
+    expected = out.projected.means2d.absgrad
+    assert (meta["means2d"].absgrad - expected).abs().max() <= 1e-4 * expected.max()
 
-    (counts, state), (expected, wanted) = fit(False), fit(True)
-    assert len(set(expected)) > 1  # it did split and duplicate
-    assert counts == expected
-    for name in ("grad2d", "count", "radii"):
-        assert torch.equal(state[name], wanted[name])
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("sh_degree", [None, 1])
+def test_leading_dimensions_are_scenes_of_their_own(packed, sh_degree):
+    """Two by three scenes at once, and each alone: images, gradients and what meta says."""
+    scenes = [(random_gaussians(20, b, torch.float32, sh_degree, 32), b) for b in range(6)]
+    cameras = [batch(*(random_camera(*SIZE, 2 * b + c, torch.float32) for c in range(2))) for _, b in scenes]
+    backgrounds = torch.rand(6, 2, 3)
+    options = {"sh_degree": sh_degree, "packed": packed, "absgrad": True, "render_mode": "RGB+ED"}
+
+    def stacked(values):
+        return torch.stack(list(values)).unflatten(0, (2, 3)).detach().requires_grad_()
+
+    together = {name: stacked(getattr(g, name) for g, _ in scenes) for name in FIELDS}
+    k = stacked(c.intrinsics[:, :3, :3] for c in cameras)
+    pose = stacked(c.extrinsics for c in cameras)
+    behind = backgrounds.unflatten(0, (2, 3))
+    renders, alphas, meta = rasterization(
+        **together, viewmats=pose, Ks=k, width=32, height=24, backgrounds=behind, **options
+    )
+    assert renders.shape == (2, 3, 2, 24, 32, 4)
+    assert alphas.shape == (2, 3, 2, 24, 32, 1)
+    assert (meta["n_batches"], meta["n_cameras"]) == (6, 2)
+    (renders.square().sum() + alphas.sum()).backward()
+    for b, (gaussians, _) in enumerate(scenes):
+        inputs = leaves(gaussians)[1]
+        one, two = pose.flatten(0, 1)[b].detach(), k.flatten(0, 1)[b].detach()
+        image, alpha, alone = rasterization(*inputs, one, two, 32, 24, backgrounds=backgrounds[b], **options)
+        (image.square().sum() + alpha.sum()).backward()
+        assert torch.equal(image, renders.flatten(0, 1)[b])
+        assert torch.equal(alpha, alphas.flatten(0, 1)[b])
+        for name, value in zip(FIELDS, inputs, strict=True):
+            assert torch.equal(together[name].grad.flatten(0, 1)[b], value.grad)
+        rows = meta["batch_ids"] == b if packed else (b // 3, b % 3)
+        for name in ("means2d", "radii", "conics"):
+            assert torch.equal(meta[name][rows], alone[name])
+        assert torch.equal(meta["means2d"].grad[rows], alone["means2d"].grad)
+        assert torch.equal(meta["means2d"].absgrad[rows], alone["means2d"].absgrad)
+        if packed:
+            assert torch.equal(meta["gaussian_ids"][rows], alone["gaussian_ids"])
+            assert torch.equal(meta["camera_ids"][rows], alone["camera_ids"])
+
+
+def test_scenes_may_share_their_harmonics():
+    gaussians, cameras = scene(1, torch.float32, cameras=1)
+    values = {name: getattr(gaussians, name).expand(3, *getattr(gaussians, name).shape) for name in FIELDS[:4]}
+    k, pose = cameras.intrinsics[:, :3, :3].expand(3, 1, 3, 3), cameras.extrinsics.expand(3, 1, 4, 4)
+    shared = rasterization(**values, colors=gaussians.colors, viewmats=pose, Ks=k, width=32, height=24, sh_degree=1)
+    own = gaussians.colors.expand(3, *gaussians.colors.shape)
+    assert torch.equal(
+        shared[0], rasterization(**values, colors=own, viewmats=pose, Ks=k, width=32, height=24, sh_degree=1)[0]
+    )
+
+
+@pytest.mark.parametrize("mode", ["RGB", "ED", "RGB+D"])
+@pytest.mark.parametrize("own", [False, True])
+def test_extra_signals_are_features_of_their_own(mode, own):
+    gaussians, cameras = scene(1, torch.float32)
+    signals = torch.randn(2, 60, 2, generator=torch.Generator().manual_seed(0))
+    signals = signals if own else signals[0]
+    renders, _, meta = call(gaussians, cameras, sh_degree=1, render_mode=mode, extra_signals=signals)
+    assert torch.allclose(renders, call(gaussians, cameras, sh_degree=1, render_mode=mode)[0], atol=1e-5)
+    assert torch.allclose(meta["render_extra_signals"], call(gaussians, cameras, colors=signals)[0], atol=1e-5)
+    if mode == "RGB":
+        backgrounds = torch.rand(2, 5)
+        over = call(gaussians, cameras, sh_degree=1, extra_signals=signals, backgrounds=backgrounds)
+        alone = call(gaussians, cameras, colors=signals, backgrounds=backgrounds[:, 3:])[0]
+        assert torch.allclose(over[2]["render_extra_signals"], alone, atol=1e-5)
+
+
+def test_normals_are_third_axes_towards_the_camera(exactly):
+    dtype, bound = exactly
+    gaussians, cameras = scene(cameras=1, dtype=dtype)
+    drawn = kgs.reference.layers(gaussians, cameras)
+    axes = quaternion_to_rotation_matrix(gaussians.quats)[:, :, 2].double()
+    pose = cameras.extrinsics[0].double()
+    away = gaussians.means.double() + pose[:3, :3].T @ pose[:3, 3]
+    axes = torch.where(((axes * away).sum(1) > 0)[:, None], -axes, axes)
+    expected = torch.einsum("lhw,lc->hwc", drawn.weights, axes[drawn.order])
+    normals = call(gaussians, cameras, return_normals=True)[2]["normals"]
+    assert torch.allclose(normals[0].double(), expected, atol=5 * bound)
+    with pytest.raises(ValueError, match=r"^return_normals: expected False"):
+        call(gaussians, cameras, return_normals=True, covars=torch.eye(3, dtype=dtype).expand(60, 3, 3))

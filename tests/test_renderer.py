@@ -295,8 +295,8 @@ def test_options_given_twice_or_of_another_kind_are_refused():
             call(options=RasterOptions(), eps2d=0.1)
         with pytest.raises(TypeError, match="options: expected RasterOptions, got dict"):
             call(options={"eps2d": 0.1})
-        with pytest.raises(TypeError, match="far_plane: unexpected keyword argument"):
-            call(far_plane=10.0)
+        with pytest.raises(TypeError, match="last_plane: unexpected keyword argument"):
+            call(last_plane=10.0)
 
 
 @pytest.mark.usefixtures("torch_alone")

@@ -188,6 +188,12 @@ def test_features_of_any_width_are_colours():
         ("max_bytes", -1),
         ("near_plane", float("nan")),
         ("eps2d", float("inf")),
+        ("far_plane", 0.01),
+        ("far_plane", float("nan")),
+        ("far_plane", "far"),
+        ("radius_clip", -1),
+        ("radius_clip", float("inf")),
+        ("antialiased", 1),
         ("alpha_threshold", 1.0),
         ("transmittance_stop", "0"),
         ("frame", (0, 0, 4)),
@@ -201,15 +207,23 @@ def test_options_are_checked_in_one_place(name, value):
 
 
 def test_options_may_be_numbers_of_numpy():
-    made = kgs.RasterOptions(tile_size=np.int64(16), near_plane=np.float32(0.5))
-    assert (made.tile_size, made.near_plane) == (16, 0.5)
+    """They become Python's: compiled kernels know no others."""
+    made = kgs.RasterOptions(tile_size=np.int64(16), near_plane=np.float32(0.5), far_plane=np.float64(9), eps2d=0)
+    assert (made.tile_size, made.near_plane, made.far_plane, made.eps2d) == (16, 0.5, 9.0, 0.0)
+    assert [type(x) for x in (made.tile_size, made.near_plane, made.far_plane, made.eps2d)] == [int] + [float] * 3
+    frame = kgs.RasterOptions(frame=tuple(np.arange(4, dtype=np.float32))).frame
+    assert frame == (0.0, 1.0, 2.0, 3.0)
+    assert type(frame[0]) is float
 
 
 def test_every_default_is_that_of_the_options():
     for function in (kgs.rasterization, kgs.reference.render):
         for name, parameter in inspect.signature(function).parameters.items():
             if hasattr(kgs.RasterOptions, name):
-                assert parameter.default == getattr(kgs.RasterOptions, name), (function, name)
+                expected = {"far_plane": 1e10}.get(
+                    name, getattr(kgs.RasterOptions, name)
+                )  # gsplat's is as good as none
+                assert parameter.default == expected, (function, name)
 
 
 def test_the_fields_of_the_options_may_be_keyword_arguments():

@@ -1,53 +1,28 @@
 """`gsplat.rasterization` on kgs: the same arguments, order and results, for trainers that are written for gsplat."""
 
 import dataclasses
+import math
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from .camera import pinhole_cameras
-from .renderer import blend
-from .stages import composite, project
-from .types import SH_SIZES, Gaussians, ProjectedGaussians, RasterOptions, check_tensor
+from kgs.projection import normals
+from kgs.renderer import blend
+from kgs.stages import draw, project
+from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
-_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-# Arguments of gsplat 1.5 and 1.6 that ask for what kgs does not do: the value at which each does nothing.
-_NO_OPS: dict[str, Any] = {
-    "radius_clip": 0,
-    "sparse_grad": False,
-    "absgrad": False,
-    "rasterize_mode": "classic",
-    "distributed": False,
-    "camera_model": "pinhole",
-    "covars": None,
-    "with_ut": False,
-    "with_eval3d": False,
-    "return_normals": False,
-    "global_z_order": True,
-    "rays": None,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "ftheta_coeffs": None,
-    "lidar_coeffs": None,
-    "external_distortion_coeffs": None,
-    "rolling_shutter": None,
-    "viewmats_rs": None,
-    "ut_params": None,
-    "extra_signals": None,
-    "extra_signals_sh_degree": None,
-    "renderer_config": None,
-}
-_WITHOUT_EFFECT = ("macro_tile",)  # they change how gsplat works, not its result
-_LARGEST_RADIUS = 2e9  # pixels, as an int32
+from .arguments import check_words, refuse
+from .meta import Pairs, joined
+from .scenes import Scene, batch_shape, split
+
+_FAR = 1e10  # gsplat's default far plane: no plane at all
 
 
 def rasterization(  # noqa: D417 - arguments without effect are described together
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
     opacities: Tensor,
     colors: Tensor | None,
     viewmats: Tensor,
@@ -55,8 +30,8 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     width: int,
     height: int,
     near_plane: float = RasterOptions.near_plane,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
+    far_plane: float = _FAR,
+    radius_clip: float = RasterOptions.radius_clip,
     eps2d: float = RasterOptions.eps2d,
     sh_degree: int | None = None,
     packed: bool = True,
@@ -66,57 +41,88 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: str = "classic",
-    channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
     segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    macro_tile: bool = False,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+    ut_params: Any = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
     *,
+    channel_chunk: int = 32,
     pixel_centers: str = "half",
     alpha_threshold: float = RasterOptions.alpha_threshold,
     transmittance_stop: float = RasterOptions.transmittance_stop,
     max_bytes: int = RasterOptions.max_bytes,
     backend: str = "auto",
-    **others: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians in C pinhole cameras; a drop-in for `gsplat.rasterization`.
+    """Render N Gaussians in C cameras; a drop-in for `gsplat.rasterization` of gsplat 1.6, and of 1.5 by name.
 
-    Differentiable in all tensors, `viewmats` and `Ks` included. For other lenses and outputs see `GaussianRenderer`.
-    For near_plane, eps2d, tile_size, alpha_threshold, transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
-    packed, channel_chunk, segmented and macro_tile have no effect. These arguments are accepted only at their no-op
-    values: far_plane (1e10 or more), radius_clip, sparse_grad, absgrad, rasterize_mode, distributed, camera_model, and
-    `others`, the further arguments of gsplat 1.5 and 1.6 by name.
+    Differentiable in all tensors, `viewmats` and `Ks` included. Leading dimensions `...` are scenes of their own, of N
+    Gaussians and C cameras each. For near_plane, radius_clip, eps2d, tile_size, alpha_threshold, transmittance_stop and
+    max_bytes see :class:`kgs.RasterOptions`.
+
+    segmented, macro_tile, channel_chunk, ut_params and renderer_config change nothing. sparse_grad, distributed,
+    with_ut, with_eval3d, global_z_order, rays, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs,
+    lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs and extra_signals_sh_degree are accepted only
+    at gsplat's defaults. The page "Coming from gsplat" has the differences, argument by argument.
 
     Convention:
         World-to-camera matrices, OpenCV axes; quaternions w, x, y, z; the first pixel's centre at (0.5, 0.5).
 
     Args:
-        means: centres in world units, `(N, 3)`.
-        quats: of any norm from 1e-38 on, `(N, 4)`.
-        scales: standard deviations in world units, > 0, `(N, 3)`.
-        opacities: in [0, 1], `(N,)` or `(C, N)`.
-        colors: without `sh_degree` any features, `(N, D)` or `(C, N, D)`; with it harmonics `(N, K, 3)`. May be None
-            where `render_mode` is "D" or "ED".
-        viewmats: `(C, 4, 4)`.
-        Ks: intrinsics in pixels, `(C, 3, 3)`.
+        means: centres in world units, `(..., N, 3)`.
+        quats: of any norm from 1e-38 on, `(..., N, 4)`; None where `covars` are given.
+        scales: standard deviations in world units, > 0, `(..., N, 3)`; None where `covars` are given.
+        opacities: in [0, 1], `(..., N)`, or `(..., C, N)` for one value per camera.
+        colors: without `sh_degree` any features, `(..., N, D)` or `(..., C, N, D)`; with it harmonics `(..., N, K, 3)`,
+            or `(N, K, 3)` for all scenes. May be None where `render_mode` is "D" or "ED".
+        viewmats: `(..., C, 4, 4)`.
+        Ks: intrinsics in pixels, `(..., C, 3, 3)`; skew is followed by pinhole cameras alone.
         width: of the images in pixels.
         height: of the images in pixels.
+        far_plane: Gaussians with z >= far_plane are left out; 1e10 or more: none are.
         sh_degree: degree 0 to 3 of the harmonics to use; K is at least (sh_degree + 1)^2. None: `colors` as they are.
-        backgrounds: `(C, D)`, or None for 0.
+        packed: the layout of `meta`, see below; it changes nothing else.
+        backgrounds: `(..., C, D)`, or None for 0; with extra signals `(..., C, D + E)`.
         render_mode: "RGB" (the colours), "D" (sum of w z), "ED" (that over alpha), "RGB+D" or "RGB+ED".
+        absgrad: `backward` also sets `meta["means2d"].absgrad`, see :class:`kgs.RasterOptions`.
+        rasterize_mode: "classic", or "antialiased": see :class:`kgs.RasterOptions`.
+        camera_model: "pinhole", "fisheye" (equidistant) or "ortho".
+        covars: covariances in place of `quats` and `scales`, `(..., N, 3, 3)`, see :func:`kgs.covariance.half_axes`.
+        return_normals: `meta["normals"]` are the sums of w times normal, `(..., C, H, W, 3)`; the normal is the third
+            local axis, turned towards the camera, in world axes.
+        extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, drawn into `meta["render_extra_signals"]`.
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
         backend: "auto", "torch", or in float32 with tiles of 8 "numba" (on a CPU) or "triton" (on a GPU), see
             `kgs.backends`.
 
     Returns:
-        Renders `(C, H, W, D)`, where a depth is the last channel; alphas `(C, H, W, 1)`; and a dict `meta` of the M
-        pairs (camera, Gaussian) that were seen: camera_ids, gaussian_ids, depths, opacities, all `(M,)`; means2d
-        `(M, 2)` in the pixels of `Ks`, which keeps its `.grad`; radii `(M, 2)`, int32, 3.33 standard deviations along
-        x and y in pixels, rounded up, as gsplat's strategies expect; conics `(M, 3)`; width, height, tile_size,
-        n_cameras.
+        Renders `(..., C, H, W, D)`, where a depth is the last channel; alphas `(..., C, H, W, 1)`; and a dict `meta`.
+        Of the M pairs (camera, Gaussian) that were seen it has depths and opacities `(M,)`; means2d `(M, 2)` in the
+        pixels of `Ks`, which keeps its `.grad`; radii `(M, 2)`, int32, 3.33 standard deviations along x and y in
+        pixels, rounded up; conics `(M, 3)`; batch_ids, camera_ids and gaussian_ids `(M,)`. With `packed=False` they are
+        `(..., C, N)` and so on, 0 where a Gaussian is not seen, and the ids are None. Also width, height, tile_size,
+        tile_width, tile_height, n_batches and n_cameras.
 
     Raises:
-        TypeError: an argument is not a tensor, or of another dtype or device; gsplat has no such argument.
-        ValueError: shapes do not match, an option is out of range, or kgs does not support what is asked for.
+        TypeError: an argument is not a tensor, or of another dtype or device.
+        ValueError: shapes do not match, an option is out of range, or kgs does not do what is asked for.
         ModuleNotFoundError: the backend is numba or triton, and it is not installed.
 
     Examples:
@@ -129,88 +135,106 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         >>> renders.shape, alphas.shape, meta["means2d"].tolist()
         (torch.Size([1, 24, 32, 6]), torch.Size([1, 24, 32, 1]), [[16.0, 12.0]])
     """
-    others |= {"radius_clip": radius_clip, "rasterize_mode": rasterize_mode, "camera_model": camera_model}
-    others |= {"sparse_grad": sparse_grad, "absgrad": absgrad, "distributed": distributed}
-    _check_no_ops(others)
-    if not far_plane >= 1e10:
-        raise ValueError(f"far_plane: expected 1e10 or more, kgs cuts nothing far away, got {far_plane}")
-    if render_mode not in _MODES:
-        raise ValueError(f"render_mode: expected one of {_MODES}, got {render_mode!r}")
-    check_tensor("means", means)
-    if backgrounds is not None:
-        check_tensor("backgrounds", backgrounds)
-    posed = pinhole_cameras(viewmats, Ks, width, height, pixel_centers)
-    count, n = posed.batch_size, means.shape[0] if means.ndim else 0
+    check_words(render_mode, rasterize_mode, camera_model)
+    refuse(
+        sparse_grad=sparse_grad,
+        distributed=distributed,
+        with_ut=with_ut,
+        with_eval3d=with_eval3d,
+        global_z_order=global_z_order,
+        rays=rays,
+        radial_coeffs=radial_coeffs,
+        tangential_coeffs=tangential_coeffs,
+        thin_prism_coeffs=thin_prism_coeffs,
+        ftheta_coeffs=ftheta_coeffs,
+        lidar_coeffs=lidar_coeffs,
+        external_distortion_coeffs=external_distortion_coeffs,
+        rolling_shutter=rolling_shutter,
+        viewmats_rs=viewmats_rs,
+        extra_signals_sh_degree=extra_signals_sh_degree,
+    )
+    if return_normals and covars is not None:
+        raise ValueError("return_normals: expected False where covars are given, they have no third axis")
+    options = RasterOptions(
+        tile_size=tile_size,
+        near_plane=near_plane,
+        far_plane=math.inf if far_plane >= _FAR else far_plane,
+        radius_clip=radius_clip,
+        eps2d=eps2d,
+        antialiased=rasterize_mode == "antialiased",
+        alpha_threshold=alpha_threshold,
+        transmittance_stop=transmittance_stop,
+        max_bytes=max_bytes,
+        absgrad=absgrad,
+    )
     image = "RGB" in render_mode
-    if colors is None and not image:
-        colors, sh_degree = means.new_zeros(n, 0), None
-    colors = _check_colors(colors, sh_degree, count, n)
-    own = sh_degree is None and colors.ndim == 3
-    every = colors.transpose(0, 1).flatten(1) if own else colors  # not finite in one camera: left out in all
-    gaussians = Gaussians(means, quats, scales, opacities, every)
-    options = RasterOptions(tile_size, near_plane, eps2d, alpha_threshold, transmittance_stop, max_bytes)
-    projected = project(gaussians, posed, options=options, colors=image and not own, backend=backend)
+    if image:
+        check_tensor("colors", colors)
+    else:
+        colors, sh_degree, backgrounds = None, None, None
+    batch, count, n = batch_shape(means, viewmats)
+    seen = (viewmats, Ks, (height, width), camera_model, pixel_centers)
+    scenes = split(means, quats, scales, covars, opacities, colors, extra_signals, sh_degree, *seen)
+    projected = [
+        project(s.gaussians, s.cameras, options=options, colors=bool(s.shared), backend=backend) for s in scenes
+    ]
+    pairs = Pairs(projected, batch, count, n, packed)
     half = 0.5 if pixel_centers == "half" else 0.0
-    means2d = projected.means2d + half
+    means2d = pairs.spread(joined([p.means2d for p in projected]) + half)
     if means2d.requires_grad:
         means2d.retain_grad()
-    projected = dataclasses.replace(projected, means2d=means2d - half)
-    features = projected.colors
-    if image and own:
-        features = colors.flatten(0, 1).index_select(0, projected.camera_ids * n + projected.gaussian_ids)
-    channels = features.shape[1]
-    if backgrounds is not None and image and tuple(backgrounds.shape) != (count, channels):
-        raise ValueError(f"backgrounds: expected shape ({count}, {channels}), got {tuple(backgrounds.shape)}")
-    if render_mode.endswith("D"):
-        features = torch.cat([features, projected.depths[:, None]], 1)
-    result = composite(projected, features, options=options, backend=backend)
-    alphas = 1.0 - result.transmittance
-    renders, depths = result.features[:, :channels], result.features[:, channels:]
-    if image:
-        renders = blend(renders, result.transmittance, backgrounds, "backgrounds")
-    if render_mode.endswith("ED"):
-        depths = depths / alphas.clamp_min(1e-10)
-    names = ("camera_ids", "gaussian_ids", "depths", "conics", "opacities")
-    meta = {name: getattr(projected, name) for name in names} | {"radii": _radii(projected), "means2d": means2d}
-    meta |= {"width": width, "height": height, "tile_size": result.tile_size, "n_cameras": count}
-    return torch.cat([renders, depths], 1).permute(0, 2, 3, 1), alphas.permute(0, 2, 3, 1), meta
+    drawn = []
+    for b, (scene, rows) in enumerate(zip(scenes, pairs.gathered(means2d), strict=True)):
+        projected[b] = dataclasses.replace(projected[b], means2d=rows - half)
+        features = _features(scene, projected[b], render_mode.endswith("D"), return_normals)
+        values = torch.cat(list(features.values()), 1)
+        keep = pairs.keeper(means2d, b)
+        drawn.append(draw(projected[b], values, options, backend=backend, keep_absgrad=keep))
+    transmittance = joined([x.transmittance for x in drawn])
+    widths = [x.shape[1] for x in features.values()]
+    found = dict(zip(features, joined([x.features for x in drawn]).split(widths, 1), strict=True))
+    shown = _over(found, transmittance, backgrounds, (*batch, count))
+    alphas = 1.0 - transmittance
+    if "depth" in found:
+        shown["depth"] = found["depth"] / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else found["depth"]
+
+    def laid_out(x: Tensor) -> Tensor:
+        images: Tensor = x.permute(0, 2, 3, 1).unflatten(0, (*batch, count))
+        return images
+
+    meta = pairs.meta(means2d)
+    tile = drawn[0].tile_size
+    meta |= {"width": width, "height": height, "tile_size": tile}
+    meta |= {"tile_width": -(-width // tile), "tile_height": -(-height // tile)}
+    if extra_signals is not None:
+        meta["render_extra_signals"] = laid_out(shown["extra"])
+    if return_normals:
+        meta["normals"] = laid_out(found["normal"])
+    renders = torch.cat([shown[name] for name in ("image", "depth") if name in shown], 1)
+    return laid_out(renders), laid_out(alphas), meta
 
 
-def _check_no_ops(given: dict[str, Any]) -> None:
-    """Raise a TypeError for an argument that gsplat does not have, a ValueError for one that is not at its no-op."""
-    for name, value in given.items():
-        if name in _WITHOUT_EFFECT:
-            continue
-        if name not in _NO_OPS:
-            raise TypeError(f"rasterization: got an unexpected argument {name!r}")
-        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
-            continue
-        if hasattr(value, "shape"):
-            got = f"an array {tuple(value.shape)}"
-            raise ValueError(f"{name}: expected {_NO_OPS[name]!r}, all that kgs supports, got {got}")
-        if value != _NO_OPS[name]:
-            raise ValueError(f"{name}: expected {_NO_OPS[name]!r}, all that kgs supports, got {value!r}")
+def _features(scene: Scene, projected: ProjectedGaussians, depth: bool, normal: bool) -> dict[str, Tensor]:
+    """What is composited for a scene, `(M, ...)` each, in this order."""
+    found = scene.features_of(projected)
+    if depth:
+        found["depth"] = projected.depths[:, None]
+    if normal:
+        found["normal"] = normals(scene.gaussians, scene.cameras, projected, axis=2)
+    return found
 
 
-@torch.no_grad()
-def _radii(projected: ProjectedGaussians) -> Tensor:
-    """Gsplat's radii, `(M, 2)` int32: 3.33 standard deviations along x and y, rounded up."""
-    variances = projected.factors.square().sum(2) + projected.eps2d
-    return (3.33 * variances.sqrt()).ceil().clamp_max(_LARGEST_RADIUS).int()
-
-
-def _check_colors(colors: Tensor | None, sh_degree: int | None, count: int, n: int) -> Tensor:
-    """The colours, of harmonics those that are used."""
-    if not isinstance(colors, Tensor):
-        raise TypeError(f"colors: expected a torch.Tensor, got {type(colors).__name__}")
-    shape = tuple(colors.shape)
-    if sh_degree is None:
-        if shape[:-1] not in ((n,), (count, n)):
-            raise ValueError(f"colors: expected shape ({n}, D) or ({count}, {n}, D) without sh_degree, got {shape}")
-        return colors
-    if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
-        raise ValueError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree}")
-    least = (sh_degree + 1) ** 2
-    if len(shape) != 3 or shape[0] != n or shape[1] < least or shape[2] != 3:
-        raise ValueError(f"colors: expected shape ({n}, K, 3) with K >= {least} for sh_degree {sh_degree}, got {shape}")
-    return colors[:, :least]
+def _over(
+    found: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, images: tuple[int, ...]
+) -> dict[str, Tensor]:
+    """The image and the extra signals over their background."""
+    names = [name for name in ("image", "extra") if name in found]
+    if backgrounds is None:
+        return {name: found[name] for name in names}
+    widths = [found[name].shape[1] for name in names]
+    check_tensor("backgrounds", backgrounds)
+    if tuple(backgrounds.shape) != (*images, sum(widths)):
+        raise ValueError(f"backgrounds: expected shape {(*images, sum(widths))}, got {tuple(backgrounds.shape)}")
+    behind = backgrounds.reshape(-1, sum(widths))
+    over = blend(torch.cat([found[name] for name in names], 1), transmittance, behind, "backgrounds")
+    return dict(zip(names, over.split(widths, 1), strict=True))

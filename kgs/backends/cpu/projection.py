@@ -24,7 +24,7 @@ def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """`kgs.projection.project_torch` on the kernels, where they can do the call."""
-    if not _is_plain(cameras) or options.near_plane < 1e-8:  # Kornia does not divide by less
+    if not _is_plain(cameras) or gaussians.quats.ndim == 3 or options.near_plane < 1e-8:  # Kornia divides by no less
         return project_torch(gaussians, cameras, size, options, colors)
     opacities = gaussians.opacities.detach()
     wide = bool((opacities > 2.0).any())  # only these change the cutoff

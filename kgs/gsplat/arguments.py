@@ -1,0 +1,54 @@
+"""Which arguments of gsplat's call kgs follows, and one line for each that it does not."""
+
+from typing import Any
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+LENSES = ("pinhole", "fisheye", "ortho")
+_HIT_DISTANCES = ("d", "Ed", "RGB-d", "RGB-Ed")
+_FROM_3D = "kgs draws footprints in the image, not Gaussians in space"
+_LENS = "for distorted lenses use kgs.PosedCamera and kgs.GaussianRenderer"
+
+# What kgs does not do: the value at which each argument does nothing, and why no other is taken.
+_NOT_DONE: dict[str, tuple[Any, str]] = {
+    "sparse_grad": (False, "the gradients of kgs are dense"),
+    "distributed": (False, "kgs renders in one process"),
+    "with_ut": (False, "kgs linearises the lens at each centre"),
+    "with_eval3d": (False, _FROM_3D),
+    "global_z_order": (True, "kgs sorts by z"),
+    "rays": (None, _FROM_3D),
+    "radial_coeffs": (None, _LENS),
+    "tangential_coeffs": (None, _LENS),
+    "thin_prism_coeffs": (None, _LENS),
+    "ftheta_coeffs": (None, _LENS),
+    "lidar_coeffs": (None, _FROM_3D),
+    "external_distortion_coeffs": (None, _LENS),
+    "rolling_shutter": (None, "one pose per image"),
+    "viewmats_rs": (None, "one pose per image"),
+    "extra_signals_sh_degree": (None, "extra signals are taken as they are"),
+}
+
+
+def refuse(**given: Any) -> None:
+    """Raise a ValueError for an argument whose value asks for what kgs does not do."""
+    for name, value in given.items():
+        nothing, why = _NOT_DONE[name]
+        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
+            continue
+        if hasattr(value, "shape"):
+            raise ValueError(f"{name}: expected {nothing!r} ({why}), got an array {tuple(value.shape)}")
+        if value != nothing:
+            raise ValueError(f"{name}: expected {nothing!r} ({why}), got {value!r}")
+
+
+def check_words(render_mode: str, rasterize_mode: str, camera_model: str) -> None:
+    """Raise a ValueError for a word that gsplat does not have, or that kgs does not follow."""
+    if render_mode in _HIT_DISTANCES:
+        raise ValueError(f"render_mode: expected one of {RENDER_MODES} ({_FROM_3D}), got {render_mode!r}")
+    words = {
+        "render_mode": (render_mode, RENDER_MODES),
+        "rasterize_mode": (rasterize_mode, ("classic", "antialiased")),
+        "camera_model": (camera_model, LENSES),
+    }
+    for name, (word, known) in words.items():
+        if word not in known:
+            raise ValueError(f"{name}: expected one of {known}, got {word!r}")

@@ -1,0 +1,80 @@
+"""gsplat's dict of intermediate results, packed or dense."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kgs.covariance import reach
+from kgs.types import ProjectedGaussians
+
+_LARGEST_RADIUS = 2e9  # pixels, as an int32
+
+
+def joined(parts: list[Tensor]) -> Tensor:
+    """The parts of all scenes; no copy where there is one."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+class Pairs:
+    """The pairs (camera, Gaussian) of all scenes, and how a value of each pair lies in gsplat's tensors.
+
+    Packed: one after the other, `(M, ...)`. Dense: `(*batch, C, N, ...)`, 0 where a camera does not see the Gaussian.
+    """
+
+    def __init__(self, projected: list[ProjectedGaussians], batch: tuple[int, ...], count: int, n: int, packed: bool):
+        self.projected, self.packed = projected, packed
+        self.shape, self.total = (*batch, count, n), len(projected) * count * n
+        ids = [(b * count + p.camera_ids) * n + p.gaussian_ids for b, p in enumerate(projected)]
+        self.ids = joined(ids)
+        self.counts = [len(p) for p in projected]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Values of the pairs, `(M, ...)`, in gsplat's layout."""
+        if self.packed:
+            return values
+        dense = values.new_zeros(self.total, *values.shape[1:]).index_copy(0, self.ids, values)
+        return dense.view(*self.shape, *values.shape[1:])
+
+    def gathered(self, tensor: Tensor) -> list[Tensor]:
+        """The way back: for each scene its rows of a tensor in gsplat's layout."""
+        if not self.packed:
+            tensor = tensor.reshape(self.total, *tensor.shape[len(self.shape) :]).index_select(0, self.ids)
+        return list(tensor.split(self.counts))
+
+    def keeper(self, means2d: Tensor, b: int) -> Callable[[Tensor], None]:
+        """What puts the absolute gradients of a scene where gsplat has them: in `means2d.absgrad`."""
+        begin = sum(self.counts[:b])
+
+        def keep(absolute: Tensor) -> None:
+            if not hasattr(means2d, "absgrad"):
+                means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
+            rows = slice(begin, begin + self.counts[b])
+            flat = means2d.absgrad.view(-1, 2)  # type: ignore[attr-defined]
+            if self.packed:
+                flat[rows] = absolute
+            else:
+                flat[self.ids[rows]] = absolute
+
+        return keep
+
+    def meta(self, means2d: Tensor) -> dict[str, Any]:
+        """What gsplat says of the pairs."""
+        count, n = self.shape[-2:]
+        names = ("depths", "conics", "opacities")
+        found: dict[str, Any] = {name: self.spread(self._joined(name)) for name in names}
+        images = torch.div(self.ids, max(n, 1), rounding_mode="floor")
+        ids = {
+            "batch_ids": torch.div(images, count, rounding_mode="floor"),
+            "camera_ids": images % count,
+            "gaussian_ids": self._joined("gaussian_ids"),
+        }
+        found |= ids if self.packed else dict.fromkeys(ids)
+        with torch.no_grad():
+            radii = [reach(p.factors, p.eps2d).clamp_max(_LARGEST_RADIUS).int() for p in self.projected]
+            found["radii"] = self.spread(joined(radii))
+        return found | {"means2d": means2d, "n_batches": len(self.projected), "n_cameras": count}
+
+    def _joined(self, name: str) -> Tensor:
+        return joined([getattr(p, name) for p in self.projected])

@@ -1,0 +1,153 @@
+"""Anti-aliasing, far plane and smallest radius of the renderer: closed forms, the reference, gradients."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from factories import batch, footprints, leaves, pinhole, random_camera, random_gaussians
+from oracles import theta_mass
+from reference_checks import one
+
+import kgs.reference
+from kgs import GaussianRenderer, project
+from kgs.covariance import compensations, conics
+
+EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
+pytestmark = pytest.mark.usefixtures("each_backend")
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.1, 0.3, 1.0, 2.0])
+def test_a_footprint_keeps_its_sum(sigma, exactly):
+    """Over all pixels 2 pi o times the root of the determinant before it is widened."""
+    dtype, bound = exactly
+    factors = torch.tensor([[[sigma, 0.0, 0.0], [0.0, 2 * sigma, 0.0]]], dtype=dtype)
+    size, eps2d = (61, 61), 0.3
+    given = footprints(torch.tensor([[30.3, 29.8]], dtype=dtype), factors, torch.tensor([0.5]).to(dtype), size, eps2d)
+    opacities = given.opacities * compensations(factors, eps2d)
+    image = kgs.composite(dataclasses.replace(given, opacities=opacities), torch.ones(1, 1, dtype=dtype), **EXACT)
+    widths = [sigma**2 + eps2d, 4 * sigma**2 + eps2d]
+    sums = [theta_mass(width, centre) for width, centre in zip(widths, (30.3, 29.8), strict=True)]
+    expected = 0.5 * 2 * sigma**2 / math.sqrt(widths[0] * widths[1]) * sums[0] * sums[1]
+    assert float(image.features.sum()) == pytest.approx(expected, rel=max(1e3 * bound, 1e-9))
+    if min(widths) > 0.5:  # where the pixels are fine enough for the sum to be the integral
+        assert expected == pytest.approx(0.5 * 2 * math.pi * 2 * sigma**2, rel=1e-4)
+
+
+def test_renders_are_those_of_multiplied_opacities(exactly):
+    dtype, bound = exactly
+    gaussians = random_gaussians(80, 0, dtype, 1, 32)
+    gaussians.scales[::2] *= 0.1
+    cameras = batch(*(random_camera(24, 32, seed, dtype) for seed in range(2)))
+    image = GaussianRenderer(antialiased=True, **EXACT)(gaussians, cameras).image
+    for c in range(2):
+        camera = random_camera(24, 32, c, dtype)
+        plain = project(gaussians, camera, **EXACT)
+        wide = torch.linalg.inv(
+            plain.factors.double() @ plain.factors.double().mT + 0.3 * torch.eye(2, dtype=torch.float64)
+        )
+        narrow = torch.linalg.det(plain.factors.double() @ plain.factors.double().mT).clamp_min(0)
+        factor = torch.ones(80, dtype=torch.float64)
+        factor[plain.gaussian_ids] = (narrow * torch.linalg.det(wide)).sqrt()
+        fainter = dataclasses.replace(gaussians, opacities=gaussians.opacities * factor.to(dtype))
+        expected = kgs.reference.render(fainter, camera, **EXACT)
+        assert (image[c] - expected[0]).abs().max() <= 2 * bound
+    assert (image - GaussianRenderer(**EXACT)(gaussians, cameras).image).abs().max() > 0.05
+
+
+@pytest.mark.usefixtures("torch_alone")
+@pytest.mark.parametrize("sigma", [1e-3, 0.05, 0.5, 5.0])
+def test_the_factor_has_the_gradient_of_finite_differences(sigma):
+    factors = sigma * torch.randn(5, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x: compensations(x, 0.3), factors.requires_grad_(), eps=1e-6 * sigma)
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_flat_footprints_have_the_factor_zero_and_no_infinite_gradient():
+    factors = torch.zeros(3, 2, 3)
+    factors[1, 0, 0] = 2.0
+    factors[2] = torch.tensor([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]])
+    factors.requires_grad_()
+    factor = compensations(factors, 0.3)
+    assert not factor.any()
+    factor.sum().backward()
+    assert factors.grad.isfinite().all()
+
+
+def test_gradients_of_an_antialiased_render(exactly):
+    dtype, bound = exactly
+    camera = random_camera(16, 20, 0, dtype)
+    scene = random_gaussians(30, 1, torch.float64, 1, 20, (0.1, 0.9))
+    scene.scales[::2] *= 0.1
+
+    def by_hand(gaussians):
+        plain = project(gaussians, random_camera(16, 20, 0), backend="torch", **EXACT)
+        narrow = plain.factors @ plain.factors.mT
+        a, b, c = conics(plain.factors, 0.3).unbind(1)
+        factor = (torch.linalg.det(narrow) * (a * c - b * b)).clamp_min(0).sqrt()
+        given = dataclasses.replace(plain, opacities=plain.opacities * factor)
+        return kgs.composite(given, plain.colors, backend="torch", **EXACT).features
+
+    own, inputs = leaves(dataclasses.replace(scene, **{k: v.to(dtype) for k, v in vars(scene).items()}))
+    image = GaussianRenderer(antialiased=True, **EXACT)(own, camera).image
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    (image * weights).sum().backward()
+    true, expected = leaves(scene)
+    (by_hand(true) * weights).sum().backward()
+    for found, wanted in zip(inputs, expected, strict=True):
+        assert (found.grad - wanted.grad).abs().max() <= 10 * bound * wanted.grad.abs().max().clamp_min(1)
+
+
+def test_a_coarse_render_is_nearer_to_the_mean_of_a_fine_one():
+    """Small Gaussians drawn at an eighth of the size, against means over 8 x 8 pixels."""
+    gaussians = random_gaussians(400, 3, torch.float32, None, 256, (0.3, 0.9))
+    fine = pinhole(192, 256, 256.0, dtype=torch.float32)
+    coarse = pinhole(24, 32, 32.0, dtype=torch.float32)
+    target = torch.nn.functional.avg_pool2d(GaussianRenderer(eps2d=0.01)(gaussians, fine).image, 8)
+    errors = [
+        (GaussianRenderer(antialiased=antialiased)(gaussians, coarse).image - target).square().mean()
+        for antialiased in (False, True)
+    ]
+    assert errors[1] < 0.2 * errors[0]
+
+
+def test_without_a_low_pass_filter_there_is_nothing_to_correct():
+    gaussians, camera = random_gaussians(30, 0, torch.float32, 0, 32), random_camera(24, 32, 0, torch.float32)
+    plain, antialiased = (GaussianRenderer(eps2d=0.0, antialiased=x)(gaussians, camera).image for x in (False, True))
+    assert torch.equal(plain, antialiased)
+
+
+# -- what is left out ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options", [{"far_plane": 4.0}, {"radius_clip": 15.0}, {"far_plane": 5.0, "radius_clip": 12.0}]
+)
+def test_what_is_left_out_is_as_if_it_were_not_there(options):
+    gaussians, camera = random_gaussians(80, 0, torch.float32, 1, 32), random_camera(24, 32, 0, torch.float32)
+    everything = project(gaussians, camera)
+    spread = (everything.factors @ everything.factors.mT + 0.3 * torch.eye(2)).diagonal(dim1=1, dim2=2)
+    radii = (3.33 * spread.sqrt()).ceil().amax(1)
+    kept = (everything.depths < options.get("far_plane", math.inf)) & (radii > options.get("radius_clip", 0))
+    assert 10 < kept.sum() < len(everything) - 10
+    rest = torch.zeros(80, dtype=torch.bool)
+    rest[everything.gaussian_ids[kept]] = True
+    own, inputs = leaves(gaussians)
+    out = GaussianRenderer(**options)(own, camera)
+    out.image.square().sum().backward()
+    assert torch.equal(out.projected.gaussian_ids, everything.gaussian_ids[kept])
+    other, expected = leaves(gaussians[rest])
+    image = GaussianRenderer()(other, camera).image
+    image.square().sum().backward()
+    assert torch.equal(out.image, image)
+    for found, wanted in zip(inputs, expected, strict=True):
+        assert torch.allclose(found.grad[rest], wanted.grad, rtol=1e-5, atol=1e-6)
+        assert not found.grad[~rest].any()
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_a_single_gaussian_before_and_behind_the_far_plane():
+    gaussian, camera = one([0, 0, 2], [0.1] * 3), pinhole(15, 17, 50)
+    assert len(project(gaussian, camera, far_plane=2.0)) == 0
+    assert len(project(gaussian, camera, far_plane=2.01)) == 1
+    assert GaussianRenderer(far_plane=1.0)(gaussian, camera).image.abs().sum() == 0
