@@ -161,9 +161,8 @@ def variances(factors: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Te
     return xx + eps2d, xy, yy + eps2d, det
 
 
-def conics(factors: Tensor, eps2d: float) -> Tensor:
+def conics(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
     """Inverse covariances (a, b, c) of a dx^2 + 2 b dx dy + c dy^2, `(M, 3)`."""
-    xx, xy, yy, det = variances(factors, eps2d)
     return torch.stack([yy / det, -xy / det, xx / det], 1)
 
 
@@ -177,9 +176,8 @@ def compensations(factors: Tensor, eps2d: float) -> Tensor:
     return found
 
 
-def reach(factors: Tensor, eps2d: float) -> Tensor:
+def reach(xx: Tensor, yy: Tensor) -> Tensor:
     """How far footprints reach along x and y in pixels, `(M, 2)`: 3.33 standard deviations, rounded up."""
-    xx, _, yy, _ = variances(factors, eps2d)
     return (3.33 * torch.stack([xx, yy], 1).sqrt()).ceil()
 
 

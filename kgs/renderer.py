@@ -25,7 +25,8 @@ class GaussianRenderer(nn.Module):
 
     Limits:
         Differentiable once, by `backward` or `torch.autograd.grad`. Second derivatives, forward mode, `torch.func`
-        (vmap, jacrev, jvp, ...) and `is_grads_batched` are errors. Depth divides by alpha = 1 - T, which in float32 is
+        (vmap, jacrev, jvp, ...) and `is_grads_batched` are errors. `torch.compile` breaks its graph at `project` and
+        `composite`, which run as they are. Depth divides by alpha = 1 - T, which in float32 is
         right to 6e-8: to 6 % where alpha is 1e-6.
 
     Args:

@@ -1,9 +1,10 @@
 """The two stages of a render, `project` and `composite`: arguments are checked here, and a backend does the work."""
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Unpack
+from typing import Any, TypeVar, Unpack
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from .backends import choose
 from .backends.base import Compositor
 from .camera import Cameras, image_size, intrinsics
-from .covariance import compensations, reach
+from .covariance import compensations, reach, variances
 from .types import (
     Composited,
     Gaussians,
@@ -24,7 +25,22 @@ from .types import (
     raster_options,
 )
 
+F = TypeVar("F", bound=Callable[..., Any])
 
+
+def outside_graphs(stage: F) -> F:
+    """A stage that `torch.compile` runs as it is: what it computes depends on numbers, which a graph cannot follow."""
+
+    @functools.wraps(stage)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        if not torch.compiler.is_compiling():
+            return stage(*args, **kwargs)
+        return torch.compiler.disable(stage)(*args, **kwargs)
+
+    return run  # type: ignore[return-value]
+
+
+@outside_graphs
 def project(
     gaussians: Gaussians,
     cameras: Cameras,
@@ -78,7 +94,8 @@ def _with_options(projected: ProjectedGaussians, options: RasterOptions) -> Proj
     if options.far_plane < math.inf or options.radius_clip > 0:
         kept = projected.depths < options.far_plane
         if options.radius_clip > 0:
-            kept &= reach(projected.factors.detach(), options.eps2d).amax(1) > options.radius_clip
+            xx, _, yy, _ = variances(projected.factors.detach(), options.eps2d)
+            kept &= reach(xx, yy).amax(1) > options.radius_clip
         projected = _rows(projected, kept.nonzero()[:, 0])
     if options.antialiased and options.eps2d > 0:
         factor = compensations(projected.factors, options.eps2d)
@@ -141,6 +158,7 @@ def composite(
     return draw(projected, features, given, median_depth=median_depth, chunk_size=chunk_size, backend=backend)
 
 
+@outside_graphs
 def draw(
     projected: ProjectedGaussians,
     features: Tensor,

@@ -12,7 +12,7 @@ from typing import Any, Self, TypedDict
 import torch
 from torch import Tensor
 
-from .covariance import conics
+from .covariance import conics, variances
 
 SH_SIZES = (1, 4, 9, 16)
 
@@ -240,7 +240,7 @@ class ProjectedGaussians:
     @property
     def conics(self) -> Tensor:
         """Inverse covariances (a, b, c), meaning a dx^2 + 2 b dx dy + c dy^2, shape `(M, 3)`."""
-        return conics(self.factors, self.eps2d)
+        return conics(*variances(self.factors, self.eps2d))
 
     def __len__(self) -> int:
         return self.camera_ids.shape[0]

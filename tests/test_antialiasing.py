@@ -11,7 +11,7 @@ from reference_checks import one
 
 import kgs.reference
 from kgs import GaussianRenderer, project
-from kgs.covariance import compensations, conics
+from kgs.covariance import compensations, conics, variances
 
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 pytestmark = pytest.mark.usefixtures("each_backend")
@@ -83,7 +83,7 @@ def test_gradients_of_an_antialiased_render(exactly):
     def by_hand(gaussians):
         plain = project(gaussians, random_camera(16, 20, 0), backend="torch", **EXACT)
         narrow = plain.factors @ plain.factors.mT
-        a, b, c = conics(plain.factors, 0.3).unbind(1)
+        a, b, c = conics(*variances(plain.factors, 0.3)).unbind(1)
         factor = (torch.linalg.det(narrow) * (a * c - b * b)).clamp_min(0).sqrt()
         given = dataclasses.replace(plain, opacities=plain.opacities * factor)
         return kgs.composite(given, plain.colors, backend="torch", **EXACT).features

@@ -86,7 +86,7 @@ def test_gradcheck_of_rotation_and_factors():
     inputs = [value.requires_grad_() for value in (rows, quats, scales)]
     assert torch.autograd.gradcheck(footprint_factors, inputs)
     assert torch.autograd.gradcheck(lambda *x: torch.stack(variances(footprint_factors(*x), EPS2D)), inputs)
-    assert torch.autograd.gradcheck(lambda *x: conics(footprint_factors(*x), EPS2D), inputs)
+    assert torch.autograd.gradcheck(lambda *x: conics(*variances(footprint_factors(*x), EPS2D)), inputs)
     assert torch.autograd.gradcheck(lambda *x: torch.stack(whitening(*variances(footprint_factors(*x), EPS2D))), inputs)
 
 
@@ -131,7 +131,7 @@ def test_conic_is_the_inverse_and_whitening_its_root(eps2d):
     ):
         torch.testing.assert_close(got, expected, rtol=1e-11, atol=1e-12)
     inverse = torch.linalg.inv(sigma)
-    a, b, c = conics(factors, eps2d).unbind(1)
+    a, b, c = conics(*variances(factors, eps2d)).unbind(1)
     torch.testing.assert_close(torch.stack([a, b, b, c], 1).reshape(-1, 2, 2), inverse, rtol=1e-9, atol=1e-12)
     assert (entries[0] > entries[2]).any(), "both pivots must occur"
     assert (entries[0] < entries[2]).any()

@@ -115,6 +115,18 @@ CLAIMS["07_your_own_photos"] = (
     """,
 )
 
+CLAIMS["08_from_gsplat"] = (
+    """
+    assert info["means2d"].shape == (1, len(params["means"]), 2)
+    assert viewmats.grad.any() and Ks.grad[0, :2, :3].any() and renders.shape[-1] == 4
+    """,
+    """
+    levels = {name: level for name, (_, level, _) in results.items()}
+    assert min(levels.values()) > 18 and levels["DropGaussian"] > levels["without the layer"] - 0.5
+    assert all(len(params["means"]) > len(points.points) for params, _, _ in results.values())  # it densified
+    """,
+)
+
 
 @pytest.fixture
 def workplace(tmp_path):
@@ -223,7 +235,7 @@ def test_it_is_small_and_names_no_place_on_a_disk(path):
 
 # -- your own photos -------------------------------------------------------------------------------------------------
 
-YOUR_OWN = nbformat.read(NOTEBOOKS[-1], as_version=4)
+YOUR_OWN = nbformat.read(NOTEBOOKS[0].with_name("07_your_own_photos.ipynb"), as_version=4)
 
 
 def test_it_is_stored_without_photos_of_others():

@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 from factories import drop_layer as at
-from factories import pinhole, random_model
+from factories import pinhole, random_camera, random_gaussians, random_model
 from factories import random_opacities as draw
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from kgs import DropGaussian, GaussianRenderer
+from kgs import DropGaussian, GaussianRenderer, Gaussians
 from kgs.losses import photometric_loss, target_moments
 
 
@@ -219,3 +219,57 @@ def test_a_whole_network_survives_deepcopy_and_shared_memory():
     network = Blobs(at(0.5, p=0.2, seed=3))
     twin = copy.deepcopy(network).share_memory()
     assert torch.equal(twin(), network())
+
+
+# -- the renderer in a compiled step -------------------------------------------------------------------------------
+
+
+def rendered_fit(backend, seed):
+    """Losses and parameters of four steps with the renderer, the layer and the loss in them."""
+    torch._dynamo.reset()
+    torch.manual_seed(0)
+    scene = random_gaussians(60, 0, torch.float32, 1, 32)
+    parameters = {name: value.clone().requires_grad_() for name, value in vars(scene).items()}
+    drop = DropGaussian(p=0.2, seed=seed)
+    renderer, camera = GaussianRenderer(opacity_layer=drop), random_camera(24, 32, 0, torch.float32)
+    target = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(1))
+    adam = torch.optim.Adam(parameters.values(), lr=1e-2)
+
+    def loss():
+        return photometric_loss(renderer(Gaussians(**parameters), camera).image, target)
+
+    step, losses = loss if backend is None else torch.compile(loss, backend=backend), []
+    for i in range(4):
+        drop.progress = (i + 1) / 4
+        value = step()
+        adam.zero_grad()
+        value.backward()
+        adam.step()
+        losses.append(value.item())
+    return losses, parameters
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("backend", ["eager", "aot_eager", "inductor"])
+def test_a_compiled_step_with_the_renderer_is_the_step(backend, seed):
+    """`project` and `composite` run as they are, in the kernels too; the rest is compiled around them."""
+    if backend == "inductor":
+        try:
+            torch.compile(lambda x: x + 1)(torch.ones(2))
+        except Exception as error:
+            pytest.skip(f"no compiler works here: {type(error).__name__}")
+    expected, eager = rendered_fit(None, seed)
+    breaks = torch._dynamo.utils.counters["graph_break"]
+    breaks.clear()
+    losses, parameters = rendered_fit(backend, seed)
+    if backend != "inductor" or seed is not None:  # inductor draws other numbers than torch
+        assert losses == pytest.approx(expected, abs=1e-6)
+        for name, value in parameters.items():  # Adam divides a gradient by its own size, as above
+            assert (value - eager[name]).abs().max() <= 4 * 0.01, name
+            assert ((value - eager[name]).abs() > 1e-4).float().mean() <= 0.01, name
+    assert losses[-1] < losses[0]
+    # the stages, drawing with a seed, the taps of the loss's window
+    known = ("torch.compiler.disable", "function `disable`", "Generator", "tolist")
+    assert breaks
+    assert not [reason for reason in breaks if not any(word in reason for word in known)]

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.covariance import reach
+from kgs.covariance import conics, reach, variances
 from kgs.types import ProjectedGaussians
 
 _LARGEST_RADIUS = 2e9  # pixels, as an int32
@@ -62,8 +62,10 @@ class Pairs:
     def meta(self, means2d: Tensor) -> dict[str, Any]:
         """What gsplat says of the pairs."""
         count, n = self.shape[-2:]
-        names = ("depths", "conics", "opacities")
-        found: dict[str, Any] = {name: self.spread(self._joined(name)) for name in names}
+        found: dict[str, Any] = {name: self.spread(self._joined(name)) for name in ("depths", "opacities")}
+        xx, xy, yy, det = variances(self._joined("factors"), self.projected[0].eps2d)
+        found["conics"] = self.spread(conics(xx, xy, yy, det))
+        found["radii"] = self.spread(reach(xx.detach(), yy.detach()).clamp_max(_LARGEST_RADIUS).int())
         images = torch.div(self.ids, max(n, 1), rounding_mode="floor")
         ids = {
             "batch_ids": torch.div(images, count, rounding_mode="floor"),
@@ -71,9 +73,6 @@ class Pairs:
             "gaussian_ids": self._joined("gaussian_ids"),
         }
         found |= ids if self.packed else dict.fromkeys(ids)
-        with torch.no_grad():
-            radii = [reach(p.factors, p.eps2d).clamp_max(_LARGEST_RADIUS).int() for p in self.projected]
-            found["radii"] = self.spread(joined(radii))
         return found | {"means2d": means2d, "n_batches": len(self.projected), "n_cameras": count}
 
     def _joined(self, name: str) -> Tensor:

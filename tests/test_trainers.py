@@ -1,0 +1,183 @@
+"""The layer and kgs's call in other people's trainers: the lines of docs/gsplat.md, put into the projects' own files.
+
+nerfstudio's file comes from its wheel; those of gsplat's examples and of the paper's release from clones in the folder
+KGS_PEERS (gsplat, DropGaussian_release). What is tested is their Python; CUDA is replaced.
+"""
+
+import ast
+import math
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from factories import random_camera, random_gaussians
+
+import kgs
+
+pytestmark = pytest.mark.slow
+
+SIZE = (24, 32)  # height, width
+
+
+def peer(*parts):
+    """A file of a clone."""
+    folder = os.environ.get("KGS_PEERS")
+    if not folder or not (path := Path(folder, *parts)).exists():
+        pytest.skip(f"there is no {'/'.join(parts)} in KGS_PEERS")
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def splatfacto(tmp_path_factory):
+    """The file of nerfstudio's wheel; nothing of it is installed."""
+    folder = tmp_path_factory.mktemp("wheel")
+    load = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "-d", folder, "nerfstudio==1.1.5"]
+    if subprocess.run(load, check=False, capture_output=True).returncode:
+        pytest.skip("there is no nerfstudio 1.1.5 to download")
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as wheel:
+        return wheel.read("nerfstudio/models/splatfacto.py").decode()
+
+
+def function(source, name, changes, names):
+    """A function of a file, after some of its lines were replaced; each must be there once."""
+    found = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef) and node.name == name]
+    assert len(found) == 1
+    lines = source.splitlines()[found[0].lineno - 1 : found[0].end_lineno]
+    indent = len(lines[0]) - len(lines[0].lstrip())
+    text = "\n".join(line[indent:] for line in lines)
+    for old, new in changes.items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    text = text.replace('device="cuda"', 'device="cpu"')
+    namespace = {"torch": torch, "math": math, "Any": Any, **names}
+    exec(compile(f"from __future__ import annotations\n{text}", name, "exec"), namespace)
+    return namespace[name]
+
+
+def scene():
+    """Gaussians as trainers hold them, and a camera as gsplat has it."""
+    gaussians = random_gaussians(60, 0, torch.float32, 1, 32)
+    camera = random_camera(*SIZE, 0, torch.float32)
+    k = camera.intrinsics[:, :3, :3].clone()
+    k[:, :2, 2] += 0.5
+    return gaussians, camera, k
+
+
+def as_is(gaussians, camera, k, **options):
+    """What the trainers should draw without the layer."""
+    given = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    return kgs.rasterization(*given, camera.extrinsics, k, SIZE[1], SIZE[0], sh_degree=1, **options)[0]
+
+
+def check_drops(draw, drop, expected):
+    """All Gaussians in eval(), fewer in train(), at the rate of the progress."""
+    drop.eval()
+    assert torch.allclose(draw(), expected, atol=1e-5)
+    drop.train()
+    drop.progress = 1.0
+    assert drop.rate == 0.2
+    assert (draw() - expected).abs().max() > 0.01
+    drop.eval()
+    assert torch.allclose(draw(), expected, atol=1e-5)
+
+
+def test_gsplats_simple_trainer():
+    source = peer("gsplat", "examples", "simple_trainer.py")
+    assert 'torch.sigmoid(self.splats["opacities"])' in source
+    line = next(x for x in source.splitlines() if 'opacities = torch.sigmoid(self.splats["opacities"])' in x)
+    own = {line.strip(): f"{line.split('#')[0].strip()}\n    opacities = self.drop(opacities)"}
+    strategy = pytest.importorskip("gsplat.strategy").DefaultStrategy
+    names = {"rasterization": kgs.rasterization, "DefaultStrategy": strategy}
+    rasterize_splats = function(source, "rasterize_splats", own, names)
+    gaussians, camera, k = scene()
+    splats = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales.log()}
+    splats |= {"opacities": gaussians.opacities.logit(), "sh0": gaussians.colors[:, :1], "shN": gaussians.colors[:, 1:]}
+    config = dict.fromkeys(("app_opt", "packed", "sparse_grad", "with_ut", "with_eval3d", "antialiased"), False)
+    config |= {"camera_model": "pinhole", "post_processing": None, "strategy": strategy(absgrad=True)}
+    drop = kgs.DropGaussian(p=0.2)
+    runner = SimpleNamespace(splats=splats, cfg=SimpleNamespace(**config), world_size=1, device="cpu", drop=drop)
+    poses = camera.extrinsics.inverse()
+
+    def draw():
+        return rasterize_splats(runner, poses, k, SIZE[1], SIZE[0], sh_degree=1)[0]
+
+    check_drops(draw, drop, as_is(gaussians, camera, k))
+
+
+class Tensor(torch.Tensor):
+    """On the CPU, whatever is asked for."""
+
+    def cuda(self):
+        return self.as_subclass(torch.Tensor)
+
+
+def test_splatfacto(splatfacto):
+    call = "opacities=torch.sigmoid(opacities_crop).squeeze(-1),"
+    own = {call: "opacities=self.drop(torch.sigmoid(opacities_crop).squeeze(-1)),"}
+    assert "def populate_modules(self):" in splatfacto
+    assert "        self.step = step\n" in splatfacto
+    names = {"rasterization": kgs.rasterization, "get_viewmat": lambda pose: pose, "Cameras": SimpleNamespace}
+    names |= dict.fromkeys(("Dict", "List", "Union"), dict)
+    get_outputs = function(splatfacto, "get_outputs", own, names)
+    gaussians, camera, k = scene()
+    drop = kgs.DropGaussian(p=0.2)
+    strategy = pytest.importorskip("gsplat.strategy").DefaultStrategy(absgrad=True)
+    config = SimpleNamespace(rasterize_mode="classic", output_depth_during_training=True)
+    config.sh_degree, config.sh_degree_interval, config.use_bilateral_grid = 1, 1000, False
+    fields = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales.log()}
+    fields |= {"opacities": gaussians.opacities.logit()[:, None], "features_dc": gaussians.colors[:, 0]}
+    fields |= {"features_rest": gaussians.colors[:, 1:], "drop": drop, "strategy": strategy, "config": config}
+    model = SimpleNamespace(**fields, training=False, crop_box=None, step=5000, device="cpu")
+    model._get_downscale_factor = lambda: 1
+    model._get_background_color = lambda: torch.zeros(3)
+    view = SimpleNamespace(
+        camera_to_worlds=camera.extrinsics, width=torch.tensor(SIZE[1]), height=torch.tensor(SIZE[0])
+    )
+    view.get_intrinsics_matrices = lambda: k.as_subclass(Tensor)
+    view.rescale_output_resolution = lambda factor: None
+    expected = as_is(gaussians, camera, k)[0].clamp(0, 1)
+    check_drops(lambda: get_outputs(model, view)["rgb"], drop, expected)
+    depth = as_is(gaussians, camera, k, render_mode="RGB+ED")[0, ..., 3:]
+    assert torch.allclose(get_outputs(model, view)["depth"], depth, atol=1e-4)
+    assert model.info["means2d"].shape == (1, 60, 2)
+
+
+def test_the_papers_release():
+    source = peer("DropGaussian_release", "gaussian_renderer", "__init__.py")
+    lines = source.splitlines()
+    begin = next(i for i, line in enumerate(lines) if line.strip() == "if is_train:")
+    end = next(i for i in range(begin, len(lines)) if "compensation[:, None]" in lines[i])
+    old = "\n".join(line[4:] for line in lines[begin : end + 1])
+    new = "if is_train:\n    drop.progress = min(1.0, iteration / 10_000)\n    opacity = drop(opacity)"
+    indented = "\n".join(f"    {line}" for line in new.splitlines())
+    drop, seen = kgs.DropGaussian(p=0.2, seed=0), []
+
+    def rasteriser(**given):
+        seen.append(given["opacities"])
+        return torch.zeros(3, *SIZE), torch.ones(60)
+
+    names = {"drop": drop, "GaussianRasterizationSettings": SimpleNamespace}
+    names["GaussianRasterizer"] = lambda raster_settings: rasteriser
+    whole = "\n".join([*lines[:begin], *indented.splitlines(), *lines[end + 1 :]])
+    assert old.strip()
+    render = function(whole, "render", {}, names)
+    gaussians, _, _ = scene()
+    model = SimpleNamespace(get_xyz=gaussians.means, get_opacity=gaussians.opacities[:, None], active_sh_degree=1)
+    model.get_scaling, model.get_rotation, model.get_features = gaussians.scales, gaussians.quats, gaussians.colors
+    view = SimpleNamespace(FoVx=1.0, FoVy=0.8, image_height=SIZE[0], image_width=SIZE[1], camera_center=torch.zeros(3))
+    view.world_view_transform = view.full_proj_transform = torch.eye(4)
+    pipe = SimpleNamespace(compute_cov3D_python=False, convert_SHs_python=False, debug=False)
+    render(view, model, pipe, torch.zeros(3), is_train=True, iteration=5000)
+    assert drop.rate == 0.1
+    kept = seen[0] != 0
+    assert seen[0].shape == (60, 1)
+    assert 0 < (~kept).sum() < 20
+    assert torch.allclose(seen[0][kept], (gaussians.opacities[:, None] / 0.9)[kept])
+    render(view, model, pipe, torch.zeros(3), is_train=False)
+    assert torch.equal(seen[1], gaussians.opacities[:, None])
