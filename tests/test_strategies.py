@@ -168,6 +168,7 @@ def test_mcmc_strategy_trains(monkeypatch):
 
 
 @pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_mcmc_strategy_trains_with_gsplats_own_functions():
     pytest.importorskip("gsplat.csrc", reason="gsplat was built without its extension")
     strategy = strategies.MCMCStrategy(

@@ -17,6 +17,7 @@ DTYPES = pytest.mark.parametrize("dtype", list(BOUNDS))
 
 
 @pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_auto_takes_the_kernels():
     """Else all tests of this folder would pass in torch."""
     assert backends.resolve("auto", torch.device("cuda")) == "triton"
