@@ -83,11 +83,12 @@ class _FootprintFactors(torch.autograd.Function):
 def half_axes(covariances: Tensor) -> Tensor:
     """Matrices A with A A^T = Sigma for covariances Sigma `(N, 3, 3)`: `quats` of Gaussians whose scales are 1.
 
-    A Cholesky factorisation in float64: of needles it adds no error to that which Sigma was rounded with. Where a
-    variance is zero, or negative by rounding, it is taken as the rounding of its entry.
+    A Cholesky factorisation in float64: of needles it adds no error to that which Sigma was rounded with. What is left
+    of a variance counts as at least the rounding of its entry, and a negative one as 0. The upper and the lower
+    triangle are averaged.
 
-    The gradient is (G A^-1 + (G A^-1)^T) / 4 of a gradient G by A: right for every function of A A^T. In float32 its
-    error is about 1e-7 times the ratio of the longest to the shortest axis.
+    The gradient is (G A^-1 + (G A^-1)^T) / 4 of a gradient G by A: right for every function of A A^T, once. In float32
+    its error is about 1e-7 times the ratio of the longest to the shortest axis; of an axis of length 0 it is 0.
     """
     found: Tensor = _HalfAxes.apply(covariances)
     return found
@@ -113,12 +114,14 @@ class _HalfAxes(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:
+        if torch.is_grad_enabled():
+            raise RuntimeError("half_axes: expected backward without create_graph, there is no second derivative")
         (factors,) = ctx.saved_tensors
         flat = factors.diagonal(dim1=1, dim2=2) == 0  # the gradient is 0 there, too
         whole = factors + torch.diag_embed(flat.double())
         solved = torch.linalg.solve_triangular(whole, grad.double(), upper=False, left=False)
         found: Tensor = ((solved + solved.mT) / 4).to(grad.dtype)
-        return found
+        return found.masked_fill_(~factors.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), 0.0)
 
 
 def columns(rows: Tensor) -> Tensor:

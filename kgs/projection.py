@@ -42,6 +42,8 @@ def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussian
     The axis is the local one of this number, or the shortest for None. Differentiable with respect to the quaternions.
     At right angles to the view either direction is correct.
     """
+    if gaussians.quats.ndim == 3 and axis is None:
+        raise ValueError("outputs: normals need quats (N, 4), got matrices, of which no column has to be an axis")
     ids = projected.gaussian_ids
     turned = rotation_matrices(gaussians.quats.index_select(0, ids))
     if axis is None:

@@ -143,7 +143,7 @@ class Gaussians:
     Args:
         means: centres in world units, shape `(N, 3)`.
         quats: rotations as quaternions in the order w, x, y, z, of any norm from 1e-38 on, shape `(N, 4)`. Or matrices
-            A `(N, 3, 3)` in their place: rotations, or any others, where the covariance is A S S A^T.
+            A `(N, 3, 3)` in their place, where the covariance is A S S A^T: rotations, or any others.
         scales: standard deviations along the local axes in world units, > 0, shape `(N, 3)`.
         opacities: shape `(N,)`, or `(C, N)` for one value per camera. In [0, 1], or above 1 after `DropGaussian`.
         colors: spherical harmonics `(N, K, 3)` with K = 1, 4, 9 or 16 (degree 0 to 3); or features `(N, D)` that are

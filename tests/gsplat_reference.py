@@ -22,6 +22,8 @@ def gsplat_render(
     covars = values.get("covars")
     if covars is None:
         covars, _ = gsplat._quat_scale_to_covar_preci(values["quats"], values["scales"], True, False)
+    else:
+        covars = covars.triu() + covars.triu(1).mT  # as gsplat's call reads them
     pose, means = values["viewmats"], values["means"]
     compensated = rasterize_mode == "antialiased"
     found = gsplat._fully_fused_projection(

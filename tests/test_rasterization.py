@@ -2,6 +2,7 @@
 
 import enum
 import inspect
+import weakref
 
 import pytest
 import torch
@@ -206,6 +207,7 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
         ("means", torch.zeros(0, 60, 3).double()),
         ("means", torch.zeros(60, 2).double()),
         ("viewmats", torch.eye(4).double()),
+        ("viewmats", torch.eye(4).double().expand(0, 4, 4)),
         ("viewmats", torch.eye(4).double().expand(1, 2, 4, 4)),
         ("Ks", torch.eye(3).double()),
         ("scales", torch.zeros(60).double()),
@@ -391,3 +393,99 @@ def test_normals_are_third_axes_towards_the_camera(exactly):
     assert torch.allclose(normals[0].double(), expected, atol=5 * bound)
     with pytest.raises(ValueError, match=r"^return_normals: expected False"):
         call(gaussians, cameras, return_normals=True, covars=torch.eye(3, dtype=dtype).expand(60, 3, 3))
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("sh_degree", [None, 1])
+def test_no_gaussians_and_none_seen(packed, shape, sh_degree):
+    cameras = batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(2)))
+    views = [x.expand(*shape, *x.shape) for x in (cameras.extrinsics, cameras.intrinsics[:, :3, :3])]
+    for n in (0, 4):  # the four lie behind the cameras
+        values = [torch.rand(*shape, n, width) for width in (3, 4, 3)]
+        values[0][..., 2] -= 9.0
+        values += [torch.rand(*shape, n), torch.rand(*shape, n, *((3,) if sh_degree is None else (4, 3)))]
+        leaves = [x.requires_grad_() for x in values]
+        options = {"sh_degree": sh_degree, "packed": packed, "absgrad": True, "render_mode": "RGB+ED"}
+        renders, alphas, meta = rasterization(*leaves, *views, 32, 24, **options)
+        assert renders.shape == (*shape, 2, 24, 32, 4)
+        assert not renders.any()
+        assert not alphas.any()
+        assert meta["means2d"].shape == ((0, 2) if packed else (*shape, 2, n, 2))
+        if n:
+            renders.sum().backward()
+            assert not any(x.grad is not None and x.grad.any() for x in leaves)
+
+
+def test_features_of_no_width_in_a_batch():
+    gaussians, cameras = scene(dtype=torch.float32)
+    values = {name: torch.stack([getattr(gaussians, name)] * 2) for name in FIELDS} | {"colors": torch.zeros(2, 60, 0)}
+    views = {"viewmats": torch.stack([cameras.extrinsics] * 2), "Ks": torch.stack([cameras.intrinsics[:, :3, :3]] * 2)}
+    renders, _, _ = rasterization(**values, **views, width=32, height=24, render_mode="RGB+D")
+    assert renders.shape == (2, 2, 24, 32, 1)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value):
+    gaussians, cameras = scene(dtype=torch.float32)
+    turned = quaternion_to_rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
+    covars = turned @ turned.mT
+    rest = torch.arange(60) != 7
+    expected = call(gaussians[rest], cameras, covars=covars[rest], quats=None, scales=None)[0]
+    covars[7, 0, 1] = value
+    covars.requires_grad_()
+    renders = call(gaussians, cameras, covars=covars, quats=None, scales=None)[0]
+    assert torch.allclose(renders, expected, atol=1e-5)
+    renders.square().sum().backward()
+    assert not covars.grad[7].any()
+    assert covars.grad.isfinite().all()
+    assert covars.grad[rest].any()
+
+
+def test_covariances_are_read_from_their_upper_triangles():
+    gaussians, cameras = scene(dtype=torch.float32)
+    turned = quaternion_to_rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
+    covars = turned @ turned.mT
+    whole, upper = (call(gaussians, cameras, covars=x, quats=None, scales=None)[0] for x in (covars, covars.triu()))
+    assert torch.allclose(whole, upper, atol=1e-5)
+    assert torch.allclose(whole, call(gaussians, cameras)[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_second_backward_pass_sets_the_same_absolute_gradients(packed):
+    gaussians, cameras = scene(dtype=torch.float32)
+    renders, _, meta = call(leaves(gaussians)[0], cameras, absgrad=True, packed=packed)
+    renders.square().sum().backward(retain_graph=True)
+    first = meta["means2d"].absgrad.clone()
+    renders.square().sum().backward()
+    assert torch.equal(meta["means2d"].absgrad, first)
+
+
+@pytest.mark.usefixtures("torch_alone")
+@pytest.mark.parametrize(
+    "name", ["quats", "scales", "opacities", "colors", "viewmats", "Ks", "covars", "extra_signals"]
+)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
+def test_another_dtype_is_named(name, dtype):
+    gaussians, cameras = scene(dtype=torch.float32)
+    values = {name: getattr(gaussians, name) for name in FIELDS} | {"extra_signals": torch.rand(60, 2)}
+    values |= {
+        "viewmats": cameras.extrinsics,
+        "Ks": cameras.intrinsics[:, :3, :3],
+        "covars": torch.eye(3).expand(60, 3, 3),
+    }
+    with pytest.raises(TypeError, match=rf"^{name}: expected torch.float32 .* as means, got {dtype}"):
+        call(gaussians, cameras, **{name: values[name].to(dtype)})
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_a_render_keeps_no_more_than_it_needs():
+    """Without absolute gradients nothing of the call is alive after the backward pass but what meta holds."""
+    gaussians, cameras = scene(dtype=torch.float32)
+    renders, _, meta = call(leaves(gaussians)[0], cameras)
+    loss = renders.square().sum()
+    reference = weakref.ref(meta["means2d"])
+    loss.backward()
+    del renders, meta
+    assert reference() is None
+    assert loss > 0

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from kgs.model import GaussianModel
 
-_LARGEST = 1e6  # of a scale, in extents of the camera rig: a larger one means that the fit explodes
+# of a scale, in extents of the camera rig: a larger one means that the fit explodes, a hundred times in a few steps
+_LARGEST = 1e6
 _BOUND = 1e4  # extents: no photo tells a larger scale from this one
 
 

@@ -48,7 +48,7 @@ from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fau
 from .poses import MovingPoses, decayed
 from .targets import targets
 
-_LOOK = 20  # steps between looks at scales, and on a GPU for faults: reading a number waits until all work is done
+_LOOK = 20  # steps between limits of the scales, and on a GPU between looks for faults: a read waits for all work
 # for each parameter the name of its learning rate in the recipe, without `lr_`
 _LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
 

@@ -13,7 +13,7 @@ from kgs.stages import draw, project
 from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
 from .arguments import check_words, refuse
-from .meta import Pairs, joined
+from .meta import Pairs, joined, keep_absgrad
 from .scenes import Scene, batch_shape, split
 
 _FAR = 1e10  # gsplat's default far plane: no plane at all
@@ -74,13 +74,13 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     """Render N Gaussians in C cameras; a drop-in for `gsplat.rasterization` of gsplat 1.6, and of 1.5 by name.
 
     Differentiable in all tensors, `viewmats` and `Ks` included. Leading dimensions `...` are scenes of their own, of N
-    Gaussians and C cameras each. For near_plane, radius_clip, eps2d, tile_size, alpha_threshold, transmittance_stop and
-    max_bytes see :class:`kgs.RasterOptions`.
+    Gaussians and C cameras each. For near_plane, radius_clip, eps2d, alpha_threshold, transmittance_stop and max_bytes
+    see :class:`kgs.RasterOptions`.
 
-    segmented, macro_tile, channel_chunk, ut_params and renderer_config change nothing. sparse_grad, distributed,
-    with_ut, with_eval3d, global_z_order, rays, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs,
-    lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs and extra_signals_sh_degree are accepted only
-    at gsplat's defaults. The page "Coming from gsplat" has the differences, argument by argument.
+    tile_size, segmented, macro_tile, channel_chunk, ut_params and renderer_config change nothing. sparse_grad,
+    distributed, with_ut, with_eval3d, global_z_order, rays, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
+    ftheta_coeffs, lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs and extra_signals_sh_degree
+    are accepted only at gsplat's defaults. The page "Coming from gsplat" has the differences, argument by argument.
 
     Convention:
         World-to-camera matrices, OpenCV axes; quaternions w, x, y, z; the first pixel's centre at (0.5, 0.5).
@@ -99,18 +99,18 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         far_plane: Gaussians with z >= far_plane are left out; 1e10 or more: none are.
         sh_degree: degree 0 to 3 of the harmonics to use; K is at least (sh_degree + 1)^2. None: `colors` as they are.
         packed: the layout of `meta`, see below; it changes nothing else.
-        backgrounds: `(..., C, D)`, or None for 0; with extra signals `(..., C, D + E)`.
+        backgrounds: `(..., C, D)`, or None for 0; with extra signals `(..., C, D + E)`. Not used without colours.
         render_mode: "RGB" (the colours), "D" (sum of w z), "ED" (that over alpha), "RGB+D" or "RGB+ED".
         absgrad: `backward` also sets `meta["means2d"].absgrad`, see :class:`kgs.RasterOptions`.
         rasterize_mode: "classic", or "antialiased": see :class:`kgs.RasterOptions`.
         camera_model: "pinhole", "fisheye" (equidistant) or "ortho".
-        covars: covariances in place of `quats` and `scales`, `(..., N, 3, 3)`, see :func:`kgs.covariance.half_axes`.
+        covars: covariances in place of `quats` and `scales`, `(..., N, 3, 3)`: their upper triangles, see
+            :func:`kgs.covariance.half_axes`.
         return_normals: `meta["normals"]` are the sums of w times normal, `(..., C, H, W, 3)`; the normal is the third
             local axis, turned towards the camera, in world axes.
         extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, drawn into `meta["render_extra_signals"]`.
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
-        backend: "auto", "torch", or in float32 with tiles of 8 "numba" (on a CPU) or "triton" (on a GPU), see
-            `kgs.backends`.
+        backend: "auto", "torch", or in float32 "numba" (on a CPU) or "triton" (on a GPU), see `kgs.backends`.
 
     Returns:
         Renders `(..., C, H, W, D)`, where a depth is the last channel; alphas `(..., C, H, W, 1)`; and a dict `meta`.
@@ -158,7 +158,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     options = RasterOptions(
         tile_size=tile_size,
         near_plane=near_plane,
-        far_plane=math.inf if far_plane >= _FAR else far_plane,
+        far_plane=far_plane,
         radius_clip=radius_clip,
         eps2d=eps2d,
         antialiased=rasterize_mode == "antialiased",
@@ -167,6 +167,8 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         max_bytes=max_bytes,
         absgrad=absgrad,
     )
+    endless = options.far_plane >= _FAR
+    options = dataclasses.replace(options, tile_size=None, far_plane=math.inf if endless else options.far_plane)
     image = "RGB" in render_mode
     if image:
         check_tensor("colors", colors)
@@ -188,7 +190,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         projected[b] = dataclasses.replace(projected[b], means2d=rows - half)
         features = _features(scene, projected[b], render_mode.endswith("D"), return_normals)
         values = torch.cat(list(features.values()), 1)
-        keep = pairs.keeper(means2d, b)
+        keep = keep_absgrad(means2d, pairs.places(b)) if absgrad else None
         drawn.append(draw(projected[b], values, options, backend=backend, keep_absgrad=keep))
     transmittance = joined([x.transmittance for x in drawn])
     widths = [x.shape[1] for x in features.values()]

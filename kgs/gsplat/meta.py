@@ -17,6 +17,17 @@ def joined(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
+def keep_absgrad(means2d: Tensor, places: Tensor | slice) -> Callable[[Tensor], None]:
+    """What puts absolute gradients where gsplat has them: in `means2d.absgrad`, at some of its rows."""
+
+    def keep(absolute: Tensor) -> None:
+        if not hasattr(means2d, "absgrad"):
+            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
+        means2d.absgrad.view(-1, 2)[places] = absolute  # type: ignore[attr-defined]
+
+    return keep
+
+
 class Pairs:
     """The pairs (camera, Gaussian) of all scenes, and how a value of each pair lies in gsplat's tensors.
 
@@ -43,21 +54,11 @@ class Pairs:
             tensor = tensor.reshape(self.total, *tensor.shape[len(self.shape) :]).index_select(0, self.ids)
         return list(tensor.split(self.counts))
 
-    def keeper(self, means2d: Tensor, b: int) -> Callable[[Tensor], None]:
-        """What puts the absolute gradients of a scene where gsplat has them: in `means2d.absgrad`."""
+    def places(self, b: int) -> Tensor | slice:
+        """Where the pairs of a scene lie among all rows of a tensor in gsplat's layout."""
         begin = sum(self.counts[:b])
-
-        def keep(absolute: Tensor) -> None:
-            if not hasattr(means2d, "absgrad"):
-                means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
-            rows = slice(begin, begin + self.counts[b])
-            flat = means2d.absgrad.view(-1, 2)  # type: ignore[attr-defined]
-            if self.packed:
-                flat[rows] = absolute
-            else:
-                flat[self.ids[rows]] = absolute
-
-        return keep
+        rows = slice(begin, begin + self.counts[b])
+        return rows if self.packed else self.ids[rows]
 
     def meta(self, means2d: Tensor) -> dict[str, Any]:
         """What gsplat says of the pairs."""
