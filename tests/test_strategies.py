@@ -110,17 +110,23 @@ def _in_float64():
     ],
 )
 def test_default_strategy_trains_as_on_gsplats_projection(packed, absgrad, steps):
-    """It splits, duplicates, prunes by opacity and by size in the image: with the same numbers of Gaussians."""
+    """It splits, duplicates, prunes by opacity and by size in the image, resets: the same numbers of Gaussians."""
     rules = {"refine_start_iter": 5, "refine_every": steps // 12, "refine_scale2d_stop_iter": steps, "reset_every": 30}
     rules |= {"grow_grad2d": 0.02 if absgrad else 0.008, "grow_scale2d": 0.6, "prune_scale2d": 0.9, "prune_opa": 0.3}
+
+    def reset(params, optimizers, state, step):  # in 1.5.3 the strategy's own condition is never true
+        if step % (steps // 3) == steps // 6:
+            ops.reset_opa(params, optimizers, state, value=0.6)
 
     def own_step(params, optimizers, state, step, info):
         if absgrad:
             info["means2d"].absgrad = info["centres"].grad.abs().sum(2)
         strategy.step_post_backward(params, optimizers, state, step, info)
+        reset(params, optimizers, state, step)
 
-    def kgs_step(*arguments):
-        strategy.step_post_backward(*arguments, packed=packed)
+    def kgs_step(params, optimizers, state, step, info):
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
+        reset(params, optimizers, state, step)
 
     strategy = strategies.DefaultStrategy(absgrad=absgrad, **rules)
     expected, losses, wanted = train(strategy, own_render, steps, own_step)
