@@ -174,8 +174,8 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         check_tensor("colors", colors)
     else:
         colors, sh_degree, backgrounds = None, None, None
-    batch, count, n = batch_shape(means, viewmats)
-    seen = (viewmats, Ks, (height, width), camera_model, pixel_centers)
+    batch, count, n = shape = batch_shape(means, viewmats)
+    seen = (viewmats, Ks, (height, width), camera_model, pixel_centers, shape)
     scenes = split(means, quats, scales, covars, opacities, colors, extra_signals, sh_degree, *seen)
     projected = [
         project(s.gaussians, s.cameras, options=options, colors=bool(s.shared), backend=backend) for s in scenes

@@ -67,9 +67,10 @@ def split(
     size: tuple[int, int],
     lens: str,
     pixel_centers: str,
+    shape: tuple[tuple[int, ...], int, int],
 ) -> list[Scene]:
-    """The scenes, one after the other; see `kgs.rasterization` for the arguments."""
-    batch, count, n = batch_shape(means, viewmats)
+    """The scenes, one after the other; see `kgs.rasterization` for the arguments, `batch_shape` for the last."""
+    batch, count, n = shape
     flat = partial(_flat, batch=batch, like=means)
     if covars is None:
         quats, scales = flat("quats", quats, (n, 4)), flat("scales", scales, (n, 3))
