@@ -1,15 +1,17 @@
 """The layer and kgs's call in other people's trainers: in the projects' own functions that render.
 
-What docs/gsplat.md changes there is changed here; the lines that set the progress and switch the layer off belong into
-other functions, and are done by hand. nerfstudio's file comes from its wheel; those of gsplat's examples and of the
-paper's release from clones in the folder KGS_PEERS (gsplat, DropGaussian_release). CUDA is replaced.
+What docs/gsplat.md changes there is changed here. nerfstudio's file comes from its wheel; those of gsplat's examples
+and of the paper's release from clones in the folder KGS_PEERS (gsplat, DropGaussian_release). CUDA is replaced, and
+what else a function needs of its project.
 """
 
 import ast
+import json
 import math
 import os
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +19,9 @@ from typing import Any
 
 import pytest
 import torch
+import tqdm
 from factories import random_camera, random_gaussians
+from kornia.metrics import ssim
 
 import kgs
 
@@ -88,27 +92,91 @@ def check_drops(draw, drop, expected):
     assert torch.allclose(draw(), expected, atol=1e-5)
 
 
-def test_gsplats_simple_trainer():
+STEPS = 150
+
+
+def trainer(tmp_path):
+    """gsplat's Runner for three photos of random Gaussians: what its __init__ makes, with the layer in it."""
+    strategies = pytest.importorskip("gsplat.strategy")
+    strategy = strategies.DefaultStrategy(absgrad=True, refine_start_iter=10, refine_stop_iter=40, refine_every=20)
     source = peer("gsplat", "examples", "simple_trainer.py")
-    assert 'torch.sigmoid(self.splats["opacities"])' in source
-    line = next(x for x in source.splitlines() if 'opacities = torch.sigmoid(self.splats["opacities"])' in x)
-    own = {line.strip(): f"{line.split('#')[0].strip()}\n    opacities = self.drop(opacities)"}
-    strategy = pytest.importorskip("gsplat.strategy").DefaultStrategy
-    names = {"rasterization": kgs.rasterization, "DefaultStrategy": strategy}
+    names = {"rasterization": kgs.rasterization, "DefaultStrategy": strategies.DefaultStrategy}
+    activate = 'opacities = torch.sigmoid(self.splats["opacities"])  # [N,]\n'
+    own = {activate: f"{activate}    opacities = self.drop(opacities)\n"}
     rasterize_splats = function(source, "rasterize_splats", own, names)
+    names |= {"F": torch.nn.functional, "json": json, "time": time, "tqdm": tqdm}
+    names["yaml"] = SimpleNamespace(dump=lambda values, file: None)
+    names["fused_ssim"] = lambda image, photo, padding: ssim(image, photo, 11, padding=padding).mean()
+    on = "        # forward\n"
+    off = "        if renders.shape[-1] == 4:\n"
+    own = {on: f"        self.drop.progress = (step + 1) / max_steps\n        self.drop.train()\n{on}"}
+    own |= {off: f"        self.drop.eval()\n{off}"}
+    train = function(source, "train", own, names)
+
     gaussians, camera, k = scene()
     splats = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales.log()}
     splats |= {"opacities": gaussians.opacities.logit(), "sh0": gaussians.colors[:, :1], "shN": gaussians.colors[:, 1:]}
-    config = dict.fromkeys(("app_opt", "packed", "sparse_grad", "with_ut", "with_eval3d", "antialiased"), False)
-    config |= {"camera_model": "pinhole", "post_processing": None, "strategy": strategy(absgrad=True)}
-    drop = kgs.DropGaussian(p=0.2)
-    runner = SimpleNamespace(splats=splats, cfg=SimpleNamespace(**config), world_size=1, device="cpu", drop=drop)
+    splats = torch.nn.ParameterDict({name: value.clone() for name, value in splats.items()})
+    off = "app_opt packed sparse_grad visible_adam with_ut with_eval3d antialiased random_bkgd depth_loss pose_opt"
+    off += " pose_noise save_ply opacity_reg scale_reg tb_every"
+    config = dict.fromkeys(off.split(), False) | dict.fromkeys(("post_processing", "compression"))
+    config |= {"camera_model": "pinhole", "near_plane": 0.01, "far_plane": 1e10, "disable_viewer": True}
+    config |= {"sh_degree": 1, "sh_degree_interval": 20, "ssim_lambda": 0.2, "strategy": strategy}
+    config |= {"max_steps": STEPS, "batch_size": 1, "result_dir": tmp_path}
+    config |= {"eval_steps": [STEPS // 2], "save_steps": [], "ply_steps": []}
+    fields = {"splats": splats, "cfg": SimpleNamespace(**config), "device": "cpu", "world_rank": 0, "world_size": 1}
+    fields |= {"stats_dir": tmp_path, "ckpt_dir": tmp_path, "post_processing_module": None}
+    fields |= dict.fromkeys(("pose_optimizers", "app_optimizers", "post_processing_optimizers"), ())
+    fields |= {"strategy_state": strategy.initialize_state(scene_scale=1.0), "render_traj": lambda step: None}
+    runner = SimpleNamespace(**fields, drop=kgs.DropGaussian(p=0.2, seed=0).eval())
+    runner.rasterize_splats = lambda *args, **options: rasterize_splats(runner, *args, **options)
+    runner.train = lambda: train(runner)
+    runner.optimizers = {name: torch.optim.Adam([value], lr=0.01) for name, value in splats.items()}
+    return runner, (gaussians, camera, k)
+
+
+def test_gsplats_simple_trainer_draws(tmp_path):
+    runner, (gaussians, camera, k) = trainer(tmp_path)
     poses = camera.extrinsics.inverse()
 
     def draw():
-        return rasterize_splats(runner, poses, k, SIZE[1], SIZE[0], sh_degree=1)[0]
+        return runner.rasterize_splats(poses, k, SIZE[1], SIZE[0], sh_degree=1)[0]
 
-    check_drops(draw, drop, as_is(gaussians, camera, k))
+    check_drops(draw, runner.drop, as_is(gaussians, camera, k))
+
+
+def test_gsplats_simple_trainer_trains(tmp_path, monkeypatch):
+    loader = torch.utils.data.DataLoader
+    monkeypatch.setattr(torch.utils.data, "DataLoader", lambda views, shuffle, **_: loader(views, shuffle=shuffle))
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 0)
+    torch.manual_seed(0)
+    runner, (gaussians, camera, k) = trainer(tmp_path)
+    runner.trainset = []
+    for i, shift in enumerate((-0.1, 0.0, 0.1)):
+        pose = camera.extrinsics[0].inverse()
+        pose[0, 3] += shift
+        moved = SimpleNamespace(extrinsics=pose.inverse()[None])
+        view = {"camtoworld": pose, "K": k[0], "image": 255 * as_is(gaussians, moved, k)[0]}
+        runner.trainset.append(view | {"image_id": i, "camera_idx": 0})
+    photo, pose = runner.trainset[1]["image"] / 255, runner.trainset[1]["camtoworld"]
+    with torch.no_grad():
+        runner.splats["sh0"].add_(torch.randn_like(runner.splats["sh0"]))
+
+    def error():
+        with torch.no_grad():
+            image = runner.rasterize_splats(pose[None], k, SIZE[1], SIZE[0], sh_degree=1)[0][0]
+        return torch.nn.functional.mse_loss(image, photo).item()
+
+    evaluated = []
+    runner.eval = lambda step: evaluated.append((step, runner.drop.training, runner.drop.rate))
+    before = error()
+    runner.train()
+    assert error() < before / 4
+    assert len(runner.splats["means"]) != 60
+    assert evaluated == [(STEPS // 2 - 1, False, pytest.approx(0.1))]
+    assert (tmp_path / f"ckpt_{STEPS - 1}_rank0.pt").exists()
+    assert runner.drop.rate == pytest.approx(0.2)
 
 
 class Tensor(torch.Tensor):
@@ -122,7 +190,9 @@ def test_splatfacto(splatfacto):
     call = "opacities=torch.sigmoid(opacities_crop).squeeze(-1),"
     own = {call: "opacities=self.drop(torch.sigmoid(opacities_crop).squeeze(-1)),"}
     assert "def populate_modules(self):" in splatfacto
-    assert "        self.step = step\n" in splatfacto
+    start = "self.step = step\n"
+    own_step = {start: f"{start}    self.drop.progress = min(1.0, step / 30_000)\n"}
+    step_cb = function(splatfacto, "step_cb", own_step, {})
     names = {"rasterization": kgs.rasterization, "get_viewmat": lambda pose: pose, "Cameras": SimpleNamespace}
     names |= dict.fromkeys(("Dict", "List", "Union"), dict)
     get_outputs = function(splatfacto, "get_outputs", own, names)
@@ -147,6 +217,8 @@ def test_splatfacto(splatfacto):
     depth = as_is(gaussians, camera, k, render_mode="RGB+ED")[0, ..., 3:]
     assert torch.allclose(get_outputs(model, view)["depth"], depth, atol=1e-4)
     assert model.info["means2d"].shape == (1, 60, 2)
+    step_cb(model, SimpleNamespace(optimizers={}), 15_000)
+    assert drop.progress == 0.5
 
 
 def test_the_papers_release():
