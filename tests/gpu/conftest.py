@@ -1,5 +1,6 @@
 """Triton's kernels in its interpreter, where there is no GPU: `tests/conftest.py` has turned that on."""
 
+import dataclasses
 import os
 from contextlib import suppress
 
@@ -17,13 +18,36 @@ def _interpreted() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _scans_by_rows():
-    """The interpreter scans element by element, which takes most of the time: here it scans row by row."""
-    with pytest.MonkeyPatch.context() as patch:
-        with suppress(ImportError, AttributeError):  # of another version: slow
-            from triton.runtime.interpreter import ScanOps
+def _fast_interpreter():
+    """Without what takes most of the interpreter's time; on another version of Triton as slow as it is.
 
-            patch.setattr(ScanOps, "generic_scan", _scan)
+    It scans element by element, here row by row. It searches Triton's language for what to replace in each call of a
+    function that a kernel calls, here once in each launch for each module. It looks for integers that overflow, and
+    does nothing about them.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        with suppress(ImportError, AttributeError):
+            from triton.runtime import interpreter
+
+            patch.setattr(interpreter.ScanOps, "generic_scan", _scan)
+            options = dataclasses.replace(interpreter.interpreter_builder.options, sanitize_overflow=False)
+            patch.setattr(interpreter.interpreter_builder, "options", options)
+            replace, launch, modules = interpreter._patch_lang, interpreter.GridExecutor.__call__, set()
+            nothing = interpreter._LangPatchScope
+
+            def replace_once(function):
+                module = id(function.__globals__)
+                if module in modules:
+                    return nothing()
+                modules.add(module)
+                return replace(function)
+
+            def first(self, *arguments, **options):
+                modules.clear()
+                return launch(self, *arguments, **options)
+
+            patch.setattr(interpreter, "_patch_lang", replace_once)
+            patch.setattr(interpreter.GridExecutor, "__call__", first)
         yield
 
 
