@@ -3,7 +3,7 @@
 The derivative is closed form for pinhole and orthographic cameras and two reverse passes through Kornia's `project`
 for distorted ones. Far outside the field of view the first-order footprint is meaningless and grows without bound;
 as in gsplat, it is therefore evaluated at a point clamped to 15 % of the image size beyond its borders (perspective
-models without a wide-angle mapping only). The limits are constants; the gradient follows the clamp exactly.
+models without a wide-angle mapping only). The gradient follows the clamp exactly, that of the lens its limits too.
 
 A distorted lens sees only up to the angle where the radius in the image stops growing: what lies beyond this fold of
 the radial polynomial is not drawn.
@@ -280,8 +280,7 @@ def whole_frame(size: tuple[int, int]) -> Frame:
 
 
 def tangent_limits(focal: Tensor, centre: Tensor, frame: Frame) -> Tensor:
-    """Limits of x/z and y/z as rows (lower, upper), `(2, 2)`, without gradient; focal lengths may be negative."""
-    focal, centre = focal.detach(), centre.detach()
+    """Limits of x/z and y/z as rows (lower, upper), `(2, 2)`; focal lengths may be negative."""
     begin, end = focal.new_tensor([frame[:2], frame[2:]])
     margin = MARGIN * (end - begin)
     first, last = -(centre - begin + margin) / focal, (end - centre + margin) / focal

@@ -54,7 +54,8 @@ def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussian
     with torch.no_grad():
         means, away = gaussians.means.index_select(0, ids), []
         for c, lens in enumerate(lenses(cameras, projected.image_size)):
-            away.append(_directions(_rows(means, (projected.camera_ids == c).nonzero()[:, 0]), lens))
+            seen = _rows(means, (projected.camera_ids == c).nonzero()[:, 0])
+            away.append(view_directions(seen, lens.extrinsics, lens.parallel))
         backwards = (normal * torch.cat(away)).sum(1, keepdim=True) > 0
     return torch.where(backwards, -normal, normal)
 
@@ -100,7 +101,7 @@ def _project_one(
     ids, radii = _rows(ids, kept), _rows(radii, kept)
     rgb = _rows(gaussians.colors, ids) if colors else means.new_zeros(ids.shape[0], 0)
     if rgb.ndim == 3:
-        rgb = evaluate_harmonics(rgb, _directions(_rows(means, kept), lens))
+        rgb = evaluate_harmonics(rgb, view_directions(_rows(means, kept), lens.extrinsics, lens.parallel))
     projected = (_rows(x, kept) for x in (means2d, factors, points[:, 2]))
     return ids, *projected, radii, _rows(opacities, ids), rgb
 
@@ -129,24 +130,28 @@ def _touches_image(
     return seen & (det > 0), torch.ceil(3.0 * largest.sqrt()), ~torch.isfinite(det + largest + x + y)
 
 
-def _directions(means: Tensor, lens: Lens) -> Tensor:
-    """Unit vectors from the camera to the Gaussians, world axes; the pose may be scaled or sheared."""
-    inverse, turned = inverse_turn(lens.extrinsics)
-    if lens.parallel and turned:
-        return inverse[:, 2].expand_as(means)
-    camera = times(inverse, lens.extrinsics[:3, 3])
-    offsets = inverse[:, 2].expand_as(means) if lens.parallel else means + camera
+def view_directions(means: Tensor, extrinsics: Tensor, parallel: bool = False) -> Tensor:
+    """Unit vectors from a camera to the Gaussians, or along its parallel rays, `(N, 3)` in world axes.
+
+    The pose may be scaled or sheared.
+    """
+    inverse = _inverse(extrinsics[:3, :3])
+    offsets = inverse[:, 2].expand_as(means) if parallel else means + times(inverse, extrinsics[:3, 3])
     offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # the squares of 1e20 would overflow
     unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return unit
 
 
-def inverse_turn(extrinsics: Tensor) -> tuple[Tensor, bool]:
-    """The inverse of a pose's 3x3 block, and whether that is a rotation, whose inverse is its transpose."""
-    rotation = extrinsics[:3, :3]
-    product = times(rotation.detach(), rotation.detach())
-    turned = bool(((product - torch.diag_embed(product.new_ones(3))).abs() <= 1e-3).all())
-    return rotation.T if turned else torch.linalg.inv(rotation), turned
+def _inverse(matrix: Tensor) -> Tensor:
+    """The inverse of a 3x3 matrix by its cofactors; elementwise, as :func:`kgs.camera.times`."""
+    scale = matrix.detach().abs().amax()  # the products of small numbers would vanish
+    x, y, z = (matrix / scale).unbind()
+    cofactors = torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)
+    determinant = (x * cofactors[0]).sum()
+    if not bool(scale) or not bool(determinant):
+        raise ValueError("extrinsics: expected poses whose 3x3 block has an inverse, got one of determinant 0")
+    inverse: Tensor = torch.stack(cofactors, 1) / determinant / scale
+    return inverse
 
 
 def finite_gaussians(gaussians: Gaussians) -> Tensor:

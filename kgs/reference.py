@@ -122,9 +122,7 @@ def layers(
     transmittance = torch.cat([torch.ones(1, height, width).to(alphas), torch.cumprod(1 - alphas, 0)])
     transmittance = torch.where(transmittance >= transmittance_stop, transmittance, 0.0)
     if colors.ndim == 3:
-        turned = torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), rtol=0, atol=1e-3)
-        inverse = rotation.T if turned else torch.linalg.inv(rotation)
-        directions = torch.nn.functional.normalize(means + inverse @ translation, dim=1)
+        directions = torch.nn.functional.normalize(means + torch.linalg.inv(rotation) @ translation, dim=1)
         colors = torch.einsum("lk,lkc->lc", _harmonics(directions, colors.shape[1]), colors) + 0.5
         colors = colors.masked_fill(colors < 0, 0.0)
     return Layers(alphas * transmittance[:-1], transmittance[-1], colors, points[:, 2], order, responses)
@@ -133,7 +131,7 @@ def layers(
 def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
     """Derivative of the pixel, with x/z and y/z limited to 15 % of the image size beyond its borders."""
     size = torch.tensor([width, height]).to(points)
-    focal, centre = intrinsics.detach().diagonal()[:2], intrinsics.detach()[:2, 2]
+    focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
     ends = torch.stack([(-0.5 - centre - 0.15 * size) / focal, (size - 0.5 - centre + 0.15 * size) / focal])
     tangents = torch.clamp(points[:, :2] / points[:, 2:], ends.amin(0), ends.amax(0))
     plane = torch.cat([torch.eye(2).to(points).expand(len(points), 2, 2), -tangents[:, :, None]], 2)

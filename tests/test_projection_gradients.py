@@ -113,13 +113,21 @@ def inner(gaussians):
     return replace(gaussians, means=gaussians.means * torch.tensor([0.5, 0.5, 1.0], dtype=torch.float64))
 
 
-def test_gradcheck_with_respect_to_extrinsics_and_intrinsics():
+@pytest.mark.parametrize("beyond", [0, 3])
+def test_gradcheck_with_respect_to_extrinsics_and_intrinsics(beyond):
+    """Also of Gaussians beyond the limits of the Jacobian, which follow the intrinsics."""
     gaussians, cameras = scene(3, 2, cameras=2)
+    means = inner(gaussians).means
+    means[:beyond] += torch.tensor([[-7.0, 0, 0], [0, 4.5, 0], [6.0, -5.0, 0]], dtype=torch.float64)[:beyond]
+    gaussians = replace(gaussians, means=means, scales=gaussians.scales * (20 if beyond else 1))
     cameras.intrinsics[:, 0, 1] = 2.0
+    tangents = means[:, :2] / means[:, 2:]
+    assert ((tangents.abs() > 1.3 * 32 / cameras.intrinsics[0, 0, 0]).any(1)).sum() == beyond
+    assert len(project(gaussians, cameras)) == 6
     leaves = [cameras.extrinsics.clone().requires_grad_(), cameras.intrinsics.clone().requires_grad_()]
 
     def run(extrinsics, intrinsics):
-        return packed(inner(gaussians), PinholeCamera(intrinsics, extrinsics, cameras.height, cameras.width))
+        return packed(gaussians, PinholeCamera(intrinsics, extrinsics, cameras.height, cameras.width))
 
     assert torch.autograd.gradcheck(run, leaves, atol=1e-6)
 

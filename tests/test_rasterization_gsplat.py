@@ -16,11 +16,13 @@ SIZE = (24, 32)  # height, width
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 
 
-def scene(seed=0, n=50, cameras=2, sh_degree=None):
-    """A scene with gsplat's names, in float64; opacities below the clamps of both."""
+def scene(seed=0, n=50, cameras=2, sh_degree=None, spread=0.5):
+    """A scene with gsplat's names, in float64; opacities below the clamps of both.
+
+    A spread of 1 fills the image; with less no footprint ends beside it, where what is seen differs in the last digits.
+    """
     gaussians = random_gaussians(n, seed, torch.float64, sh_degree, max(SIZE), opacities=(0.05, 0.9))
-    gaussians.means[:, :2] *= 0.5  # not so far beside the image that their footprints are clamped: the limits are
-    # constants in kgs, and gsplat's torch code derives them by the intrinsics
+    gaussians.means[:, :2] *= spread
     views = batch(*(random_camera(*SIZE, seed + c, torch.float64) for c in range(cameras)))
     k = views.intrinsics[:, :3, :3].clone()
     k[:, :2, 2] += 0.5
@@ -37,10 +39,9 @@ def ours(values, **options):
 
 
 def gradients(values):
-    """Those that both define: of a pose by turns and shifts, of a lens by focal lengths and centre."""
+    """Those that both define: of a pose without its last row, of a lens by focal lengths and centre."""
     found = {name: value.grad for name, value in values.items() if value.grad is not None}
-    turns = found["viewmats"][:, :3, :3] @ values["viewmats"][:, :3, :3].detach().mT
-    found["viewmats"] = torch.cat([turns - turns.mT, found["viewmats"][:, :3, 3:]], 2)
+    found["viewmats"] = found["viewmats"][:, :3]
     found["Ks"] = found["Ks"] * torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     return found
 
@@ -93,6 +94,45 @@ def test_modes_with_backgrounds(mode, packed):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_harmonics(degree):
     compare(scene(sh_degree=degree), sh_degree=degree)
+
+
+@pytest.mark.parametrize("camera_model", ["fisheye", "ortho"])
+def test_harmonics_are_seen_from_the_centre_through_every_lens(camera_model):
+    values = scene(sh_degree=2)
+    if camera_model == "ortho":
+        values["Ks"][:, :2, :2] /= 4
+    extra = torch.rand(50, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    compare(values, sh_degree=2, camera_model=camera_model)
+    values = {name: value.float() for name, value in values.items()}
+    values["colors"][7, 1, 2] = torch.nan
+    renders, _, meta = ours(values, sh_degree=2, camera_model=camera_model, extra_signals=extra.float())
+    assert renders.isfinite().all()
+    assert 7 not in meta["gaussian_ids"]
+    kept = {name: value[torch.arange(50) != 7] if len(value) == 50 else value for name, value in values.items()}
+    rest = extra[torch.arange(50) != 7].float()
+    again, _, other = ours(kept, sh_degree=2, camera_model=camera_model, extra_signals=rest)
+    assert torch.allclose(renders, again, atol=1e-6)
+    assert torch.allclose(meta["render_extra_signals"], other["render_extra_signals"], atol=1e-6)
+
+
+def test_gaussians_beyond_the_limits_of_the_jacobian():
+    """The limits follow the lens, and so do its gradients."""
+    values = scene(spread=1.0)
+    values["means"][:6, 0] = torch.tensor([-5.5, 4.0, -5.0, 5.0, -4.5, 4.5])
+    values["scales"][:6] = 1.0
+    _, own, _ = compare(values)
+    point = values["means"][:6] @ values["viewmats"][0, :3, :3].mT + values["viewmats"][0, :3, 3]
+    assert (values["Ks"][0, 0, 0] * point[:, 0] / point[:, 2]).abs().min() > 1.3 * SIZE[1] / 2
+    assert own["Ks"].grad[:, 0, 0].any()
+
+
+def test_poses_that_are_rounded_scaled_or_sheared():
+    values = scene(sh_degree=2)
+    for change in (torch.eye(3) * 1.0004, torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.9, -0.1], [0.1, 0.0, 1.2]])):
+        moved = values["viewmats"].clone()
+        moved[:, :3, :3] = change.double() @ moved[:, :3, :3]
+        compare(values | {"viewmats": moved}, sh_degree=2)
+    compare(values | {"viewmats": (values["viewmats"] * 1e4).round() / 1e4}, sh_degree=2)
 
 
 def test_what_lies_behind_the_far_plane_or_is_too_small_is_not_drawn():

@@ -192,7 +192,7 @@ def test_gradient_follows_the_tangent_clamp(fraction):
     assert torch.autograd.gradcheck(image, inputs, eps=1e-6, atol=1e-7)
 
 
-def test_tangent_limits_are_constants_for_the_gradient():
+def test_the_gradient_of_the_lens_follows_the_tangent_limits():
     camera = pinhole(6, 6, 8, centre=(1.5, 3.0))
     gaussian = one([4.0, 0.3, 2.0], [0.9, 0.6, 1.2])  # beyond the right limit
 
@@ -200,18 +200,12 @@ def test_tangent_limits_are_constants_for_the_gradient():
         return layers(gaussian, posed(camera, intrinsics=intrinsics), **EXACT).responses[0]
 
     intrinsics = camera.intrinsics[0].clone().requires_grad_()
-    value = response(intrinsics)
-    value[3, 4].backward()
-    # the centre alone shifts the image; log o G is quadratic in the pixel, so that central differences are exact
-    log = value.detach().log()
-    slope = tensor((log[3, 5] - log[3, 3]) / 2, (log[4, 4] - log[2, 4]) / 2)
-    torch.testing.assert_close(intrinsics.grad[:2, 2], -value.detach()[3, 4] * slope, rtol=1e-10, atol=0)
-    # along this line of focal length and centre the limit stays where it is
-    line = torch.zeros_like(camera.intrinsics[0])
-    line[0, 0], line[0, 2] = 1.0, -(6 - 0.5 - 1.5 + 0.15 * 6) / 8
-    step = 1e-5
-    difference = response(camera.intrinsics[0] + step * line) - response(camera.intrinsics[0] - step * line)
-    torch.testing.assert_close((intrinsics.grad * line).sum(), difference[3, 4] / (2 * step), rtol=1e-7, atol=0)
+    response(intrinsics)[3, 4].backward()
+    for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)):
+        step = torch.zeros_like(camera.intrinsics[0])
+        step[row, column] = 1e-5
+        difference = response(camera.intrinsics[0] + step) - response(camera.intrinsics[0] - step)
+        torch.testing.assert_close(intrinsics.grad[row, column], difference[3, 4] / 2e-5, rtol=1e-7, atol=1e-9)
 
 
 def test_gradients_obey_the_invariances():

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from kgs.camera import Cameras, PosedCamera, pinhole_cameras
 from kgs.covariance import half_axes
+from kgs.harmonics import evaluate_harmonics
+from kgs.projection import view_directions
 from kgs.types import SH_SIZES, Gaussians, ProjectedGaussians, check_tensor
 
 
@@ -24,16 +26,26 @@ class Scene:
     cameras: Cameras
     shared: dict[str, int]  # which these are, and how wide, or {"image": 3}
     own: dict[str, Tensor]  # other features, (N, D), or one set per camera (C, N, D)
+    harmonics: Tensor | None = None  # (N, K, 3), if they are seen from the cameras' centres though rays are parallel
 
     def features_of(self, projected: ProjectedGaussians) -> dict[str, Tensor]:
         """Image and extra signals of what is drawn, `(M, D)` each."""
         found = dict(zip(self.shared, projected.colors.split(list(self.shared.values()), 1), strict=True))
+        if self.harmonics is not None:
+            found["image"] = self._seen_from_centres(self.harmonics, projected)
         for name, values in self.own.items():
             ids = projected.gaussian_ids
             if values.ndim == 3:
                 ids, values = projected.camera_ids * len(self.gaussians) + ids, values.flatten(0, 1)
             found[name] = values.index_select(0, ids)
         return {name: found[name] for name in ("image", "extra") if name in found}
+
+    def _seen_from_centres(self, harmonics: Tensor, projected: ProjectedGaussians) -> Tensor:
+        ids, directions = projected.gaussian_ids, []
+        for c, pose in enumerate(self.cameras.extrinsics):
+            means = self.gaussians.means.index_select(0, ids[projected.camera_ids == c])
+            directions.append(view_directions(means, pose))
+        return evaluate_harmonics(harmonics.index_select(0, ids), torch.cat(directions))
 
 
 def batch_shape(means: Any, viewmats: Any) -> tuple[tuple[int, ...], int, int]:
@@ -93,13 +105,16 @@ def split(
     scenes = []
     for b in range(math.prod(batch)):
         own = {kind: x[b] for kind, x in plain.items() if kind not in shared}
-        if harmonics is None:
+        bands = None if harmonics is None else harmonics[b if len(harmonics) > 1 else 0]
+        if bands is None or lens == "ortho":
             drawn, widths = torch.cat([means[b, :, :0], *(plain[kind][b] for kind in shared)], 1), shared
         else:
-            drawn, widths = harmonics[b if len(harmonics) > 1 else 0], {"image": 3}
-        gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], own), drawn)
+            drawn, widths = bands, {"image": 3}
+        centred = bands if lens == "ortho" else None  # gsplat sees harmonics from the centre through every lens
+        known = [*own.values(), *([] if centred is None else [centred.flatten(1)])]
+        gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], known), drawn)
         cameras = _cameras(viewmats[b], intrinsics[b], size, lens, pixel_centers)
-        scenes.append(Scene(gaussians, cameras, widths, own))
+        scenes.append(Scene(gaussians, cameras, widths, own, centred))
     return scenes
 
 
@@ -119,7 +134,7 @@ def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: in
     if sh_degree is None:
         return None
     if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
-        raise ValueError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree}")
+        raise ValueError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree!r}")
     check_tensor("colors", colors, like, " as means")
     least, shape = SH_SIZES[sh_degree], tuple(colors.shape)
     if shape[:-2] not in ((n,), (*batch, n)) or shape[-2] < least or shape[-1] != 3:
@@ -130,9 +145,9 @@ def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: in
     return used
 
 
-def _drop_broken(opacities: Tensor, own: dict[str, Tensor]) -> Tensor:
-    """The opacities, NaN for Gaussians with a feature of a camera that is not finite: none sees them."""
-    for values in own.values():
+def _drop_broken(opacities: Tensor, features: list[Tensor]) -> Tensor:
+    """The opacities, NaN for Gaussians with a feature that is not finite: no camera sees them."""
+    for values in features:
         finite = values.detach().isfinite().all(-1)
         opacities = opacities.masked_fill(~(finite if values.ndim == 2 else finite.all(0)), torch.nan)
     return opacities

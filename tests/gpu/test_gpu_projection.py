@@ -104,6 +104,7 @@ def test_poses_that_are_scaled_or_sheared(handed_over):
         pose = cameras.extrinsics[0].clone()
         pose[:3, :3] = change @ pose[:3, :3]
         assert_alike(gaussians, with_camera(cameras, extrinsics=pose), "triton")
+        assert_camera_gradients(gaussians, with_camera(cameras, extrinsics=pose), "triton", ("pose", "lens"))
     assert not handed_over
 
 
@@ -119,11 +120,14 @@ def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
     gaussians, cameras = wide_scene()
     bent = cameras.intrinsics[0].clone()
     bent[2, 0] = 0.1
-    pose = (cameras.extrinsics[0] * torch.tensor([1.7, 1.7, 1.7, 1.0])[:, None]).requires_grad_()
+    flat = cameras.extrinsics[0].clone()
+    flat[2, :3] = 0.0
     lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), cameras.extrinsics)
-    for camera in (with_camera(cameras, intrinsics=bent), with_camera(cameras, extrinsics=pose), lens):
+    for camera in (with_camera(cameras, intrinsics=bent), lens):
         got, expected = (project(gaussians, camera, backend=backend) for backend in ("triton", "torch"))
         assert torch.equal(got.means2d, expected.means2d)
+    with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
+        project(gaussians, with_camera(cameras, extrinsics=flat), backend="triton")
     assert len(handed_over) == 3
     assert len(project(gaussians[:0], cameras, backend="triton")) == 0
     assert len(handed_over) == 4

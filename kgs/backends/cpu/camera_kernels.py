@@ -11,9 +11,9 @@ def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, grad
     """From gradients of what a camera sees, a range of its list, to those of its matrices, one row for each Gaussian.
 
     `ids` and `gradients` are those of :func:`.projection_kernels.footprint_gradients`. Written are `found` `(M, 21)`:
-    world to camera `(3, 4)`, then the intrinsics `(3, 3)`. The 3x3 block of the pose is a rotation.
+    world to camera `(3, 4)`, then the intrinsics `(3, 3)`.
     """
-    v, k, limits, centre = camera
+    v, k, limits, back, centre = camera
     g_means2d, g_factors, g_depths, _, g_rgb = gradients
     bands = colors.shape[1] // 3 if g_rgb.shape[1] else 0
     b, h, none = np.empty(16, np.float32), np.empty(16, np.float32), np.empty((0, 0), np.float32)
@@ -33,10 +33,17 @@ def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, grad
         px, py = (k[0, 0] * x + k[0, 1] * y) * inverse + k[0, 2], (k[1, 0] * x + k[1, 1] * y) * inverse + k[1, 2]
         across = g_mean[0] * inverse, g_mean[1] * inverse, -(g_mean[0] * px + g_mean[1] * py) * inverse
         for i in range(3):
+            turned = back[0, i] * w[0] + back[1, i] * w[1] + back[2, i] * w[2]
             for c in range(3):
-                out[4 * i + c] = moved[i] * world[c] + j[i] * u[c] + j[3 + i] * u[3 + c] + v[i, 3] * w[c]
+                out[4 * i + c] = moved[i] * world[c] + j[i] * u[c] + j[3 + i] * u[3 + c] + turned * centre[c]
                 out[12 + 3 * i + c] = across[i] * local[c]
-            out[4 * i + 3] = moved[i] + v[i, 0] * w[0] + v[i, 1] * w[1] + v[i, 2] * w[2]
+            out[4 * i + 3] = moved[i] + turned
         for i in range(2):
             out[12 + 3 * i] += (by_j[3 * i] - by_j[3 * i + 2] * tx) * inverse
             out[13 + 3 * i] += (by_j[3 * i + 1] - by_j[3 * i + 2] * ty) * inverse
+        if not limits[0, 0] <= x * inverse <= limits[0, 1]:  # the limits follow the lens
+            by_limit = (k[0, 0] * by_j[2] + k[1, 0] * by_j[5]) * inverse / k[0, 0]
+            out[12], out[14] = out[12] + by_limit * tx, out[14] + by_limit
+        if not limits[1, 0] <= y * inverse <= limits[1, 1]:
+            by_limit = (k[0, 1] * by_j[2] + k[1, 1] * by_j[5]) * inverse / k[1, 1]
+            out[16], out[17] = out[16] + by_limit * ty, out[17] + by_limit

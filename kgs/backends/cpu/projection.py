@@ -103,22 +103,13 @@ class _Projection(torch.autograd.Function):
 
 
 def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
-    """Whether these are pinhole cameras with affine intrinsics and poses; rigid poses if these need a gradient."""
+    """Whether these are pinhole cameras with affine intrinsics and poses, the poses invertible."""
     if not isinstance(cameras, PinholeCamera):
         return False
-    matrices = cameras.intrinsics, cameras.extrinsics
-    wanted = torch.is_grad_enabled() and cameras.extrinsics.requires_grad
-    (k, pose), unit = arrays(*matrices), np.eye(4)
+    (k, pose), unit = arrays(cameras.intrinsics, cameras.extrinsics), np.eye(4)
     last = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
-    rigid = not wanted or all(_is_turn(each[:3, :3]) for each in pose)
-    return bool(
-        last and rigid and k[:, 0, 0].all() and k[:, 1, 1].all() and np.isfinite(k).all() and np.isfinite(pose).all()
-    )
-
-
-def _is_turn(matrix: Array) -> bool:
-    """As in `kgs.projection.inverse_turn`."""
-    return bool((np.abs(matrix @ matrix.T - np.eye(3, dtype=matrix.dtype)) <= 1e-3).all())
+    finite = np.isfinite(k).all() and np.isfinite(pose).all()
+    return bool(last and finite and k[:, 0, 0].all() and k[:, 1, 1].all() and np.linalg.det(pose[:, :3, :3]).all())
 
 
 def _views(cameras: PinholeCamera, frame: Frame) -> list[tuple[Array, ...]]:
@@ -130,10 +121,9 @@ def _views(cameras: PinholeCamera, frame: Frame) -> list[tuple[Array, ...]]:
         margin = MARGIN * (end - begin)
         first, last = -(centre - begin + margin) / focal, (end - centre + margin) / focal
         limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
-        rotation = pose[:3, :3]
-        inverse = rotation.T if _is_turn(rotation) else np.linalg.inv(rotation)
+        inverse = np.linalg.inv(pose[:3, :3])
         # copies: a user may change a camera in place before the backward pass
-        views.append((pose[:3].copy(), matrix[:2, :3].copy(), limits, -(inverse @ pose[:3, 3])))
+        views.append((pose[:3].copy(), matrix[:2, :3].copy(), limits, inverse, -(inverse @ pose[:3, 3])))
     return views
 
 

@@ -2,7 +2,7 @@
 
 The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; gradients of cameras are in
 :mod:`.camera_kernels`. A camera is a tuple: world to camera `(3, 4)`, intrinsics `(2, 3)`, limits of x / z and y / z
-`(2, 2)`, centre `(3,)`.
+`(2, 2)`, inverse of the pose's 3x3 block, centre `(3,)`.
 """
 
 import math
@@ -136,7 +136,7 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, r
     depths, opacities, colours of harmonics `(N, 3)` (`(N, 0)` where none are wanted), radii and numbers of the
     Gaussians, and in `counts` how many of each block are seen and how many are not finite, `(blocks, 2)`.
     """
-    v, k, limits, centre = camera
+    v, k, limits, _, centre = camera
     height, width, near, eps2d, cutoff = rules
     means2d, factors, depths, alphas, rgb, radii, ids = lists
     bands = colors.shape[1] // 3 if rgb.shape[1] else 0
@@ -258,7 +258,7 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
     opacities and colours `(M, 3)` or `(M, 0)`. Added to are `found`, of means, quats, scales, opacities `(1, N)` or
     `(C, N)`, and colours `(N, F)`, or `(N, 0)` where that is not wanted.
     """
-    v, k, limits, centre = camera
+    v, k, limits, _, centre = camera
     g_means2d, g_factors, g_depths, g_opacities, g_rgb = gradients
     d_means, d_quats, d_scales, d_opacities, d_colors = found
     bands = colors.shape[1] // 3 if g_rgb.shape[1] else 0

@@ -1,7 +1,7 @@
 """What kernels read of a pinhole camera, as one row of numbers; and the gradients of cameras.
 
-A row, `WIDTH` numbers: world to camera (3, 4), intrinsics (2, 3), limits of x / z, then of y / z, the centre (3,), and
-whether the kernels can draw it.
+A row, `WIDTH` numbers: world to camera (3, 4), intrinsics (2, 3), limits of x / z, then of y / z, the centre (3,),
+whether the kernels can draw it, and the inverse of the pose's 3x3 block.
 """
 
 import triton
@@ -9,19 +9,11 @@ import triton.language as tl
 
 from .footprint_kernels import is_finite
 
-WIDTH = 32
-PLAIN = 25  # where in a row it says that intrinsics and pose are affine, and the pose rigid where it must be
+WIDTH = 36
+PLAIN = 25  # where in a row it says that intrinsics and pose are affine, and the pose invertible
 
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
 _PLAIN: tl.constexpr = tl.constexpr(PLAIN)
-
-
-@triton.jit
-def _product(pose, i, j):
-    """The product of two rows of the 3x3 block of a pose."""
-    a, b = pose + 4 * i, pose + 4 * j
-    total = tl.load(a) * tl.load(b) + tl.load(a + 1) * tl.load(b + 1)
-    return total + tl.load(a + 2) * tl.load(b + 2)
 
 
 @triton.jit
@@ -42,10 +34,8 @@ def _store_limits(out, focal, centre, low, high, margin):
 
 
 @triton.jit
-def describe_cameras(
-    intrinsics, extrinsics, left, top, right, bottom, margin_x, margin_y, rows, MUST_TURN: tl.constexpr
-):  # fmt: skip
-    """Fill the row of a camera from its matrices `(4, 4)`; with `MUST_TURN` only rigid poses count as plain."""
+def describe_cameras(intrinsics, extrinsics, left, top, right, bottom, margin_x, margin_y, rows):
+    """Fill the row of a camera from its matrices `(4, 4)`."""
     c = tl.program_id(0)
     matrix, pose, out = intrinsics + c * 16, extrinsics + c * 16, rows + c * _WIDTH
     i = tl.arange(0, 16)
@@ -54,14 +44,6 @@ def describe_cameras(
     plain = is_finite(k) & is_finite(e) & ((k == unit) | ((i < 8) & (i % 4 < 3))) & ((e == unit) | (i < 12))
     plain &= (k != 0.0) | ((i != 0) & (i != 5))
     plain = tl.min(plain.to(tl.int32), 0)
-    off = tl.maximum(tl.abs(_product(pose, 0, 1)), tl.abs(_product(pose, 0, 2)))
-    off = tl.maximum(off, tl.abs(_product(pose, 1, 2)))
-    off = tl.maximum(off, tl.abs(_product(pose, 0, 0) - 1.0))
-    off = tl.maximum(off, tl.abs(_product(pose, 1, 1) - 1.0))
-    off = tl.maximum(off, tl.abs(_product(pose, 2, 2) - 1.0))
-    turned = off <= 1e-3  # as in `kgs.projection.inverse_turn`
-    if MUST_TURN:
-        plain = tl.where(turned, plain, 0)
     for j in tl.static_range(12):
         tl.store(out + j, tl.load(pose + j))
     for j in tl.static_range(3):
@@ -71,11 +53,12 @@ def describe_cameras(
     _store_limits(out + 20, tl.load(matrix + 5), tl.load(matrix + 6), top, bottom, margin_y)
     det = tl.load(pose) * _cofactor(pose, 0, 0) + tl.load(pose + 1) * _cofactor(pose, 0, 1)
     det += tl.load(pose + 2) * _cofactor(pose, 0, 2)
-    plain = tl.where(turned | ((det != 0.0) & is_finite(det)), plain, 0)  # torch says that it has no inverse
+    plain = tl.where((det != 0.0) & is_finite(det), plain, 0)  # torch says that it has no inverse
     for j in tl.static_range(3):
         moved = tl.load(pose + 3) * 0.0
         for m in tl.static_range(3):
-            inverse = tl.where(turned, tl.load(pose + 4 * m + j), _cofactor(pose, m, j) / det)
+            inverse = _cofactor(pose, m, j) / det
+            tl.store(out + 26 + 3 * j + m, inverse)
             moved -= inverse * tl.load(pose + 4 * m + 3)
         tl.store(out + 22 + j, moved)
     tl.store(out + _PLAIN, plain.to(tl.float32))

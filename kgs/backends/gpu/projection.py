@@ -72,9 +72,7 @@ def _describe(cameras: PinholeCamera, size: tuple[int, int], options: RasterOpti
     left, top, right, bottom = options.frame or whole_frame(size)
     margins = (MARGIN * (right - left), MARGIN * (bottom - top))
     rows = matrices[0].new_empty(len(matrices[0]), WIDTH)
-    wanted = torch.is_grad_enabled() and cameras.extrinsics.requires_grad
-    edges = (left, top, right, bottom, *margins)
-    launch(describe_cameras, (len(rows),), *matrices, *edges, rows, MUST_TURN=wanted, warps=1)
+    launch(describe_cameras, (len(rows),), *matrices, left, top, right, bottom, *margins, rows, warps=1)
     return rows
 
 

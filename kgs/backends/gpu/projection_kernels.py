@@ -272,6 +272,18 @@ def _point_gradient(camera, x, y, z, u0, u1, u2, v0, v1, v2, g_u, g_v, g_depth):
 
 
 @triton.jit
+def _limit_gradients(camera, x, y, inverse, h02, h12):
+    """From the last column of dL/dJ to the principal point, by limits of the tangents, where these are reached."""
+    k00, k01, k10, k11 = tl.load(camera + 12), tl.load(camera + 13), tl.load(camera + 15), tl.load(camera + 16)
+    tx, ty = x * inverse, y * inverse
+    over_x = (tx < tl.load(camera + 18)) | (tx > tl.load(camera + 19))
+    over_y = (ty < tl.load(camera + 20)) | (ty > tl.load(camera + 21))
+    by_x = tl.where(over_x, (k00 * h02 + k10 * h12) * inverse / k00, 0.0)
+    by_y = tl.where(over_y, (k01 * h02 + k11 * h12) * inverse / k11, 0.0)
+    return by_x, by_y
+
+
+@triton.jit
 def _color_gradients(
     camera, mx, my, mz, colors, g, seen, g_rgb, m, d_colors, inside,
     BANDS: tl.constexpr, WRITE: tl.constexpr, ADD: tl.constexpr,
@@ -309,11 +321,10 @@ def _total(out, value, seen):
 @triton.jit
 def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, seen):
     """The gradient of row i of a pose: by the point, by J W, and by the direction of the colours."""
-    shift = tl.load(camera + 4 * i + 3)
-    _total(out + 4 * i, moved * mx + j * u0 + h * v0 + shift * wx, seen)
-    _total(out + 4 * i + 1, moved * my + j * u1 + h * v1 + shift * wy, seen)
-    _total(out + 4 * i + 2, moved * mz + j * u2 + h * v2 + shift * wz, seen)
-    turned = tl.load(camera + 4 * i) * wx + tl.load(camera + 4 * i + 1) * wy + tl.load(camera + 4 * i + 2) * wz
+    turned = tl.load(camera + 26 + i) * wx + tl.load(camera + 29 + i) * wy + tl.load(camera + 32 + i) * wz
+    _total(out + 4 * i, moved * mx + j * u0 + h * v0 + turned * tl.load(camera + 22), seen)
+    _total(out + 4 * i + 1, moved * my + j * u1 + h * v1 + turned * tl.load(camera + 23), seen)
+    _total(out + 4 * i + 2, moved * mz + j * u2 + h * v2 + turned * tl.load(camera + 24), seen)
     _total(out + 4 * i + 3, moved + turned, seen)
 
 
@@ -386,12 +397,13 @@ def footprint_gradients(
         u = (tl.load(camera + 12) * x + tl.load(camera + 13) * y) * inverse + tl.load(camera + 14)
         v = (tl.load(camera + 15) * x + tl.load(camera + 16) * y) * inverse + tl.load(camera + 17)
         g_u, g_v, g_w = g_u * inverse, g_v * inverse, -(g_u * u + g_v * v) * inverse
-        _total(out + 12, g_u * x + (h00 - h02 * tx) * inverse, seen)
+        by_x, by_y = _limit_gradients(camera, x, y, inverse, h02, h12)
+        _total(out + 12, g_u * x + (h00 - h02 * tx) * inverse + by_x * tx, seen)
         _total(out + 13, g_u * y + (h01 - h02 * ty) * inverse, seen)
-        _total(out + 14, g_u * z, seen)
+        _total(out + 14, g_u * z + by_x, seen)
         _total(out + 15, g_v * x + (h10 - h12 * tx) * inverse, seen)
-        _total(out + 16, g_v * y + (h11 - h12 * ty) * inverse, seen)
-        _total(out + 17, g_v * z, seen)
+        _total(out + 16, g_v * y + (h11 - h12 * ty) * inverse + by_y * ty, seen)
+        _total(out + 17, g_v * z + by_y, seen)
         _total(out + 18, g_w * x, seen)
         _total(out + 19, g_w * y, seen)
         _total(out + 20, g_w * z, seen)
