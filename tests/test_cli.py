@@ -383,3 +383,16 @@ def test_all_photos_can_be_trained_on(folder, tmp_path, capsys):
     assert run("eval", tmp_path) == 0
     assert run("fit", folder, "-o", tmp_path / "other", "--hold-out", 1, *FIT) == 2
     assert "--hold-out: expected" in capsys.readouterr().err
+
+
+def test_a_scene_may_have_one_photo(folder, tmp_path):
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    shutil.copytree(folder / "train", scene / "train")
+    content = json.loads((folder / "transforms_train.json").read_text())
+    frame = content["frames"][0]
+    frame["file_path"] += ".png"
+    (scene / "transforms.json").write_text(json.dumps(content | {"frames": [frame]}))
+    words = ("--init", "random", "--hold-out", 0, "--size", 32, "--steps", 4)
+    assert run("fit", scene, "-o", out, *words) == 0
+    assert run("render", out / "splat.ply", "--cameras", scene, "-o", tmp_path / "renders") == 0
+    assert [path.name for path in (tmp_path / "renders").glob("*.png")] == ["train_r_0.png"]

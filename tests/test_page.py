@@ -114,6 +114,7 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
             "was not measured (kgs fit with --hold-out 8 measures it). PSNR on the 1 photo it",
         ),
         ({"": {"train": views(10.0)}}, "10.0 dB, that is recognisable, with large errors."),
+        ({"": {"train": views(4.9)}}, "4.9 dB, that is not the scene of the photos."),
         ({"": {"views": views(27.0)}}, "PSNR on 1 photo: 27.0 dB, that is close to the photos"),
         ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "training: not measured."),
     ],

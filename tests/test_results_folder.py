@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -156,6 +157,34 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
     assert any(line.startswith(f"{unfinished}: holds the results") for line in lines)
 
 
+@pytest.mark.parametrize("failures", [2, 3])  # of the evaluation's, the last one, and the second try of that
+def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
+    scene: Any, done: Path, monkeypatch: Any, failures: int
+) -> None:
+    """What it shows and what is evaluated later would differ; the last checkpoint is tried again at the end."""
+    failed, save = [], Trainer.save
+
+    def full_at_the_end(trainer: Trainer, path: Any) -> None:
+        if trainer.step == 3 and len(failed) < failures:
+            failed.append(1)
+            raise OSError(28, "No space left on device", str(path))
+        save(trainer, path)
+
+    monkeypatch.setattr(Trainer, "save", full_at_the_end)
+    lines: list[str] = []
+    if failures == 2:
+        fit_scene(scene, OTHER, done, say=lines.append)
+        assert load_checkpoint(done / CHECKPOINT)["step"] == 3
+        return
+    with pytest.raises(OSError, match="No space"):
+        fit_scene(scene, OTHER, done, say=lines.append)
+    assert any(line.startswith(f"{done / 'unfinished'}: holds the results") for line in lines)
+    assert seed_of(done) == 0
+    monkeypatch.undo()
+    fit(scene, OTHER, done, resume=True)
+    assert (seed_of(done), load_checkpoint(done / CHECKPOINT)["step"]) == (1, 3)
+
+
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
@@ -224,10 +253,20 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done:
     assert not (done / "unfinished").exists()
 
 
-def test_the_finished_fit_is_resumed_where_another_was_left_unfinished(scene: Any, done: Path) -> None:
+def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one_is_resumed(
+    scene: Any, done: Path
+) -> None:
     unfinished = Trainer(scene, OTHER, run.choose_points(scene, OTHER))
     make_own_folder(done / "unfinished")
-    unfinished.save(done / "unfinished" / CHECKPOINT)
+    path = done / "unfinished" / CHECKPOINT
+    unfinished.save(path)
+    kept = path.read_bytes()
+    message = f"{re.escape(str(path))}: steps: expected 3, as the fit was begun with"
+    with pytest.raises(DataError, match=message) as error:
+        fit(scene, replace(CONFIG, steps=5), done, resume=True)
+    assert error.value.path == path
+    assert path.read_bytes() == kept
+    shutil.rmtree(done / "unfinished")
     lines = fit(scene, replace(CONFIG, steps=5), done, resume=True)
     assert lines[0] == "resumed at step 3"
     assert "trained on from step 3" in lines[1]

@@ -348,3 +348,24 @@ def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
     assert said[-1] == NOT_FOUND
     assert not [line for line in said[:-1] if " of 3 " not in line]
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]
+
+
+def test_neither_solver_sees_what_alpha_hides(folder, tmp_path, monkeypatch):
+    shown = []
+
+    def look(aside, step, database, images="", names=(), **_):
+        shown.extend(cv2.imread(f"{images}/{name}", cv2.IMREAD_UNCHANGED) for name in names)
+        raise RuntimeError("that is enough")
+
+    monkeypatch.setattr(pose.Aside, "run", look)
+    images = planes()
+    alpha = np.full((*images.shape[:3], 1), 255, np.uint8)
+    alpha[:, :60] = 0
+    save(folder, np.concatenate([images, alpha], 3))
+    with pytest.raises(RuntimeError, match="that is enough"):
+        pose_photos(folder, tmp_path / "out")
+    assert len(shown) == len(images)
+    for seen, image in zip(shown, images, strict=True):
+        assert seen.shape[2] == 3
+        assert not seen[:60].any()
+        assert np.array_equal(seen[60:], image[60:])

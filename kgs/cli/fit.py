@@ -106,7 +106,7 @@ def fit(
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size is not None:
-        height, width = load_scene(scene, photos=False).train.images.shape[-2:]
+        height, width = load_scene(scene, photos=False, hold_out=hold_out).train.images.shape[-2:]
         request["downscale"] = max(1.0, max(height, width) / size)
     loaded = load(request, place)
     height, width = loaded.train.images.shape[-2:]

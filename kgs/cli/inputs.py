@@ -19,10 +19,10 @@ def load(request: dict[str, Any], out: Path) -> Any:
 
 
 def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any:
-    """The scene without its photos, of which there may be hundreds."""
+    """The scene without its photos, of which there may be hundreds; all views are training views."""
     from kgs.datasets import load_scene
 
-    scene = load_scene(cameras, None, downscale, photos=False, **options)
+    scene = load_scene(cameras, None, downscale, hold_out=0, photos=False, **options)
     for note in scene.notes:
         say(note)
     return scene

@@ -55,7 +55,7 @@ def page(
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
     place = check_tools(device, backend, "jinja2")
-    scene = load_cameras(cameras, downscale, background=background, hold_out=0)
+    scene = load_cameras(cameras, downscale, background=background)
     model, renderer = load_splat(ply, scene, place, backend)
     behind = scene.background.to(place)
 

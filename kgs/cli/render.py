@@ -46,7 +46,7 @@ def render(
     clear = background == "transparent"
     scene = load_cameras(cameras, downscale, background="black" if clear else background)
     model, renderer = load_splat(ply, scene, place, backend)
-    posed = [(name, views.camera(i)) for views in (scene.train, scene.test) for i, name in enumerate(views.names)]
+    posed = [(name, scene.train.camera(i)) for i, name in enumerate(scene.train.names)]
     names = png_names(name for name, _ in posed)
     check_folder(out, names.values(), scene.root)
     outputs, behind = ("image", "alpha") if clear else ("image",), scene.background.to(place)

@@ -124,8 +124,8 @@ class FitConfig:
             images see. scene: the random points that Blender's layout prescribes. model-points: points of a COLMAP
             model, which was refined with the test views too. file: points of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
-        init_points: the number of points of the init random, and the largest number of dense. Unless given: of dense
-            one for every 3 pixels whose depth two views agree on, 30 000 to 60 000; of random 30 000.
+        init_points: the number of points of the init random, and the largest number of dense; at least 4. Unless given:
+            of dense one for every 3 pixels whose depth two views agree on, 30 000 to 60 000; of random 30 000.
         draw: how dense points are chosen. spread: one from each of as many equal cells of the images. uniform: each
             with the same probability.
         training_background: random: another colour in each step, so that a hole in the splat cannot pass for a surface
@@ -156,7 +156,7 @@ class FitConfig:
     seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed has to fit torch's 64 bits
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"
     init_file: Path | None = None
-    init_points: Annotated[int | None, _Range(1, 10**9)] = None
+    init_points: Annotated[int | None, _Range(4, 10**9)] = None
     draw: Literal["spread", "uniform"] = "spread"
     training_background: Literal["random", "scene"] = "random"
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None

@@ -149,6 +149,8 @@ def fit_scene(
             write_json(new / "metrics.json", metrics)
             if before_publish is not None:
                 before_publish(Finished(new, out, trainer, metrics, settings))
+            if not trainer.is_saved:  # results and checkpoint belong together
+                trainer.save(new / CHECKPOINT)
         except BaseException:
             if is_trained:
                 for note in trainer.notes[num_said:]:
@@ -169,17 +171,14 @@ def fit_scene(
 
 
 def _resumed(scene: Scene, config: FitConfig, out: Path) -> tuple[Trainer | None, Path]:
-    """Resume the interrupted fit in a results folder, else the finished one; the trainer, or None, and its folder."""
-    errors = []
+    """Resume the interrupted fit in a results folder, or if there is none the finished one; None: there is neither.
+
+    An interrupted fit with other settings is an error: it would be lost when the finished one is written again.
+    """
     for folder in (fit_staging(out).unfinished, out):
         path = folder / CHECKPOINT
         if any(file.exists() for file in (path, previous(path))):
-            try:
-                return Trainer.resume(scene, config, path), folder
-            except DataError as error:
-                errors.append(error)
-    if errors:
-        raise errors[0]
+            return Trainer.resume(scene, config, path), folder
     return None, out
 
 
@@ -247,6 +246,7 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
             try:
                 trainer.save(checkpoint)
             except OSError as error:
+                trainer.is_saved = False
                 trainer.note(f"step {trainer.step}: no checkpoint: {error}")
 
     with _interruptible() as stopped, progress(trainer.times.steps, title, trainer.step) as advance:

@@ -144,7 +144,10 @@ class Trainer:
         self.times = timetable(config)
         self.step = 0
         self.seconds = 0.0
-        self.saved = ""
+        self.saved, self.is_saved = (
+            "",
+            False,
+        )  # where the last checkpoint is, and whether the last try to write one worked
         self.curve: list[dict[str, float | None]] = []
         self.notes: list[str] = []
         self.needs = dict(needs or {})
@@ -344,7 +347,7 @@ class Trainer:
         if self.look_every > 1:
             self._stop_if(parameter_fault(self.model))
         save_checkpoint(Path(path), self.state_dict())
-        self.saved = f"{path} of step {self.step}"
+        self.saved, self.is_saved = f"{path} of step {self.step}", True
 
     @classmethod
     def resume(cls, scene: Scene, config: FitConfig, path: str | PathLike[str]) -> Self:

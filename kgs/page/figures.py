@@ -20,7 +20,8 @@ _LEVELS = (
     (32.0, "hard to tell from the photos at a glance"),
     (26.0, "close to the photos, without their finest detail"),
     (21.0, "clearly the same scene, soft or wrong in places"),
-    (-math.inf, "recognisable, with large errors"),
+    (10.0, "recognisable, with large errors"),
+    (-math.inf, "not the scene of the photos"),
 )
 # The folders of an absolute path inside a text.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[\\/](?:[^\\/\s]+[\\/])+(?=[^\\/\s])")

@@ -141,10 +141,15 @@ def find_cameras(
         png = png_names(names)
         image_names, photo_names = list(png.values()), {image: name for name, image in png.items()}
         write_images(images, photos, image_names)
+        bare = images
+        if not all(photo.is_opaque for photo in photos):  # COLMAP would find keypoints in what alpha hides
+            bare = work / "opaque"
+            bare.mkdir()
+            write_images(bare, photos, image_names, opaque=True)
         seconds["photos"] = lap()
         first, second = work / "first.db", work / "second.db"
         with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
-            of_second: dict[str, Any] = {"images": str(images), "names": image_names, "seed": seed}
+            of_second: dict[str, Any] = {"images": str(bare), "names": image_names, "seed": seed}
             lens = lens_of(photos)
             of_second["lens"] = lens.params_to_string() if lens.has_prior_focal_length else None
             second_matches = executor.submit(aside.run, "write_colmap_matches", second, **of_second)

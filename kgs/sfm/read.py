@@ -101,12 +101,19 @@ class Photo:
         ratio = self.exif.focal_ratio(*self.size)
         return ratio * max(self.size) if ratio else None
 
+    @property
+    def is_opaque(self) -> bool:
+        """Whether there is no alpha."""
+        return bool(self.pixels.shape[2] == 3)
+
+    def opaque(self) -> NDArray[np.uint8]:
+        """The photo over black, `(H, W, 3)`: what is hidden under alpha does not show."""
+        rgb = self.pixels[..., :3]
+        return rgb if self.is_opaque else (rgb * (self.pixels[..., 3:] / 255.0)).round().astype(np.uint8)
+
     def grey(self) -> NDArray[np.uint8]:
         """Brightness `(H, W)`, black where the photo is transparent."""
-        rgb = self.pixels[..., :3]
-        if self.pixels.shape[2] == 4:
-            rgb = (rgb * (self.pixels[..., 3:] / 255.0)).round().astype(np.uint8)
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(self.opaque()), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def open_photos(paths: list[Path]) -> list[OpenPhoto]:

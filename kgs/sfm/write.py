@@ -17,10 +17,11 @@ from .map import Cameras, quiet_pycolmap
 from .read import Photo
 
 
-def write_images(folder: Path, photos: list[Photo], names: list[str]) -> None:
-    """Write the photos as PNGs without metadata: another JPEG compression would lose detail."""
+def write_images(folder: Path, photos: list[Photo], names: list[str], opaque: bool = False) -> None:
+    """Write the photos, or these over black, as PNGs without metadata: another JPEG compression would lose detail."""
     for photo, name in zip(photos, names, strict=True):
-        write_png(folder / name, torch.from_numpy(photo.pixels).permute(2, 0, 1) / 255)
+        pixels = photo.opaque() if opaque else photo.pixels
+        write_png(folder / name, torch.from_numpy(pixels).permute(2, 0, 1) / 255)
 
 
 def level_and_scale(cameras: Cameras) -> None:
