@@ -164,6 +164,14 @@ def test_colours_that_a_tiff_multiplies_by_alpha_are_divided_by_it(tmp_path: Pat
     assert not image[0, 0].any()
 
 
+@pytest.mark.parametrize(("mode", "name"), [("LAB", "CIELab"), ("CMYK", "CMYK")])
+def test_tiffs_of_other_colours_are_refused(tmp_path: Path, mode: str, name: str) -> None:
+    made = pytest.importorskip("PIL.Image").new(mode, (7, 5))
+    made.save(tmp_path / "a.tif")
+    with pytest.raises(DataError, match=f"expected a TIFF of grey or RGB, got {name}"):
+        read_image(tmp_path / "a.tif")
+
+
 def test_alpha_of_grey_images_is_used_or_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="unusual TIFF"):
         read_image(stored(tmp_path / "a.tif", tiff(pixels(np.uint16, 2))))

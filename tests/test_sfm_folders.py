@@ -79,6 +79,13 @@ def test_too_few_photos(folder, count, refused):
     refused(folder, f"at least 3 photos, found {count}", "Take 3 to 12")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_a_link_to_a_photo_that_is_gone(folder, refused):
+    save(folder, small(planes()))
+    (folder / "3.png").symlink_to("gone.png")
+    refused(folder, "links to files that are not there: 3.png")
+
+
 def test_a_folder_one_level_too_deep(folder, refused):
     save(folder / "DCIM", planes())
     refused(folder, "these folders in it do: DCIM")

@@ -27,6 +27,8 @@ def find_photos(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = list_photos(folder)
+    if lost := [path for path in list_images(folder, _readable()) if not path.exists()]:
+        raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed(lost)}")
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
     if others := [path for path in files if path.suffix.lower() in set(UNREADABLE_SUFFIXES).difference(_readable())]:
