@@ -37,7 +37,7 @@ _LONGEST_SIGNATURE = 12  # bytes
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
 _BITS, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPLES, _EXIF = 258, 274, 277, 322, 323, 338, 34665
 _MULTIPLIED_ALPHA, _ALPHA = 1, 2  # values of `_EXTRA_SAMPLES`
-_COLORS, _NOT_RGB = 262, {5: "CMYK", 8: "CIELab", 9: "ICCLab", 10: "ITULab"}
+_COLORS, _LAB = 262, {8: "CIELab", 9: "ICCLab", 10: "ITULab"}  # a tag, and those of its values that are decoded wrongly
 
 
 class Metadata(NamedTuple):
@@ -281,8 +281,8 @@ def _decode_tiff(data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of a TIFF, as stored, its colours not multiplied by alpha."""
     image = _open("TIFF", io.BytesIO(data))
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
-    if other := _NOT_RGB.get(int(tags.get(_COLORS, 2))):
-        raise ValueError(f"expected a TIFF of grey or RGB, got {other}")
+    if lab := _LAB.get(int(tags.get(_COLORS, 2))):
+        raise ValueError(f"expected a TIFF of grey or RGB, got {lab}")
     orientation, samples = int(tags.get(_ORIENTATION, 1)), int(tags.get(_SAMPLES, 1))
     alpha = tags.get(_EXTRA_SAMPLES, (0,))[0]
     if set(tags.get(_BITS, (1,))) == {8} and (samples == 2 or alpha == _ALPHA):

@@ -148,7 +148,7 @@ def _inverse(matrix: Tensor) -> Tensor:
     x, y, z = (matrix / scale).unbind()
     cofactors = torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)
     determinant = (x * cofactors[0]).sum()
-    if not bool(scale) or not bool(determinant):
+    if bool((scale == 0) | (determinant == 0)):  # one wait on a GPU
         raise ValueError("extrinsics: expected poses whose 3x3 block has an inverse, got one of determinant 0")
     inverse: Tensor = torch.stack(cofactors, 1) / determinant / scale
     return inverse

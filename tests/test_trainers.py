@@ -107,10 +107,9 @@ def trainer(tmp_path):
     names |= {"F": torch.nn.functional, "json": json, "time": time, "tqdm": tqdm}
     names["yaml"] = SimpleNamespace(dump=lambda values, file: None)
     names["fused_ssim"] = lambda image, photo, padding: ssim(image, photo, 11, padding=padding).mean()
-    on = "        # forward\n"
-    off = "        if renders.shape[-1] == 4:\n"
-    own = {on: f"        self.drop.progress = (step + 1) / max_steps\n        self.drop.train()\n{on}"}
-    own |= {off: f"        self.drop.eval()\n{off}"}
+    before, after = "        # forward\n", "        if renders.shape[-1] == 4:\n"
+    own = {before: f"        self.drop.progress = (step + 1) / max_steps\n        self.drop.train()\n{before}"}
+    own |= {after: f"        self.drop.eval()\n{after}"}
     train = function(source, "train", own, names)
 
     gaussians, camera, k = scene()

@@ -144,10 +144,8 @@ class Trainer:
         self.times = timetable(config)
         self.step = 0
         self.seconds = 0.0
-        self.saved, self.is_saved = (
-            "",
-            False,
-        )  # where the last checkpoint is, and whether the last try to write one worked
+        self.saved = ""  # where the last checkpoint is
+        self.is_saved = False  # whether the last try to write one worked
         self.curve: list[dict[str, float | None]] = []
         self.notes: list[str] = []
         self.needs = dict(needs or {})

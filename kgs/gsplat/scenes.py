@@ -106,11 +106,12 @@ def split(
     for b in range(math.prod(batch)):
         own = {kind: x[b] for kind, x in plain.items() if kind not in shared}
         bands = None if harmonics is None else harmonics[b if len(harmonics) > 1 else 0]
-        if bands is None or lens == "ortho":
+        # gsplat sees harmonics from the centre through every lens; kgs has another direction where rays are parallel
+        bands, centred = (None, bands) if lens == "ortho" else (bands, None)
+        if bands is None:
             drawn, widths = torch.cat([means[b, :, :0], *(plain[kind][b] for kind in shared)], 1), shared
         else:
             drawn, widths = bands, {"image": 3}
-        centred = bands if lens == "ortho" else None  # gsplat sees harmonics from the centre through every lens
         known = [*own.values(), *([] if centred is None else [centred.flatten(1)])]
         gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], known), drawn)
         cameras = _cameras(viewmats[b], intrinsics[b], size, lens, pixel_centers)
