@@ -37,6 +37,8 @@ class GaussianModel(nn.Module):
         sh_rest: harmonics of degree 1 and above, `(N, K - 1, 3)` with K = 1, 4, 9 or 16.
         sh_degree: the active degree, 0 to that of `sh_rest`; None takes that of `_extra_state`, else that of `sh_rest`.
         _extra_state: the active degree as `state_dict()` holds it.
+        antialiased: whether the Gaussians were fitted with `RasterOptions(antialiased=True)`, and so must be rendered
+            with it: `GaussianRenderer(antialiased=model.antialiased)`. No part of `state_dict()`.
 
     Raises:
         TypeError: a tensor is not float32 or float64, or differs in dtype or device from `means`.
@@ -59,8 +61,10 @@ class GaussianModel(nn.Module):
         sh_rest: Tensor,
         sh_degree: int | None = None,
         _extra_state: Tensor | None = None,
+        antialiased: bool = False,
     ) -> None:
         super().__init__()
+        self.antialiased = antialiased
         values = (means, quats, log_scales, opacity_logits, sh_dc, sh_rest)
         for name, value in zip(PARAMETERS, values, strict=True):
             check_tensor(name, value)
@@ -115,7 +119,7 @@ class GaussianModel(nn.Module):
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
         values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
-        return GaussianModel(**values, sh_degree=min(degree, self.sh_degree))
+        return GaussianModel(**values, sh_degree=min(degree, self.sh_degree), antialiased=self.antialiased)
 
     @property
     def max_sh_degree(self) -> int:
@@ -169,7 +173,9 @@ class GaussianModel(nn.Module):
 
     def extra_repr(self) -> str:
         """What `print(model)` shows."""
-        return f"{len(self)} Gaussians, sh_degree={self.sh_degree} of {self.max_sh_degree}, {self.means.dtype}"
+        antialiased = ", antialiased" if self.antialiased else ""
+        degrees = f"sh_degree={self.sh_degree} of {self.max_sh_degree}"
+        return f"{len(self)} Gaussians, {degrees}, {self.means.dtype}{antialiased}"
 
 
 class _JoinedBands(torch.autograd.Function):

@@ -89,6 +89,16 @@ def test_header_is_that_of_3d_gaussian_splatting(tmp_path):
     assert len(body) == 4 * 26 * 4
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_an_antialiased_model_is_tagged_as_other_programs_do(tmp_path, antialiased):
+    model = random_model()
+    model.antialiased = antialiased
+    save_ply(tmp_path / "a.ply", model)
+    head = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0]
+    assert (b"\ncomment SplatRenderMode: mip\n" in head) == antialiased  # the spelling of Brush and splat-transform
+    assert load_ply(tmp_path / "a.ply").antialiased == antialiased
+
+
 UTM = torch.tensor([448262.127, 5411932.678, 118.5], dtype=torch.float64)  # metres, in zone 31
 
 

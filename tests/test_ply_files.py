@@ -89,6 +89,28 @@ def test_a_comment_cannot_raise_the_degree(tmp_path):
     assert load_ply(tmp_path / "b.ply").sh_degree == 1
 
 
+@pytest.mark.parametrize(
+    ("tags", "antialiased"),
+    [
+        ([], False),
+        (["SplatRenderMode: mip"], True),  # Brush, splat-transform
+        (["SplatRenderMode: default"], False),
+        (["SplatRenderMode: 2dgs"], False),
+        (["antialiased 1"], True),  # Postshot
+        (["antialiased 0"], False),
+        (["splatrendermode mip"], True),
+        (["antialiased 1", "SplatRenderMode: default"], False),  # the last one counts, as in splat-transform
+        (["SplatRenderMode: default", "antialiased 1"], True),
+        (["was not trained with SplatRenderMode: mip"], False),
+    ],
+)
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_tags_of_antialiased_splats(tmp_path, tags, antialiased, newline):
+    lines = [f"comment {tag}" for tag in tags]
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, [ROW], newline=newline, before=[(lines, b"")]))
+    assert load_ply(tmp_path / "a.ply").antialiased is antialiased
+
+
 def without(name):
     return [(n, k) for n, k in FLOATS if n != name]
 

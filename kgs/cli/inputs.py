@@ -29,11 +29,12 @@ def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any:
 
 
 def load_splat(ply: Path, scene: Any, place: Any, backend: str) -> tuple[Any, Any]:
-    """The Gaussians in the frame of the scene, and a renderer whose near plane follows from them."""
+    """The Gaussians in the frame of the scene, and a renderer for them: its near plane, and whether it antialiases."""
     from kgs.geometry import typical_depths
     from kgs.io.ply import load_ply
     from kgs.renderer import GaussianRenderer
 
     model = load_ply(ply, origin=scene.offset)
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
-    return model.to(place), GaussianRenderer(near_plane=near_plane, backend=backend).eval()
+    renderer = GaussianRenderer(near_plane=near_plane, antialiased=model.antialiased, backend=backend)
+    return model.to(place), renderer.eval()

@@ -40,7 +40,8 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
     Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit.
     Where float32 would move more than a tenth of the Gaussians by more than a thousandth of their largest axis (a scene
     in map coordinates, millions of metres from its origin) x, y and z are doubles. A viewer that reads floats alone
-    cannot show such a scene: write it without the offset. The active degree is a comment.
+    cannot show such a scene: write it without the offset. The active degree is a comment, and so is the tag of an
+    antialiased model.
 
     Args:
         path: the file to write, or a link to it; its folder exists.
@@ -67,9 +68,18 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
     position = "float"
     if _float32_moves(means, values["log_scales"]):
         position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
-    header = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}\n"
-    header += f"comment kgs sh_degree {model.sh_degree}\nelement vertex {n}\n"
-    header += "".join(f"property {position if name in 'xyz' else 'float'} {name}\n" for name in names) + "end_header\n"
+    comments = [MADE_BY, f"kgs sh_degree {model.sh_degree}"]
+    if model.antialiased:
+        comments.append("SplatRenderMode: mip")
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {comment}" for comment in comments),
+        f"element vertex {n}",
+        *(f"property {position if name in 'xyz' else 'float'} {name}" for name in names),
+        "end_header",
+    ]
+    header = "".join(f"{line}\n" for line in lines)
     write_whole(Path(path), header.encode("ascii") + columns.tobytes())
 
 
@@ -77,7 +87,9 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     """Read a 3DGS PLY file: ascii or binary, properties in any order and of any scalar type, harmonics of degree 0-3.
 
     Other properties and elements are skipped. The active degree is the one that kgs wrote down, else that of the
-    harmonics in the file. Warns where float32 cannot hold the positions and `origin` would help.
+    harmonics in the file. The model is antialiased where a comment says so: `SplatRenderMode: mip` (of Brush and
+    splat-transform) or `antialiased 1` (of Postshot). Warns where float32 cannot hold the positions and `origin` would
+    help.
 
     Args:
         path: the file to read.
@@ -94,7 +106,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     path, start = Path(path), np.zeros(3) if origin is None else as_vector("origin", origin)
     try:
         with open(path, "rb") as file:
-            order, elements, degree = _read_header(path, file)
+            header = _read_header(path, file)
+            elements = header.elements
             places = [place for place, element in enumerate(elements) if element.name == "vertex"]
             if len(places) != 1:
                 raise DataError(path, "vertex", f"expected one element of that name, got {len(places)}")
@@ -109,7 +122,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
             for name in names:
                 if name not in vertex.codes:
                     raise DataError(path, name, "expected this property of a splat, got none")
-            columns = _read_columns(path, order, elements, places[0], file)
+            columns = _read_columns(path, header.order, elements, places[0], file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
@@ -125,8 +138,16 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     if _float32_moves(means, scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
-    sh_rest, degree = sh_rest.unflatten(1, (3, rest // 3)).mT, min(degree, sizes.index(rest))
-    return GaussianModel(means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, degree)
+    return GaussianModel(
+        means32,
+        quats,
+        scales,
+        opacity[:, 0],
+        sh_dc=dc[:, None],
+        sh_rest=sh_rest.unflatten(1, (3, rest // 3)).mT,
+        sh_degree=min(header.sh_degree, sizes.index(rest)),
+        antialiased=header.antialiased,
+    )
 
 
 def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
@@ -153,17 +174,36 @@ class _Element:
     codes: dict[str, str] = field(default_factory=dict)  # NumPy's type code of each property, O for a list
 
 
+@dataclass
+class _Header:
+    order: str = ""  # of the bytes, a key of BYTE_ORDERS
+    elements: list[_Element] = field(default_factory=list)
+    sh_degree: int = 3  # the active degree
+    antialiased: bool = False
+
+    def read_comment(self, comment: str) -> None:
+        """Take over what a comment says of the splat; the last one counts."""
+        match re.split(r"[\s:]+", comment.strip().lower()):
+            case ["kgs", "sh_degree", digits] if re.fullmatch("[0-9]", digits):
+                self.sh_degree = int(digits)
+            case ["splatrendermode", mode]:  # default, mip or 2dgs
+                self.antialiased = mode == "mip"
+            case ["antialiased", flag]:  # 0 or 1
+                self.antialiased = flag == "1"
+
+
 def _splat_names(rest: int) -> list[str]:
     """The names of the properties after position and normal, with `rest` of them f_rest."""
     colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
-    """The byte order, the elements in order, and the active degree (3 if the header has none)."""
+def _read_header(path: Path, file: BinaryIO) -> _Header:
+    """Read the header, up to where the data begin."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
         raise DataError(path, "", "not a PLY file: expected 'ply' in the first line")
-    order, elements, degree = None, list[_Element](), 3
+    header = _Header()
+    elements = header.elements
     while True:
         line = file.readline(MAX_HEADER)
         if not line.endswith(b"\n") or file.tell() > MAX_HEADER:
@@ -171,24 +211,24 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
         match line.decode("ascii", "replace").split():
             case ["end_header"]:
                 break
-            case ["format", name, "1.0"] if name in BYTE_ORDERS and order is None:
-                order = name
+            case ["format", name, "1.0"] if name in BYTE_ORDERS and not header.order:
+                header.order = name
             case ["element", name, digits] if re.fullmatch("[0-9]{1,18}", digits):
                 elements.append(_Element(name, int(digits)))
             case ["property", "list", _, _, name] if elements:
                 elements[-1].codes[name] = "O"
             case ["property", kind, name] if elements and kind in SCALARS and name not in elements[-1].codes:
                 elements[-1].codes[name] = SCALARS[kind]
-            case ["comment", "kgs", "sh_degree", digits] if re.fullmatch("[0-9]", digits):
-                degree = int(digits)
-            case ["comment" | "obj_info", *_] | []:
+            case ["comment", *words]:
+                header.read_comment(" ".join(words))
+            case ["obj_info", *_] | []:
                 pass
             case _:
                 text = line[:80].decode("ascii", "backslashreplace").rstrip()
                 raise DataError(path, "header", f"expected a line of a PLY header, got {text!r}")
-    if order is None:
+    if not header.order:
         raise DataError(path, "format", f"expected one of {sorted(BYTE_ORDERS)}, got none")
-    return order, elements, degree
+    return header
 
 
 def _read_columns(
