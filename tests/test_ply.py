@@ -80,13 +80,39 @@ def test_trimesh_reads_all_columns(tmp_path):
 def test_header_is_that_of_3d_gaussian_splatting(tmp_path):
     save_ply(tmp_path / "a.ply", random_model(n=4, sh_degree=1))
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    expected = ["ply", "format binary_little_endian 1.0", "element vertex 4"]  # their viewer counts the lines
+    expected += [f"property float {name}" for name in splat_columns(1)]
     lines = head.decode().splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    assert [line for line in lines[2:] if not line.startswith("comment")] == [
-        "element vertex 4",
-        *(f"property float {name}" for name in splat_columns(1)),
-    ]
+    assert lines[: len(expected)] == expected
+    assert all(line.startswith("comment ") for line in lines[len(expected) :])
     assert len(body) == 4 * 26 * 4
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_of_a_higher_degree_are_zeros_in_the_file(tmp_path, degree):
+    model = random_model(4, degree)
+    model.sh_degree = degree // 2
+    save_ply(tmp_path / "a.ply", model, sh_degree=3)
+    again = load_ply(tmp_path / "a.ply")
+    assert again.sh_degree == degree // 2
+    assert torch.equal(again.sh_rest[:, : model.sh_rest.shape[1]], model.sh_rest)
+    assert not again.sh_rest[:, model.sh_rest.shape[1] :].any()
+    # as the viewer of 3D Gaussian Splatting reads it: the count from the third line, then 62 floats a Gaussian
+    with open(tmp_path / "a.ply", "rb") as file:
+        count = int([file.readline() for _ in range(3)][2].split()[2])
+        while file.readline() != b"end_header\n":
+            pass
+        rows = np.fromfile(file, "<f4").reshape(count, 62)
+    np.testing.assert_array_equal(rows[:, :3], model.means.detach())
+    np.testing.assert_array_equal(rows[:, 54], model.opacity_logits.detach())
+    np.testing.assert_array_equal(rows[:, 58:], model.quats.detach())
+
+
+@pytest.mark.parametrize("degree", [0, 4, -1, 3.0])
+def test_a_degree_below_that_of_the_model_or_above_3_is_refused(tmp_path, degree):
+    with pytest.raises(ValueError, match="sh_degree: expected"):
+        save_ply(tmp_path / "a.ply", random_model(sh_degree=1), sh_degree=degree)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

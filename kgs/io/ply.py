@@ -34,7 +34,9 @@ SCALARS = {
 }
 
 
-def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None) -> None:
+def save_ply(
+    path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None, sh_degree: int | None = None
+) -> None:
     """Write a model as a 3DGS PLY file, all harmonics included; the file appears whole or not at all.
 
     Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit.
@@ -47,21 +49,32 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
         path: the file to write, or a link to it; its folder exists.
         model: the Gaussians.
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
+        sh_degree: the degree of the harmonics in the file, from that of the model to 3; those that the model lacks are
+            zeros. Some programs, as the viewer of 3D Gaussian Splatting, read files of degree 3 only. None: the
+            model's.
 
     Raises:
         TypeError: `model` is not a GaussianModel.
-        ValueError: `offset` has another shape, or a value is not finite in float32.
+        ValueError: `offset` has another shape, `sh_degree` is out of range, or a value is not finite in float32.
     """
     check_kind("model", model, GaussianModel)
     values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
     n, means = len(model), values["means"].astype(np.float64)
     if offset is not None:  # not + 0: that would lose the sign of zero
         means += as_vector("offset", offset)
-    rest = values["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * model.sh_rest.shape[1])
-    parts = [means, np.zeros((n, 3)), values["sh_dc"][:, 0], rest, values["opacity_logits"][:, None]]
+    bands = SH_SIZES[_check_degree(sh_degree, model)] - 1
+    rest = np.zeros((n, 3, bands), values["sh_rest"].dtype)
+    rest[:, :, : model.sh_rest.shape[1]] = values["sh_rest"].transpose(0, 2, 1)
+    parts = [
+        means,
+        np.zeros((n, 3)),
+        values["sh_dc"][:, 0],
+        rest.reshape(n, 3 * bands),
+        values["opacity_logits"][:, None],
+    ]
     with np.errstate(over="ignore"):
         columns = np.hstack([*parts, values["log_scales"], values["quats"]], dtype="<f4", casting="unsafe")
-    names = [*"xyz", "nx", "ny", "nz", *_splat_names(rest.shape[1])]
+    names = [*"xyz", "nx", "ny", "nz", *_splat_names(3 * bands)]
     bad = np.flatnonzero(~np.isfinite(columns).all(axis=0))
     if len(bad):
         raise ValueError(f"model: expected values that are finite in float32, got others in {names[bad[0]]}")
@@ -74,9 +87,9 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment {comment}" for comment in comments),
-        f"element vertex {n}",
+        f"element vertex {n}",  # the third line: the viewer of 3D Gaussian Splatting looks for it only there
         *(f"property {position if name in 'xyz' else 'float'} {name}" for name in names),
+        *(f"comment {comment}" for comment in comments),
         "end_header",
     ]
     header = "".join(f"{line}\n" for line in lines)
@@ -158,6 +171,17 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
     if not np.isfinite(vector).all():
         raise ValueError(f"{name}: expected finite numbers, got {vector.tolist()}")
     return vector
+
+
+def _check_degree(value: int | None, model: GaussianModel) -> int:
+    """The degree of the harmonics in a file; a ValueError if it cannot be that."""
+    least = model.max_sh_degree
+    most = len(SH_SIZES) - 1
+    if value is None:
+        return least
+    if not isinstance(value, int | np.integer) or not least <= value <= most:
+        raise ValueError(f"sh_degree: expected an integer from {least}, the model's, to {most}, got {value!r}")
+    return int(value)
 
 
 def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[Any]]) -> bool:
