@@ -31,7 +31,7 @@ class GaussianModel(nn.Module):
     Args:
         means: centres in world units, `(N, 3)`, float32 or float64.
         quats: rotations as quaternions w, x, y, z of any norm from 1e-38 on, `(N, 4)`.
-        log_scales: natural logarithm of the standard deviations in world units, `(N, 3)`.
+        log_scales: natural logarithm of the standard deviations in world units, `(N, 3)`; -inf for a flat disc.
         opacity_logits: `(N,)`.
         sh_dc: harmonics of degree 0, `(N, 1, 3)`.
         sh_rest: harmonics of degree 1 and above, `(N, K - 1, 3)` with K = 1, 4, 9 or 16.

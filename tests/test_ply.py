@@ -12,9 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from kgs import GaussianRenderer
+from kgs import Densifier, GaussianRenderer
+from kgs.datasets import Views
+from kgs.fit.prune import contributions
+from kgs.io.glb import save_glb
 from kgs.io.ply import load_ply, save_ply
 from kgs.model import GaussianModel
+from kgs.page.data import pack
 
 
 def same(one, two):
@@ -221,6 +225,60 @@ def test_values_that_float32_cannot_hold_are_not_written(tmp_path):
         with pytest.raises(ValueError, match="finite in float32, got others in f_rest_2"):
             save_ply(tmp_path / "a.ply", model)
     assert not list(tmp_path.iterdir())
+
+
+DISC = torch.tensor([-1.0, -2.0, -math.inf])  # scales of a flat disc: its third axis has no extent
+
+
+def test_flat_discs_come_back(tmp_path):
+    model = random_model()
+    with torch.no_grad():
+        model.log_scales[2] = DISC
+        model.log_scales[4] = -math.inf
+    save_ply(tmp_path / "a.ply", model)
+    assert same(model, load_ply(tmp_path / "a.ply"))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degrees", [0.0, 50.0, 90.0])
+def test_a_flat_disc_has_the_footprint_of_an_ellipse(tmp_path, each_backend, degrees, antialiased):
+    model = random_model(1, 0)
+    angle = math.radians(degrees)
+    with torch.no_grad():
+        model.means.copy_(torch.tensor([[0.0, 0.0, 2.0]]))
+        model.quats.copy_(torch.tensor([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]]))  # about x
+        model.log_scales.copy_(DISC)
+    save_ply(tmp_path / "a.ply", model)
+    model = load_ply(tmp_path / "a.ply")
+    renderer = GaussianRenderer(antialiased=antialiased)
+    render = renderer(model(), pinhole(40, 48, 50.0, dtype=torch.float32))
+    widths = [25.0 * math.exp(-1.0), 25.0 * math.exp(-2.0) * math.cos(angle)]  # pixels: a metre is 25 at 2 metres
+    conics = torch.tensor([[1.0 / (widths[0] ** 2 + 0.3), 0.0, 1.0 / (widths[1] ** 2 + 0.3)]])
+    torch.testing.assert_close(render.projected.conics, conics, rtol=1e-4, atol=1e-6)
+    render.image.sum().backward()
+    assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters() if parameter.grad is not None)
+
+
+def test_what_takes_a_splat_takes_flat_discs(tmp_path):
+    model = small_model()
+    with torch.no_grad():
+        model.log_scales[::2] = DISC
+        model.log_scales[1] = -math.inf
+    camera = pinhole(40, 48, 50.0, dtype=torch.float32)
+    views = Views(camera, torch.rand(1, 3, 40, 48), ("0.png",))
+    save_glb(tmp_path / "a.glb", model, torch.eye(3))
+    assert pack(model(), camera, most_bytes=10**6).layout["count"] == len(model)
+    weights = contributions(model, views, near_plane=0.01)
+    assert weights.isfinite().all()
+    assert weights[2] > 0
+    densifier = Densifier(model, torch.optim.Adam(model.parameters()), extent=10.0, grad_threshold=0.0)
+    render = GaussianRenderer()(model(), camera)
+    render.image.sum().backward()
+    densifier.observe(render.projected)
+    report = densifier.step()
+    assert report.cloned > 0
+    assert report.split > 0
+    assert all(not bool(parameter.isnan().any()) for parameter in model.parameters())
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):

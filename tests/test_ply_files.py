@@ -161,6 +161,9 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "nothing but numbers"),
         (handmade(FLOATS, [[*ROW[:9], math.inf, *ROW[10:]]]), "opacity", "got inf in row 0"),
         (handmade(FLOATS, [ROW, [*ROW[:16], math.nan]]), "rot_3", "got nan in row 1"),
+        (handmade(FLOATS, [[*ROW[:9], -math.inf, *ROW[10:]]]), "opacity", "got -inf in row 0"),
+        (handmade(FLOATS, [[*ROW[:11], math.inf, *ROW[12:]]]), "scale_1", "got inf in row 0"),
+        (handmade(FLOATS, [[*ROW[:11], math.nan, *ROW[12:]]]), "scale_1", "got nan in row 0"),
         (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "nothing but numbers"),
@@ -248,5 +251,7 @@ def test_mutated_and_truncated_files_load_or_raise_data_errors(tmp_path, order):
         except DataError:
             refused += 1
         else:
-            assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
+            finite = {name: value.isfinite() for name, value in model.named_parameters()}
+            finite["log_scales"] |= model.log_scales == -math.inf
+            assert all(bool(values.all()) for values in finite.values())
     assert refused > 200

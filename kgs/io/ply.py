@@ -75,9 +75,9 @@ def save_ply(
     with np.errstate(over="ignore"):
         columns = np.hstack([*parts, values["log_scales"], values["quats"]], dtype="<f4", casting="unsafe")
     names = [*"xyz", "nx", "ny", "nz", *_splat_names(3 * bands)]
-    bad = np.flatnonzero(~np.isfinite(columns).all(axis=0))
-    if len(bad):
-        raise ValueError(f"model: expected values that are finite in float32, got others in {names[bad[0]]}")
+    invalid = _invalid(columns, names).any(axis=0)
+    if invalid.any():
+        raise ValueError(f"model: expected values that are finite in float32, got others in {names[invalid.argmax()]}")
     position = "float"
     if _float32_moves(means, values["log_scales"]):
         position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
@@ -113,7 +113,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
 
     Raises:
         DataError: the file cannot be read, its header is wrong, a property is missing, the number of bytes is not what
-            the header says, or a value is not finite.
+            the header says, or a value is not finite. A logarithmic scale of minus infinity, that of a flat disc, is
+            none of these errors.
         ValueError: `origin` has another shape or is not finite.
     """
     path, start = Path(path), np.zeros(3) if origin is None else as_vector("origin", origin)
@@ -143,9 +144,9 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - start
     with np.errstate(over="ignore"):
         table = np.stack([*means.astype(np.float32).T, *(columns[name].astype(np.float32) for name in names[3:])], 1)
-    bad = np.argwhere(~np.isfinite(table))
-    if len(bad):
-        row, column = bad[0]
+    invalid = np.argwhere(_invalid(table, names))
+    if len(invalid):
+        row, column = invalid[0]
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
     means32, dc, sh_rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
     if _float32_moves(means, scales.numpy()):
@@ -171,6 +172,14 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
     if not np.isfinite(vector).all():
         raise ValueError(f"{name}: expected finite numbers, got {vector.tolist()}")
     return vector
+
+
+def _invalid(table: NDArray[np.float32], names: list[str]) -> NDArray[np.bool_]:
+    """Where a table is not finite, a column a name; a scale may be minus infinity, the logarithm of a flat disc's 0."""
+    invalid = ~np.isfinite(table)
+    scales = [i for i, name in enumerate(names) if name.startswith("scale_")]
+    invalid[:, scales] &= table[:, scales] != -np.inf
+    return invalid
 
 
 def _check_degree(value: int | None, model: GaussianModel) -> int:
