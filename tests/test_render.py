@@ -112,6 +112,35 @@ def test_a_splat_is_rendered_as_its_tag_says(llff, tmp_path, tag):
     np.testing.assert_allclose(picture, images[tag is not None], rtol=0, atol=1.0)
 
 
+def moved(splat, path, shift):
+    model = kgs.load_ply(splat)
+    with torch.no_grad():
+        model.means.add_(torch.tensor(shift))
+    save_ply(path, model)
+    return path
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, -100.0), (1000.0, 0.0, 0.0)])
+def test_a_splat_that_no_camera_sees_is_refused_before_anything_is_written(splat, llff, tmp_path, shift):
+    path = moved(splat, tmp_path / "moved.ply", shift)
+    for call, out in ((render, "renders"), (page, "page.html")):
+        with pytest.raises(DataError, match=r"moved\.ply: Gaussians: expected some that a camera of .* got none of 50"):
+            call(path, cameras=llff, out=tmp_path / out)
+        assert not (tmp_path / out).exists()
+
+
+def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
+    render(splat, cameras=llff, out=tmp_path / "all")
+    assert "see no Gaussian" not in capsys.readouterr().out
+    poses = np.load(llff / "poses_bounds.npy")
+    for row in (poses[3], poses[7]):
+        row[:15].reshape(3, 5)[:, 1:3] *= -1.0  # turned about
+    np.save(llff / "poses_bounds.npy", poses)
+    render(splat, cameras=llff, out=tmp_path / "some")
+    assert f"these cameras see no Gaussian of {splat}: 3.png, 7.png" in capsys.readouterr().out
+    assert not cv2.imread(str(tmp_path / "some" / "3.png")).any()
+
+
 def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     out, decoded, plain = tmp_path / "page.html", [], ImageFile.read
     monkeypatch.setattr(ImageFile, "read", lambda file: decoded.append(file.path.name) or plain(file))
