@@ -9,7 +9,6 @@ import os
 import re
 import warnings
 from dataclasses import dataclass, field
-from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,84 +24,87 @@ from kgs.types import SH_SIZES, check_kind
 from .json_files import write_whole
 from .ownership import MADE_BY
 
-MAX_HEADER = 1 << 16
+MAX_HEADER = 1 << 16  # bytes
+# NumPy's codes for the formats and types of PLY files.
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 SCALARS = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+_REST_COUNTS = [3 * (size - 1) for size in SH_SIZES]  # properties f_rest, by degree
 
 
 def save_ply(
     path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None, sh_degree: int | None = None
 ) -> None:
-    """Write a model as a 3DGS PLY file, all harmonics included; the file appears whole or not at all.
+    """Write a model as a 3DGS PLY file with all its harmonics. The write is atomic.
 
     Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit.
-    Where float32 would move more than a tenth of the Gaussians by more than a thousandth of their largest axis (a scene
-    in map coordinates, millions of metres from its origin) x, y and z are doubles. A viewer that reads floats alone
-    cannot show such a scene: write it without the offset. The active degree is a comment, and so is the tag of an
-    antialiased model.
+    Positions are doubles where float32 would move more than a tenth of the Gaussians by more than a thousandth of their
+    largest axis, as in map coordinates, millions of metres from the origin. Viewers that read floats only cannot show
+    such a file: write it without the offset. Comments hold the active degree, and the tag of an antialiased model.
 
     Args:
         path: the file to write, or a link to it; its folder exists.
         model: the Gaussians.
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
-        sh_degree: the degree of the harmonics in the file, from that of the model to 3; those that the model lacks are
-            zeros. Some programs, as the viewer of 3D Gaussian Splatting, read files of degree 3 only. None: the
-            model's.
+        sh_degree: the degree of the harmonics in the file, from the model's to 3. Those that the model lacks are
+            written as zeros, for programs that read files of degree 3 only. None: the model's.
 
     Raises:
         TypeError: `model` is not a GaussianModel.
         ValueError: `offset` has another shape, `sh_degree` is out of range, or a value is not finite in float32.
     """
     check_kind("model", model, GaussianModel)
+    bands = SH_SIZES[_degree_of_file(sh_degree, model)] - 1
     values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
-    n, means = len(model), values["means"].astype(np.float64)
-    if offset is not None:  # not + 0: that would lose the sign of zero
+    means = values["means"].astype(np.float64)
+    if offset is not None:  # adding zeros instead would lose the sign of -0.0
         means += as_vector("offset", offset)
-    bands = SH_SIZES[_check_degree(sh_degree, model)] - 1
-    rest = np.zeros((n, 3, bands), values["sh_rest"].dtype)
-    rest[:, :, : model.sh_rest.shape[1]] = values["sh_rest"].transpose(0, 2, 1)
+    sh_rest = np.zeros((len(model), 3, bands), values["sh_rest"].dtype)
+    sh_rest[:, :, : model.sh_rest.shape[1]] = values["sh_rest"].transpose(0, 2, 1)
     parts = [
         means,
-        np.zeros((n, 3)),
+        np.zeros((len(model), 3)),  # normals
         values["sh_dc"][:, 0],
-        rest.reshape(n, 3 * bands),
+        sh_rest.reshape(len(model), 3 * bands),
         values["opacity_logits"][:, None],
+        values["log_scales"],
+        values["quats"],
     ]
     with np.errstate(over="ignore"):
-        columns = np.hstack([*parts, values["log_scales"], values["quats"]], dtype="<f4", casting="unsafe")
-    names = [*"xyz", "nx", "ny", "nz", *_splat_names(3 * bands)]
-    invalid = _invalid(columns, names).any(axis=0)
+        table = np.hstack(parts, dtype="<f4", casting="unsafe")
+    names = [*"xyz", "nx", "ny", "nz", *_properties_after_normals(3 * bands)]
+    invalid = _invalid(table, names).any(axis=0)
     if invalid.any():
         raise ValueError(f"model: expected values that are finite in float32, got others in {names[invalid.argmax()]}")
     position = "float"
     if _float32_moves(means, values["log_scales"]):
-        position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
+        position = "double"
+        table = np.hstack([means.astype("<f8").view("<f4"), table[:, 3:]])
     comments = [MADE_BY, f"kgs sh_degree {model.sh_degree}"]
     if model.antialiased:
         comments.append("SplatRenderMode: mip")
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        f"element vertex {n}",  # the third line: the viewer of 3D Gaussian Splatting looks for it only there
+        f"element vertex {len(model)}",  # the viewer of 3D Gaussian Splatting expects it in the third line
         *(f"property {position if name in 'xyz' else 'float'} {name}" for name in names),
         *(f"comment {comment}" for comment in comments),
         "end_header",
     ]
     header = "".join(f"{line}\n" for line in lines)
-    write_whole(Path(path), header.encode("ascii") + columns.tobytes())
+    write_whole(Path(path), header.encode("ascii") + table.tobytes())
 
 
 def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> GaussianModel:
     """Read a 3DGS PLY file: ascii or binary, properties in any order and of any scalar type, harmonics of degree 0-3.
 
-    Other properties and elements are skipped. The active degree is the one that kgs wrote down, else that of the
-    harmonics in the file. The model is antialiased where a comment says so: `SplatRenderMode: mip` (of Brush and
-    splat-transform) or `antialiased 1` (of Postshot). Warns where float32 cannot hold the positions and `origin` would
-    help.
+    Other properties and elements are skipped. The active degree is that of a comment of kgs, else that of the harmonics
+    in the file. The model is antialiased if a comment says so: `SplatRenderMode: mip` (Brush, splat-transform, kgs) or
+    `antialiased 1` (Postshot). Scales of -inf, those of flat discs, are read as they are. Warns where float32 cannot
+    hold the positions and an `origin` would help.
 
     Args:
         path: the file to read.
@@ -113,59 +115,52 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
 
     Raises:
         DataError: the file cannot be read, its header is wrong, a property is missing, the number of bytes is not what
-            the header says, or a value is not finite. A logarithmic scale of minus infinity, that of a flat disc, is
-            none of these errors.
+            the header says, or a value is not finite.
         ValueError: `origin` has another shape or is not finite.
     """
-    path, start = Path(path), np.zeros(3) if origin is None else as_vector("origin", origin)
+    path = Path(path)
+    shift = np.zeros(3) if origin is None else as_vector("origin", origin)
     try:
         with open(path, "rb") as file:
             header = _read_header(path, file)
-            elements = header.elements
-            places = [place for place, element in enumerate(elements) if element.name == "vertex"]
-            if len(places) != 1:
-                raise DataError(path, "vertex", f"expected one element of that name, got {len(places)}")
-            vertex = elements[places[0]]
-            if "packed_position" in vertex.codes:
-                raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
-            rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
-            sizes = [3 * (k - 1) for k in SH_SIZES]
-            if rest not in sizes:
-                raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
-            names = [*"xyz", *_splat_names(rest)]
+            vertex = header.elements[_find_vertex(path, header)]
+            rest = _count_harmonics(path, vertex)
+            names = [*"xyz", *_properties_after_normals(rest)]
             for name in names:
                 if name not in vertex.codes:
                     raise DataError(path, name, "expected this property of a splat, got none")
-            columns = _read_columns(path, header.order, elements, places[0], file)
+            columns = _read_columns(path, header, file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
-    means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - start
+    means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - shift
     with np.errstate(over="ignore"):
-        table = np.stack([*means.astype(np.float32).T, *(columns[name].astype(np.float32) for name in names[3:])], 1)
+        others = (columns[name].astype(np.float32) for name in names[3:])
+        table = np.stack([*means.astype(np.float32).T, *others], axis=1)
     invalid = np.argwhere(_invalid(table, names))
     if len(invalid):
         row, column = invalid[0]
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
-    means32, dc, sh_rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
-    if _float32_moves(means, scales.numpy()):
+    parts = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
+    means32, sh_dc, sh_rest, opacity_logits, log_scales, quats = parts
+    if _float32_moves(means, log_scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
     return GaussianModel(
         means32,
         quats,
-        scales,
-        opacity[:, 0],
-        sh_dc=dc[:, None],
-        sh_rest=sh_rest.unflatten(1, (3, rest // 3)).mT,
-        sh_degree=min(header.sh_degree, sizes.index(rest)),
+        log_scales,
+        opacity_logits[:, 0],
+        sh_dc[:, None],
+        sh_rest.unflatten(1, (3, rest // 3)).mT,
+        sh_degree=min(header.sh_degree, _REST_COUNTS.index(rest)),
         antialiased=header.antialiased,
     )
 
 
 def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
-    """Three finite numbers in float64; a ValueError with the argument's name if they are not."""
+    """A vector of three finite numbers as float64; a ValueError that names the argument if it is none."""
     vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
     if vector.shape != (3,):
         raise ValueError(f"{name}: expected shape (3,), got {vector.shape}")
@@ -175,33 +170,39 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
 
 
 def _invalid(table: NDArray[np.float32], names: list[str]) -> NDArray[np.bool_]:
-    """Where a table is not finite, a column a name; a scale may be minus infinity, the logarithm of a flat disc's 0."""
+    """The entries that no splat can have: NaN and infinity, but for the scale of a flat disc, whose logarithm is -inf.
+
+    `names` are the properties in the columns of the table.
+    """
     invalid = ~np.isfinite(table)
     scales = [i for i, name in enumerate(names) if name.startswith("scale_")]
     invalid[:, scales] &= table[:, scales] != -np.inf
     return invalid
 
 
-def _check_degree(value: int | None, model: GaussianModel) -> int:
-    """The degree of the harmonics in a file; a ValueError if it cannot be that."""
+def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
+    """The degree of the harmonics that `save_ply` writes; a ValueError if they cannot hold the model's."""
     least = model.max_sh_degree
     most = len(SH_SIZES) - 1
-    if value is None:
+    if sh_degree is None:
         return least
-    if not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise ValueError(f"sh_degree: expected an integer from {least}, the model's, to {most}, got {value!r}")
-    return int(value)
+    if not isinstance(sh_degree, int | np.integer) or not least <= sh_degree <= most:
+        raise ValueError(f"sh_degree: expected an integer from {least}, the model's, to {most}, got {sh_degree!r}")
+    return int(sh_degree)
 
 
 def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[Any]]) -> bool:
     """Whether float32 would move more than a tenth of the Gaussians by over a thousandth of their largest axis."""
     with np.errstate(over="ignore"):
-        moved = np.abs(means.astype(np.float32) - means).max(axis=1)
-        return bool((moved > 1e-3 * np.exp(log_scales.max(axis=1))).sum() > 0.1 * len(means))
+        shifts = np.abs(means.astype(np.float32) - means).max(axis=1)
+        largest = np.exp(log_scales.max(axis=1))
+    return int((shifts > 1e-3 * largest).sum()) > 0.1 * len(means)
 
 
 @dataclass
 class _Element:
+    """An element of a PLY file, such as "vertex": so many rows of the same properties."""
+
     name: str
     count: int
     codes: dict[str, str] = field(default_factory=dict)  # NumPy's type code of each property, O for a list
@@ -209,30 +210,50 @@ class _Element:
 
 @dataclass
 class _Header:
-    order: str = ""  # of the bytes, a key of BYTE_ORDERS
+    """What the header of a PLY file says."""
+
+    format: str = ""  # a key of BYTE_ORDERS
     elements: list[_Element] = field(default_factory=list)
     sh_degree: int = 3  # the active degree
     antialiased: bool = False
 
     def read_comment(self, comment: str) -> None:
-        """Take over what a comment says of the splat; the last one counts."""
-        match re.split(r"[\s:]+", comment.strip().lower()):
-            case ["kgs", "sh_degree", digits] if re.fullmatch("[0-9]", digits):
-                self.sh_degree = int(digits)
+        """Set what the comment says of the splat; of several comments the last one counts."""
+        match re.split(r"[\s:]+", comment.lower()):
+            case ["kgs", "sh_degree", digit] if re.fullmatch("[0-9]", digit):
+                self.sh_degree = int(digit)
             case ["splatrendermode", mode]:  # default, mip or 2dgs
                 self.antialiased = mode == "mip"
             case ["antialiased", flag]:  # 0 or 1
                 self.antialiased = flag == "1"
 
 
-def _splat_names(rest: int) -> list[str]:
-    """The names of the properties after position and normal, with `rest` of them f_rest."""
+def _properties_after_normals(rest: int) -> list[str]:
+    """The names of a splat's properties behind positions and normals, with `rest` properties f_rest."""
     colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
+def _find_vertex(path: Path, header: _Header) -> int:
+    """The index of the element "vertex"."""
+    indices = [i for i, element in enumerate(header.elements) if element.name == "vertex"]
+    if len(indices) != 1:
+        raise DataError(path, "vertex", f"expected one element of that name, got {len(indices)}")
+    return indices[0]
+
+
+def _count_harmonics(path: Path, vertex: _Element) -> int:
+    """The number of properties f_rest."""
+    if "packed_position" in vertex.codes:
+        raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
+    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
+    if count not in _REST_COUNTS:
+        raise DataError(path, "f_rest", f"expected {_REST_COUNTS} properties of that name, got {count}")
+    return count
+
+
 def _read_header(path: Path, file: BinaryIO) -> _Header:
-    """Read the header, up to where the data begin."""
+    """Read the header; the file is then at the first byte of the data."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
         raise DataError(path, "", "not a PLY file: expected 'ply' in the first line")
     header = _Header()
@@ -244,8 +265,8 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
         match line.decode("ascii", "replace").split():
             case ["end_header"]:
                 break
-            case ["format", name, "1.0"] if name in BYTE_ORDERS and not header.order:
-                header.order = name
+            case ["format", name, "1.0"] if name in BYTE_ORDERS and not header.format:
+                header.format = name
             case ["element", name, digits] if re.fullmatch("[0-9]{1,18}", digits):
                 elements.append(_Element(name, int(digits)))
             case ["property", "list", _, _, name] if elements:
@@ -259,35 +280,54 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
             case _:
                 text = line[:80].decode("ascii", "backslashreplace").rstrip()
                 raise DataError(path, "header", f"expected a line of a PLY header, got {text!r}")
-    if not header.order:
+    if not header.format:
         raise DataError(path, "format", f"expected one of {sorted(BYTE_ORDERS)}, got none")
     return header
 
 
-def _read_columns(
-    path: Path, order: str, elements: list[_Element], place: int, file: BinaryIO
-) -> dict[str, NDArray[np.generic]]:
-    """The properties of the element at `place`; binary data are read only if the file is long enough."""
-    vertex, is_text, begin = elements[place], order == "ascii", file.tell()
-    dtypes = [np.dtype([(name, BYTE_ORDERS[order] + code) for name, code in e.codes.items()]) for e in elements]
-    if any(dtype.hasobject for dtype in dtypes[: place + 1]):
+def _read_columns(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
+    """The properties of the vertices by name, `(N,)` each.
+
+    Binary data are read only if the file has as many bytes as the header says, so a wrong count takes no memory.
+    """
+    index = _find_vertex(path, header)
+    vertex = header.elements[index]
+    dtypes = [_row_dtype(element, BYTE_ORDERS[header.format]) for element in header.elements]
+    if any(dtype.hasobject for dtype in dtypes[: index + 1]):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
+    is_text = header.format == "ascii"
+    data_start = file.tell()
     widths = [len(dtype.names or ()) if is_text else dtype.itemsize for dtype in dtypes]
-    ends = [0, *accumulate(element.count * width for element, width in zip(elements, widths, strict=True))]
-    start, end, total = ends[place], ends[place + 1], ends[-1]
-    available = os.fstat(file.fileno()).st_size - begin
+    sizes = [element.count * width for element, width in zip(header.elements, widths, strict=True)]
+    start = sum(sizes[:index])
+    end = start + sizes[index]
+    total = sum(sizes)
     if is_text:
-        with warnings.catch_warnings(action="error"):
-            try:
-                numbers = np.fromfile(file, np.float64, sep=" ") if total else np.empty(0)
-            except (DeprecationWarning, ValueError) as error:
-                raise DataError(path, "vertex", "expected nothing but numbers after the header") from error
+        numbers = _read_numbers(path, file) if total else np.empty(0)
         available = len(numbers)
-    if available < end or (available != total and not any(dtype.hasobject for dtype in dtypes)):
+    else:
+        available = os.fstat(file.fileno()).st_size - data_start
+    has_lists = any(dtype.hasobject for dtype in dtypes)  # behind the vertices: then the total is not known
+    if available < end or (available != total and not has_lists):
         unit = "numbers" if is_text else "bytes"
         raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
     if is_text:
-        return dict(zip(vertex.codes, numbers[start:end].reshape(vertex.count, widths[place]).T, strict=True))
-    file.seek(begin + start)
-    rows = np.fromfile(file, dtypes[place], vertex.count)
+        table = numbers[start:end].reshape(vertex.count, widths[index])
+        return dict(zip(vertex.codes, table.T, strict=True))
+    file.seek(data_start + start)
+    rows = np.fromfile(file, dtypes[index], vertex.count)
     return {name: rows[name] for name in vertex.codes}
+
+
+def _row_dtype(element: _Element, byte_order: str) -> np.dtype[Any]:
+    """The type of one row of an element in a binary file."""
+    return np.dtype([(name, byte_order + code) for name, code in element.codes.items()])
+
+
+def _read_numbers(path: Path, file: BinaryIO) -> NDArray[np.float64]:
+    """All numbers in the rest of a text file."""
+    with warnings.catch_warnings(action="error"):
+        try:
+            return np.fromfile(file, np.float64, sep=" ")
+        except (DeprecationWarning, ValueError) as error:
+            raise DataError(path, "vertex", "expected nothing but numbers after the header") from error
