@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.errors import DataError
-from kgs.model import GaussianModel
+from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
 
 from .json_files import write_whole
@@ -183,11 +183,11 @@ def _invalid(table: NDArray[np.float32], names: list[str]) -> NDArray[np.bool_]:
 def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
     """The degree of the harmonics that `save_ply` writes; a ValueError if they cannot hold the model's."""
     least = model.max_sh_degree
-    most = len(SH_SIZES) - 1
     if sh_degree is None:
         return least
-    if not isinstance(sh_degree, int | np.integer) or not least <= sh_degree <= most:
-        raise ValueError(f"sh_degree: expected an integer from {least}, the model's, to {most}, got {sh_degree!r}")
+    if not isinstance(sh_degree, int | np.integer) or not least <= sh_degree <= MAX_SH_DEGREE:
+        expected = f"an integer from {least}, the model's, to {MAX_SH_DEGREE}"
+        raise ValueError(f"sh_degree: expected {expected}, got {sh_degree!r}")
     return int(sh_degree)
 
 
