@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
 from kgs.init_points import InitialPoints, initial_points
+from kgs.init_points.in_view import check_in_view
 from kgs.io.console import Stage, each, progress, say, silent
 from kgs.io.figures import write_curve
 from kgs.io.json_files import write_json
@@ -217,18 +218,21 @@ def measure(trainer: Trainer, lpips: Lpips | None = None) -> dict[str, Any]:
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:
-    """Make the initial points that `config.init` asks for; a DataError if the scene, or the file, has none."""
+    """Make the initial points that `config.init` asks for; a DataError if there are none, or no view shows one."""
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
             reason = f"expected points of the layout itself for the init {kind!r}, got none"
             raise DataError(scene.root, "points", reason)
+        check_in_view(scene.points, scene.train, scene.root)
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     rules: dict[str, Any] = {"seed": config.seed, "count": config.init_points, "draw": config.draw}
     rules["pixels"] = scene.train.images[:, 0].numel()
     rules |= {"file": config.init_file, "origin": scene.offset}  # files that kgs writes are in the world's coordinates
-    return initial_points(views, kind, stage=stage, backend=config.backend, **rules)
+    start = initial_points(views, kind, stage=stage, backend=config.backend, **rules)
+    check_in_view(start.points, scene.train, config.init_file or scene.root)
+    return start
 
 
 def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> int:
