@@ -17,9 +17,9 @@ from kgs.cli import main
 from kgs.cli.unposed import settle
 from kgs.errors import DataError
 from kgs.io.console import silent
-from kgs.io.json_files import write_json
 from kgs.io.outputs import write_png
 from kgs.io.ownership import MARK
+from kgs.json_files import write_json
 from kgs.sfm import pose, pose_photos
 from kgs.sfm.place import photo_staging
 from kgs.sfm.read import blurred, open_photos, read_photos

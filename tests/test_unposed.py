@@ -12,7 +12,7 @@ from kgs import cli, sfm
 from kgs.cli.unposed import is_unposed
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
-from kgs.io.json_files import write_json
+from kgs.json_files import write_json
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")

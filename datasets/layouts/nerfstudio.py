@@ -20,7 +20,7 @@ from kgs.datasets.frames import Frame, FrameSet, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
-from kgs.io.json_files import is_number, read_json
+from kgs.json_files import is_number, read_json
 
 Object = dict[str, Any]
 Values = ChainMap[str, Any]  # what holds for a frame: its own entries, then those of the whole file

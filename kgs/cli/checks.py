@@ -16,10 +16,10 @@ from kgs.datasets import folders
 from kgs.datasets.options import check_options
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
-from kgs.io.json_files import read_json
 from kgs.io.outputs import EXPORTS, check_folder
 from kgs.io.ownership import is_own
 from kgs.io.results_folder import fit_staging, replaced_files
+from kgs.json_files import read_json
 from kgs.metrics.weights import weight_files
 
 from .unposed import is_unposed

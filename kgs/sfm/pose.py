@@ -16,9 +16,9 @@ import torch
 
 from kgs.errors import DataError
 from kgs.io.console import Stage, say, silent
-from kgs.io.json_files import read_json, write_json
 from kgs.io.outputs import png_names
 from kgs.io.results_folder import locked
+from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 
 from .aside import Aside, check_space
