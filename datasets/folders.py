@@ -20,15 +20,9 @@ _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
 @cache
-def has_pillow() -> bool:
-    """Whether Pillow is installed."""
-    return find_spec("PIL") is not None
-
-
-@cache
 def has_heic() -> bool:
-    """Whether HEIC can be read: Pillow and pi-heif are installed."""
-    return has_pillow() and find_spec("pi_heif") is not None
+    """Whether HEIC can be read: pi-heif is installed."""
+    return find_spec("pi_heif") is not None
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:

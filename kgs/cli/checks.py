@@ -25,7 +25,7 @@ from kgs.metrics.weights import weight_files
 from .unposed import is_unposed
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
-_ALWAYS = ("torch", "kornia", "numpy", "cv2")
+_ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
 # Kinds of devices of torch; a plugin (entry point "torch.backends") may bring others.
 _DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "maia", "lazy", "vulkan", "meta")
 
@@ -52,7 +52,7 @@ def check_fit(
         raise ValueError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
     unposed = is_unposed(scene)
-    of_photos = ("pycolmap", "PIL") if unposed else ()
+    of_photos = ["pycolmap"] if unposed else []
     _check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2", *of_photos)
     if lpips_weights is not None:
         weight_files(lpips_weights)

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from importlib import import_module
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -82,13 +81,11 @@ def pose_photos(
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be trusted; the message says
             what to do, with the number of matches of each pair.
-        ModuleNotFoundError: pycolmap or Pillow is not installed (extra `sfm`).
+        ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    # a missing package is an error before any work
-    import_module("PIL")
-    with quiet_pycolmap():
+    with quiet_pycolmap():  # a missing package is an error before any work
         pass
     paths = find_photos(folder)
     check_place(out, folder)
