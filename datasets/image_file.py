@@ -172,6 +172,8 @@ def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
         with warnings.catch_warnings(action="ignore"):  # Pillow warns of damaged metadata
             image = _open(kind, file)
             tags = _tags(image)
+        if kind == "HEIC":
+            tags[_ORIENTATION] = _left_to_turn(image, file)
         size = (image.width, image.height)
         tile = (1, 1)
         if kind == "TIFF":
@@ -212,6 +214,19 @@ def _tags(image: Opened) -> dict[int, Any]:
         return dict(exif) | exif.get_ifd(_EXIF)
     except Exception:  # Pillow has no error of its own for damage
         return {}
+
+
+def _left_to_turn(image: Opened, file: IO[bytes]) -> int:
+    """By which orientation of Exif the decoded pixels of a HEIC image are still to be turned.
+
+    Its decoder applies turning and mirroring (irot, imir) of the file, and Exif only repeats them. Some programs
+    write Exif alone.
+    """
+    file.seek(0)
+    data = file.read()
+    if b"irot" in data or b"imir" in data:
+        return 1
+    return image.info.get("original_orientation") or 1
 
 
 def check_size(path: Path, width: int, height: int, size: int) -> None:

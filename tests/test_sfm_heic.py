@@ -51,6 +51,15 @@ def test_pixels_are_upright_and_the_lens_is_known(folder):
         assert photo.focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(48, 64))
 
 
+def test_one_that_exif_alone_turns_is_turned(folder):
+    alone = PHOTO.replace(b"irot", b"free")  # a box that says nothing
+    (folder / "IMG_2.HEIC").write_bytes(alone)
+    upright, turned, _ = read_photos(open_photos(find_photos(folder)), silent)
+    assert turned.exif.orientation == 6
+    assert turned.size == (48, 64)
+    np.testing.assert_array_equal(turned.pixels, upright.pixels)
+
+
 @pytest.mark.parametrize("end", [40, 300, 640])
 def test_a_damaged_one_is_named(folder, end):
     (folder / "IMG_2.HEIC").write_bytes(PHOTO[:end])
