@@ -39,7 +39,7 @@ class Intrinsics:
 
     def same_aspect(self, width: int, height: int) -> bool:
         """Whether an image of this size can be a resized one, each side rounded to whole pixels."""
-        return abs(width * self.height - height * self.width) <= max(self.width, self.height)
+        return abs(width * self.height - height * self.width) <= max(self.width, self.height, width, height)
 
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 calibration matrix for integer pixel centres: the one place where half a pixel is subtracted."""

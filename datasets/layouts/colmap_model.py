@@ -92,8 +92,21 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
 
 
 def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe."""
-    rows = [row for row, track in _tracks(path) if len(image_ids.intersection(track[::2])) >= 2]
+    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe.
+
+    Damage, and points none of which has a track, are a DataError.
+    """
+    rows = []
+    count = 0
+    without_track = 0
+    for row, track in _tracks(path):
+        count += 1
+        without_track += not track
+        if len(image_ids.intersection(track[::2])) >= 2:
+            rows.append(row)
+    if 0 < count == without_track:
+        wanted = "expected points with a track (the photos that observe them)"
+        raise DataError(path, "", f"{wanted}, got {count} without, as LiDAR gives them: use --init file with them")
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")

@@ -7,7 +7,6 @@ import math
 import re
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
-from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.folders import IMAGE_SUFFIXES
-from kgs.datasets.frames import Frame, FrameSet, path_inside
+from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
@@ -36,7 +35,14 @@ _KNOWN = """
     camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
     aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
     applied_transform applied_scale orientation_override auto_scale_poses_override
+    camera_make camera_serial camera_index lens_make shutter_speed sensor_width sensor_height
+    max_resolution center_depth pose_confidence pose_quality
 """
+# Keys that describe a camera in words, passed over unless they name a lens that is not perspective.
+_DESCRIPTIONS = ("camera_type", "lens_model")
+_OTHER_LENS = re.compile(r"(?i)fish|ftheta|latlong|equirect|panoram|spheric|ortho|omni|360|\bvr")
+# Other names of the image size, passed over where they say the same.
+_SIZES = {"image_width": "w", "image_height": "h", "width": "w", "height": "h"}
 # Other keys that may bear on lenses or poses; they are refused, since ignoring them could give wrong cameras.
 _GEOMETRY = re.compile(
     r"(?i)angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
@@ -92,9 +98,10 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(source, "frames", "expected a list of objects, not empty")
     split = {f"{part}_filenames" for part in ("train", "val", "test")} if name == "transforms.json" else set[str]()
-    notes = _check_keys(source, [{key: data[key] for key in data.keys() - split}, *entries])
+    top = {key: data[key] for key in data.keys() - split}
+    notes = _check_keys(source, [ChainMap(top), *(ChainMap(entry, data) for entry in entries)])
     names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
-    images = [ImageFile(path_inside(source, root, name)) for name in names]
+    images = [ImageFile(find_file(source, root, name)) for name in names]
     size = (1, 1)
     if not all("w" in values and "h" in values for values in (ChainMap(entry, data) for entry in entries)):
         size = _first_size(images)
@@ -122,16 +129,25 @@ def _find_photo(source: Path, root: Path, name: str) -> str:
     return next((candidate for candidate in candidates if path_inside(source, root, candidate).is_file()), otherwise)
 
 
-def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
+def _check_keys(source: Path, objects: Iterable[Values]) -> tuple[str, ...]:
     """Refuse unknown keys that bear on lenses or poses; returns a note about the other unknown keys."""
-    known, unused = set(_KNOWN.split()), set()
-    for key, value in chain.from_iterable(item.items() for item in objects):
-        if key in known or _is_empty(value):
-            continue
-        if _GEOMETRY.search(key) or key.endswith("_filenames"):
-            raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
-        unused.add(key[:60])
+    known = set(_KNOWN.split())
+    unused = set()
+    for values in objects:
+        for key, value in values.maps[0].items():
+            if key in known or _is_empty(value) or _is_harmless(key, value, values):
+                continue
+            if _GEOMETRY.search(key) or key.endswith("_filenames"):
+                raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
+            unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
+
+
+def _is_harmless(key: str, value: Any, values: Values) -> bool:
+    """Whether a key only repeats or describes what other keys say of the camera."""
+    if key in _DESCRIPTIONS:
+        return isinstance(value, str) and not _OTHER_LENS.search(value)
+    return key in _SIZES and is_number(value) and value == values.get(_SIZES[key])
 
 
 def _is_empty(value: Any) -> bool:
@@ -161,7 +177,11 @@ def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
 
 def _is_fisheye(source: Path, values: Values) -> bool:
     """Whether the lens is a fisheye: nerfstudio names the model in `camera_model`, instant-ngp has `is_fisheye`."""
-    model, flag, known = _text(source, "camera_model", values, ""), values.get("is_fisheye"), (*_PERSPECTIVE, _FISHEYE)
+    model = _text(source, "camera_model", values, "")
+    flag = values.get("is_fisheye")
+    known = (*_PERSPECTIVE, _FISHEYE)
+    if "camera_make" in values and model not in known and not _OTHER_LENS.search(model):
+        model = ""  # of the device, as in Exif
     if model not in ("", *known):
         raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {', '.join(known)}")
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
