@@ -1,6 +1,6 @@
-"""What a folder holds, as far as the names of its files tell: photos, videos, or a scene and of which layout.
+"""What a folder holds, judged by the names of its files: photos, videos, or a scene and its layout.
 
-Loads neither NumPy nor torch, so that the command can tell at once what is wrong with a folder.
+Loads neither NumPy nor torch, so that the command reports a wrong folder at once.
 """
 
 import os
@@ -166,8 +166,8 @@ def _what_is_there(root: Path) -> str:
         return f"has {count} photos but no camera poses: {_NO_POSES}"
     endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
     for suffixes, advice in ((UNREADABLE_SUFFIXES, _TO_CONVERT), (VIDEO_SUFFIXES, f"videos: {_NO_PHOTOS}")):
-        if found := [ending[1:].upper() for ending in endings if ending in suffixes]:
-            return f"is not a scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
+        if kinds := [ending[1:].upper() for ending in endings if ending in suffixes]:
+            return f"is not a scene: it holds {len(kinds)} {' and '.join(sorted(set(kinds)))} {advice}"
     return (
         "is not a scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
         "transforms.json (nerfstudio)"

@@ -37,7 +37,9 @@ class Frame:
 
     def __post_init__(self) -> None:
         wrong = partial(DataError, self.source, self.name)
-        lens, center, rotation = self.intrinsics, self.pose[:3, 3], self.pose[:3, :3]
+        lens = self.intrinsics
+        center = self.pose[:3, 3]
+        rotation = self.pose[:3, :3]
         numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
         if not np.isfinite(numbers).all():
             raise wrong("expected finite intrinsics, got NaN or infinity")

@@ -88,7 +88,8 @@ def track_points(folder: Path, image_ids: set[int]) -> PointCloud:
 
 
 def _intrinsics(camera: ColmapCamera) -> Intrinsics:
-    numbers, model = camera.params, camera.model
+    numbers = camera.params
+    model = camera.model
     if model.startswith(("SIMPLE_", "RADIAL")):
         numbers = (numbers[0], *numbers)
     fx, fy, cx, cy, *distortion = numbers

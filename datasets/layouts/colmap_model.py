@@ -132,10 +132,13 @@ class _Binary:
     """A file's bytes, read in order; reading beyond their end is a DataError."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._data, self._at = path, read_bytes(path), 0
+        self._path = path
+        self._data = read_bytes(path)
+        self._at = 0
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
-        at, size = self._at, struct.calcsize(form)
+        at = self._at
+        size = struct.calcsize(form)
         self._need(size, what)
         self._at += size
         return struct.unpack_from(form, self._data, at)
@@ -155,7 +158,8 @@ class _Binary:
     def string(self, what: str) -> str:
         if (end := self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)) < 0:
             raise DataError(self._path, what, "expected a name that ends with a zero byte")
-        text, self._at = self._data[self._at : end], end + 1
+        text = self._data[self._at : end]
+        self._at = end + 1
         try:
             return text.decode("utf-8")
         except UnicodeDecodeError as error:

@@ -26,7 +26,8 @@ def load_llff(root: Path) -> FrameSet:
         backward axes and its centre in the world, then height, width and focal length in pixels; the principal point
         is the image's centre. The focal length is scaled to the images that are read.
     """
-    source, folder = root / "poses_bounds.npy", image_folder(root)
+    source = root / "poses_bounds.npy"
+    folder = image_folder(root)
     rows = _read_rows(source)
     if folder is None:
         raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")

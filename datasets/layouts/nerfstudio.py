@@ -26,7 +26,8 @@ Values = ChainMap[str, Any]  # what holds for a frame: its own entries, then tho
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 # The distortion coefficients of Brown-Conrady and of Kannala-Brandt lenses, in OpenCV's order.
-_BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+_BROWN = ("k1", "k2", "p1", "p2", "k3")
+_KANNALA = ("k1", "k2", "k3", "k4")
 _COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
 # Keys that are used; then keys for sorting, framing and normalising a scene, and for what a tool did to the world.
 # The latter change nothing: the world stays that of the file.
@@ -73,14 +74,15 @@ def load_nerfstudio(root: Path) -> FrameSet:
 
 def _listed(root: Path, data: Object, key: str, frames: list[Frame]) -> list[Frame]:
     """The frames in the file's list `key` of file names, sorted by name."""
-    source, names = root / "transforms.json", data.get(key) or []
+    source = root / "transforms.json"
+    names = data.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise DataError(source, key, "expected a list of file names")
     by_name = {frame.name: frame for frame in frames}
-    found = sorted({_find_photo(source, root, name) for name in names})
-    if missing := [name for name in found if name not in by_name]:
-        raise DataError(source, key, f"expected names of frames, got {missing[0][:200]!r}")
-    return [by_name[name] for name in found]
+    listed = sorted({_find_photo(source, root, name) for name in names})
+    if unknown := [name for name in listed if name not in by_name]:
+        raise DataError(source, key, f"expected names of frames, got {unknown[0][:200]!r}")
+    return [by_name[name] for name in listed]
 
 
 def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[str, ...]]:
@@ -157,21 +159,26 @@ def _is_empty(value: Any) -> bool:
 def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
     """A frame's lens; `size` is the image size if the file does not give it."""
     fisheye = _is_fisheye(source, values)
-    width, height = _number(source, "w", values, size[0]), _number(source, "h", values, size[1])
+    width = _number(source, "w", values, size[0])
+    height = _number(source, "h", values, size[1])
     if not (width.is_integer() and height.is_integer()):
         raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
-    fx, fy = _focal(source, "x", values, width), _focal(source, "y", values, height)
-    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    fx = _focal(source, "x", values, width)
+    fy = _focal(source, "y", values, height)
+    fx = fy if fx is None else fx
+    fy = fx if fy is None else fy
     if fx is None or fy is None:
         raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
-    used, frame = _KANNALA if fisheye else _BROWN, values.maps[0]
+    used = _KANNALA if fisheye else _BROWN
+    frame = values.maps[0]
     of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else values
     for key in _COEFFICIENTS:
         if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
             raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
     distortion = tuple(_number(source, key, values, 0.0) for key in used)
-    cx, cy = _number(source, "cx", values, width / 2), _number(source, "cy", values, height / 2)
+    cx = _number(source, "cx", values, width / 2)
+    cy = _number(source, "cy", values, height / 2)
     return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
 
 
@@ -222,7 +229,8 @@ def _shown(value: Any) -> str:
 
 def _opencv_pose(path: Path, frame: Object) -> Tensor:
     """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64."""
-    rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
+    rows = frame.get("transform_matrix")
+    name = f"transform_matrix of {str(frame.get('file_path'))[:200]}"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
     if len(rows) != 4 or not all(is_number(x) for row in rows for x in row):

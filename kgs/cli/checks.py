@@ -164,20 +164,20 @@ def _why_no_device(kind: str) -> str:
 
 
 def _check_layout(scene: Path) -> None:
-    """A DataError where this is no scene."""
+    """Raise a DataError unless this is a scene."""
     if folders.layout_of(scene) is None:
         raise DataError(scene, "", folders.why_no_scene(scene))
 
 
 def _check_scene(scene: Path) -> None:
-    """A DataError where this is no scene, or one without a single photo."""
+    """Raise a DataError unless this is a scene with at least one photo."""
     _check_layout(scene)
     if not folders.has_photos(scene):
         raise DataError(scene, "", "has camera poses but no photos: expected them in images/, or where its files say")
 
 
 def _check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
-    """What can be said of unposed photos; their headers are read where a factor shrinks them."""
+    """Check a folder of unposed photos and what is asked of it; reads their headers only where `downscale` is given."""
     from kgs.sfm.find import find_photos
     from kgs.sfm.place import check_place
 
