@@ -41,7 +41,7 @@ from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_ph
 from .write import level_and_scale, write_images, write_model
 
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
-SETTINGS = 4  # increased by every change after which the same photos give other files
+SETTINGS = 5  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
