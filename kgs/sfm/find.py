@@ -34,8 +34,8 @@ def find_photos(folder: Path) -> list[Path]:
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
     unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
-    copied = _converted(folder)
-    if others := [path for path in files if path.suffix.lower() in unreadable and path not in copied]:
+    converted = _converted(folder)
+    if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
         wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed(others)}). "
         raise DataError(folder, "", wrong + CONVERT)
     if not paths and videos:
@@ -55,15 +55,15 @@ def find_photos(folder: Path) -> list[Path]:
 
 def list_photos(folder: Path) -> list[Path]:
     """The photos of a folder that can be read, sorted by name; with HEIC if pi-heif is installed."""
-    copied = _converted(folder)
-    return [path for path in list_images(folder, _readable()) if path.is_file() and path not in copied]
+    converted = _converted(folder)
+    return [path for path in list_images(folder, _readable()) if path.is_file() and path not in converted]
 
 
 def notes_on(folder: Path) -> list[str]:
     """What is in a folder of photos and not used, one sentence each."""
     notes = list(folders.unused_files(folder))
-    if copied := sorted(_converted(folder)):
-        notes.append(f"{len(copied)} raw or HEIC files are not used, as JPEGs of the same names are: {listed(copied)}")
+    if converted := sorted(_converted(folder)):
+        notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed(converted)}")
     return notes
 
 
