@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from kgs.fit.config import FitConfig
-from kgs.io.json_files import write_json
 from kgs.io.ply import save_ply
+from kgs.json_files import write_json
 from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel
 

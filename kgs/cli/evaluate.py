@@ -24,7 +24,7 @@ def evaluate(
         backend: auto: that of the fit.
     """
     from kgs.fit.saved import load_fit
-    from kgs.io.json_files import read_json, write_json
+    from kgs.json_files import read_json, write_json
     from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips

@@ -19,12 +19,17 @@ def is_unposed(scene: Path) -> bool:
 
 
 def announce_unposed(photos: Path, out: Path, request: dict[str, Any], config: FitConfig, size: int | None) -> None:
-    """Say what a fit of unposed photos takes, from the size of the first of them; arguments as of `find_scene`."""
+    """Say what of a folder of unposed photos is not used, and what a fit takes, from the size of the first of them.
+
+    Arguments are those of `find_scene`.
+    """
     from kgs.datasets.image_file import read_size
     from kgs.fit.forecast import forecast
-    from kgs.sfm.find import find_photos
+    from kgs.sfm.find import find_photos, notes_on
     from kgs.sfm.read import LONGEST
 
+    for note in notes_on(photos):
+        say(note)
     paths = find_photos(photos)
     width, height = read_size(paths[0])
     longest = max(width, height)

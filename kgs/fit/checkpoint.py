@@ -21,9 +21,9 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
-from kgs.io.json_files import is_number, parse_json
 from kgs.io.ownership import MADE_BY
 from kgs.io.results_folder import previous
+from kgs.json_files import is_number, parse_json
 
 from .config import FitConfig, timetable
 

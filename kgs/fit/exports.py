@@ -8,9 +8,9 @@ from kgs.io.console import each
 from kgs.io.encoders import film_suffix
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
-from kgs.io.json_files import write_json
 from kgs.io.outputs import FILMS
 from kgs.io.ownership import is_own
+from kgs.json_files import write_json
 
 from .trainer import Trainer
 

@@ -21,7 +21,7 @@ from kgs.camera import pinhole_cameras
 from kgs.errors import DataError
 from kgs.init_points.dense import FEWEST, MOST, PIXELS_OF_A_POINT
 from kgs.io.film import FRAMES, LONGEST
-from kgs.io.json_files import read_json, write_json
+from kgs.json_files import read_json, write_json
 from kgs.machine import check_device, versions
 from kgs.renderer import GaussianRenderer
 from kgs.types import Gaussians

@@ -16,11 +16,11 @@ from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.in_view import check_in_view
 from kgs.io.console import Stage, each, progress, say, silent
 from kgs.io.figures import write_curve
-from kgs.io.json_files import write_json
 from kgs.io.outputs import check_folder, png_names, write_png
 from kgs.io.ownership import is_own
 from kgs.io.ply import save_ply
 from kgs.io.results_folder import CHECKPOINT, fit_staging, is_finished, locked, previous, replaced_files
+from kgs.json_files import write_json
 from kgs.machine import check_tools, peak_rss_mb, versions
 from kgs.metrics.coverage import measure_coverage
 from kgs.metrics.evaluate import evaluate

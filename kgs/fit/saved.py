@@ -10,8 +10,8 @@ from torch import Tensor
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.io.json_files import is_number, read_json
 from kgs.io.results_folder import CHECKPOINT, complete_stopped_move
+from kgs.json_files import is_number, read_json
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 

@@ -8,8 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.json_files import write_whole
 
-from .json_files import write_whole
 from .ownership import MADE_BY
 
 # One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The

@@ -18,10 +18,10 @@ from torch import Tensor
 
 import kgs
 from kgs.harmonics import SH_C0
+from kgs.json_files import write_whole
 from kgs.model import GaussianModel
 from kgs.types import check_kind
 
-from .json_files import write_whole
 from .ownership import MADE_BY
 from .ply import as_vector
 

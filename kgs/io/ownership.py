@@ -8,7 +8,9 @@ import shutil
 from collections.abc import Collection
 from pathlib import Path
 
-MADE_BY = "made by kgs"
+from kgs.json_files import GENERATOR
+
+MADE_BY = GENERATOR
 MARK = MADE_BY.encode()
 _FOLDER_MARK = ".kgs"  # an empty file in a temporary folder
 _HEAD, _TAIL = 2**20, 2**10  # bytes that are searched: the mark is at the end of films, else in the header

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.errors import DataError
+from kgs.json_files import write_whole
 from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
 
-from .json_files import write_whole
 from .ownership import MADE_BY
 
 MAX_HEADER = 1 << 16  # bytes

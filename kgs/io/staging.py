@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from kgs.errors import DataError
+from kgs.json_files import read_json, write_json
 
-from .json_files import read_json, write_json
 from .ownership import is_own, make_own_folder, remove_own_images
 
 _LIST = "files.json"

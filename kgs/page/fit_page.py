@@ -19,9 +19,9 @@ from kgs.fit.saved import SavedFit
 from kgs.io.cameras import rolled
 from kgs.io.console import each, say
 from kgs.io.film import film_within
-from kgs.io.json_files import read_json
 from kgs.io.outputs import film_in
 from kgs.io.ownership import is_own
+from kgs.json_files import read_json
 from kgs.model import GaussianModel
 
 from . import Picture, write_page

@@ -7,10 +7,9 @@ import uuid
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from kgs.errors import DataError
+from .errors import DataError
 
-from .ownership import MADE_BY
-
+GENERATOR = "made by kgs"  # what tells an object that kgs wrote from the user's
 _MOST_BYTES = 64 * 2**20
 
 
@@ -37,10 +36,10 @@ def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGua
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all; a ValueError if a number is not finite.
 
-    An object gets the mark of kgs as its first entry, "generator".
+    An object gets `GENERATOR` as its first entry, "generator".
     """
     if isinstance(value, dict):
-        value = {"generator": MADE_BY} | value
+        value = {"generator": GENERATOR} | value
     write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
