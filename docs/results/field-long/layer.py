@@ -35,6 +35,7 @@ def curves() -> dict[str, list[dict[str, float]]]:
 
 
 def main() -> None:
+    """Write layer.png: the photos held out on the left, the training photos on the right."""
     measured = curves()
     figure = Figure(figsize=(9.6, 3.6), dpi=160, layout="constrained", facecolor="white")
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
