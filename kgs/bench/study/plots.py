@@ -60,7 +60,8 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
     captions = {}
     for name, (points_of, xlabel, ylabel, caption) in _PLOTS.items():
         if len(points := points_of(frame)):
-            panels(points, xlabel=xlabel, ylabel=ylabel).savefig(out / f"{name}.png")
+            scale = "log" if name == "thresholds" else "linear"
+            panels(points, xlabel=xlabel, ylabel=ylabel, xscale=scale).savefig(out / f"{name}.png")
             captions[f"{name}.png"] = caption
     return captions
 
