@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from kgs.io.figures import DEFAULT, WITHOUT
 
@@ -44,6 +45,9 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
                 found[f"from {start}"] = axis.plot([], [], "h", color="grey", fillstyle=fill)[0]
         axis.set_title(title, fontsize=9)
         axis.set(**axes)
+        if axis.get_xscale() == "log":
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set(major_formatter="{x:g}", minor_formatter="")
         axis.grid(alpha=0.3)
         if named:
             axis.set_yticks(some.y, some.name, fontsize=8)
