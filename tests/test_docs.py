@@ -75,7 +75,7 @@ NUMBERS = [
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [AUTO.drop, AUTO.undropped_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
     ("docs/comparison.md", "initial points, of which there are # to #", [FEWEST, MOST]),
-    ("docs/how-to-photograph.md", "Today a fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
+    ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
     ("docs/measured.md", "| fit, # steps |", [FEW.steps]),
     ("docs/measured.md", "from # to #, for # steps with three views and # with more", [FEWEST, MOST, *STEPS_OF_BOTH]),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
@@ -96,6 +96,8 @@ NUMBERS = [
     ("docs/recipe.md", "| opacities below # | they fade", [AUTO.recipe.prune_opacity]),
     ("docs/recipe.md", "| # t/T to the end | # t/T, none", [PAPER.drop, AUTO.drop]),
     ("docs/recipe.md", "none in the last # steps", [AUTO.undropped_steps]),
+    ("notebooks/03_three_views.ipynb", "`kgs fit` takes # steps on larger photos", [FEW.steps]),
+    ("notebooks/03_three_views.ipynb", "with a drop rate that grows to #", [AUTO.drop]),
     ("docs/departures.md", "| # x the 1st percentile", [PAPER.recipe.near_plane]),
 ]
 
