@@ -71,6 +71,7 @@ STEPS_OF_BOTH = [FEW.steps, MANY.steps]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [
     ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
+    ("README.md", "whose rate grows to #.", [AUTO.drop]),
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [AUTO.drop, AUTO.undropped_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
