@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from kgs.io.figures import DEFAULT, WITHOUT
 
@@ -44,6 +45,9 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
                 found[f"from {start}"] = axis.plot([], [], "h", color="grey", fillstyle=fill)[0]
         axis.set_title(title, fontsize=9)
         axis.set(**axes)
+        if axis.get_xscale() == "log":
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set(major_formatter="{x:g}", minor_formatter="")
         axis.grid(alpha=0.3)
         if named:
             axis.set_yticks(some.y, some.name, fontsize=8)
@@ -60,7 +64,8 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
     captions = {}
     for name, (points_of, xlabel, ylabel, caption) in _PLOTS.items():
         if len(points := points_of(frame)):
-            panels(points, xlabel=xlabel, ylabel=ylabel).savefig(out / f"{name}.png")
+            scale = "log" if name == "thresholds" else "linear"
+            panels(points, xlabel=xlabel, ylabel=ylabel, xscale=scale).savefig(out / f"{name}.png")
             captions[f"{name}.png"] = caption
     return captions
 
