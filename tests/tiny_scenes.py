@@ -139,8 +139,8 @@ def write_config(folder: Path) -> None:
 
 def write_lpips(folder: Path) -> None:
     with torch.device("meta"):
-        shapes = {name: tuple(value.shape) for name, value in Lpips("alexnet").state_dict().items()}
+        shapes = {name: tuple(value.shape) for name, value in Lpips().state_dict().items()}
     features = {name: np.zeros(shape, np.float16) for name, shape in shapes.items() if name.startswith("features")}
     heads = {name: np.linspace(0, 1, shape[0], dtype=np.float32) for name, shape in shapes.items() if "lin" in name}
-    np.savez_compressed(folder / "alexnet_features.npz", **features)  # type: ignore[arg-type]  # numpy's stubs
-    np.savez(folder / "lpips_lin_alexnet.npz", **heads)  # type: ignore[arg-type]
+    np.savez_compressed(folder / "vgg16_features.npz", **features)  # type: ignore[arg-type]  # numpy's stubs
+    np.savez(folder / "lpips_lin_vgg16.npz", **heads)  # type: ignore[arg-type]

@@ -137,7 +137,7 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_lpips(folder: Path) -> None:
-    for name, value in Lpips.load(folder, "alexnet").state_dict().items():
+    for name, value in Lpips.load(folder).state_dict().items():
         check_range(name, value, -3.5e38, 3.5e38)
 
 
@@ -189,7 +189,7 @@ SCENE_READERS = (
     ),
     Reader("nerfstudio", write_nerfstudio, _read, (("transforms.json", damaged_json),)),
 )
-_PNG, _HEADS = "image.png", "lpips_lin_alexnet.npz"
+_PNG, _HEADS = "image.png", "lpips_lin_vgg16.npz"
 _CHECKPOINT = "checkpoint.safetensors"
 _CLOUDS = {"ply": ("points.ply", damaged_bytes), "xyz": ("points.xyz", damaged_text)}
 FILE_READERS = (
@@ -212,7 +212,7 @@ FILE_READERS = (
         (
             (_HEADS, damaged_bytes),
             (_HEADS, damaged_zip_member),
-            ("alexnet_features.npz", damaged_bytes),
+            ("vgg16_features.npz", damaged_bytes),
         ),
     ),
     _image_reader("PNG", "png", (_PNG, damaged_bytes), (_PNG, damaged_png_chunk), channels=4),
