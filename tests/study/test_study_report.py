@@ -13,9 +13,9 @@ from study_rows import ABLATIONS, MAIN, full, made_up, psnrs, student
 pytest.importorskip("pandas")
 
 from kgs import __version__
-from kgs.bench.study.plots import STYLES
-from kgs.bench.study.presets import FAMILIES, METHODS
-from kgs.bench.study.report import write_report
+from kgs.study.plots import STYLES
+from kgs.study.presets import FAMILIES, METHODS
+from kgs.study.report import write_report
 
 TEXTS = ("sparse.csv", "sparse.md", "index.html")
 PLOTS = ("forest.png", "curves.png", "gap.png", "cost.png", "coadaptation.png", "thresholds.png")
@@ -52,7 +52,7 @@ CASES = {
 @pytest.fixture(scope="module", autouse=True)
 def _coarse_plots():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.study.plots.DPI", 40)  # time
+        patch.setattr("kgs.study.plots.DPI", 40)  # time
         yield
 
 
@@ -72,7 +72,7 @@ def report(tmp_path_factory):
 @pytest.fixture(scope="module")
 def markdown(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.study.report.write_plots", lambda *_: {})  # time
+        patch.setattr("kgs.study.report.write_plots", lambda *_: {})  # time
         return write_report(FULL, tmp_path_factory.mktemp("text") / "new", "kgs study --preset cpu", 99)
 
 

@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 
-from kgs.bench.study.rivals import SelectiveDrop
+from kgs.study.rivals import SelectiveDrop
 
 
 def layer(rate, scores):

@@ -16,12 +16,12 @@ import torch
 from study_rows import tiny_cell
 
 from kgs import DataError
-from kgs.bench.study import cells as cells_module
-from kgs.bench.study.cells import FULL, sparse_cell
-from kgs.bench.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
 from kgs.cli import main
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
+from kgs.study import cells as cells_module
+from kgs.study.cells import FULL, sparse_cell
+from kgs.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
 
 
 @pytest.fixture

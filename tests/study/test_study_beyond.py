@@ -9,13 +9,13 @@ import torch
 from init_point_scenes import as_views
 
 from kgs import DataError
-from kgs.bench.study import beyond, study
-from kgs.bench.study.beyond import Target, beyond_cell, beyond_cells, from_the_middle, measure_target, synthetic_targets
-from kgs.bench.study.beyond_report import write_beyond
 from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Scene, pinholes
 from kgs.datasets.synthetic import ARC_CENTER, ARC_HEIGHT, ARC_RADIUS, ARC_SPAN, room, synthetic_depths, views_beyond
 from kgs.geometry import camera_centers
+from kgs.study import beyond, study
+from kgs.study.beyond import Target, beyond_cell, beyond_cells, from_the_middle, measure_target, synthetic_targets
+from kgs.study.beyond_report import write_beyond
 
 SIZE = (24, 32)
 

@@ -49,7 +49,7 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     code = [row["result"].get("revision") or "of no known commit" for row in rows]
     origin = [f"Command: {command}.", f"Figures: {'; '.join(made)}.", f"Cells by commit of kgs: {_counts(code)}."]
     origin += [f"Cells by versions and machine: {_counts(versions)}."]
-    folders = ChoiceLoader([PackageLoader("kgs.bench.study", ""), PackageLoader("kgs.page", "")])
+    folders = ChoiceLoader([PackageLoader("kgs.study", ""), PackageLoader("kgs.page", "")])
     page = Environment(loader=folders, autoescape=True, trim_blocks=True)
     page.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
     notes = page.get_template("notes.txt").render().splitlines()

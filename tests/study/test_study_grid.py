@@ -13,8 +13,8 @@ from unittest import mock
 import pytest
 from grid_cells import cells_in, do, processes_left, times_done
 
-from kgs.bench.study import grid
-from kgs.bench.study.grid import read_rows, run_grid
+from kgs.study import grid
+from kgs.study.grid import read_rows, run_grid
 
 CELLS = [{"x": x, "name": "a"} for x in range(6)]
 
@@ -153,7 +153,7 @@ def test_a_killed_grid_leaves_no_process_and_goes_on(tmp_path, monkeypatch, thre
     script = f"""
 from pathlib import Path
 from grid_cells import do
-from kgs.bench.study.grid import run_grid
+from kgs.study.grid import run_grid
 run_grid({cells!r}, do, Path({str(path)!r}), processes=2)
 """
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)

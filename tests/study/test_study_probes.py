@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kgs.bench.study.overfitting import BINS, coadaptation, count_over_threshold
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.trainer import Trainer
@@ -14,6 +13,7 @@ from kgs.harmonics import SH_C0
 from kgs.init_points import initial_points
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.study.overfitting import BINS, coadaptation, count_over_threshold
 
 # -- the probe of co-adaptation ------------------------------------------------------------------------------------
 

@@ -9,8 +9,8 @@ import pytest
 from study_rows import MAIN, made_up, psnrs, student
 
 from kgs.bench.output import mean_sd
-from kgs.bench.study.findings import findings, headline, regret
-from kgs.bench.study.pairs import (
+from kgs.study.findings import findings, headline, regret
+from kgs.study.pairs import (
     Difference,
     Noise,
     cells_frame,
@@ -20,8 +20,8 @@ from kgs.bench.study.pairs import (
     paired_difference,
     wide,
 )
-from kgs.bench.study.published import PUBLISHED, benchmark_of, priors, published, published_difference
-from kgs.bench.study.tables import BEST_OF_5, sparse_tables
+from kgs.study.published import PUBLISHED, benchmark_of, priors, published, published_difference
+from kgs.study.tables import BEST_OF_5, sparse_tables
 
 PAPER = "progressive 0.2"
 

@@ -7,7 +7,7 @@ import pytest
 from study_rows import tiny_cell
 
 from kgs import DataError
-from kgs.bench.study import grid, presets, study
+from kgs.study import grid, presets, study
 
 
 @pytest.mark.slow
