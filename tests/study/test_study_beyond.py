@@ -30,6 +30,7 @@ def targets(arc):
     return synthetic_targets("arc", arc)
 
 
+@pytest.mark.slow
 def test_cameras_before_the_room_lie_so_many_times_as_far_out():
     for out in (1.0, 2.5):
         centers = camera_centers(views_beyond("room", out, 4, (6, 8)).cameras.extrinsics).numpy()
@@ -38,6 +39,7 @@ def test_cameras_before_the_room_lie_so_many_times_as_far_out():
         np.testing.assert_allclose(centers[:, 2], room.EYE[2], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_cameras_of_the_arc_stay_at_their_distance_and_look_at_its_middle():
     cameras = views_beyond("arc", 3.0, 5, (6, 8)).cameras
     away = camera_centers(cameras.extrinsics).double().numpy() - ARC_CENTER
@@ -48,6 +50,7 @@ def test_cameras_of_the_arc_stay_at_their_distance_and_look_at_its_middle():
     np.testing.assert_allclose(axes, -away / np.linalg.norm(away, axis=1, keepdims=True), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_orbit_s_cameras_lie_on_a_larger_circle():
     near, far = (camera_centers(views_beyond("orbit", out, 3, (6, 8)).cameras.extrinsics) for out in (1.0, 2.0))
     middle = near.mean(dim=0)
@@ -77,6 +80,7 @@ def test_all_that_a_training_view_sees_counts_in_it(arc):
     assert count.max() == 6
 
 
+@pytest.mark.slow
 def test_fewer_pixels_count_farther_out(targets):
     shares = [np.mean([float(shown.float().mean()) for shown in target.shown]) for target in targets.values()]
     assert shares == sorted(shares, reverse=True)
@@ -84,6 +88,7 @@ def test_fewer_pixels_count_farther_out(targets):
     assert 0.3 < shares[-1] < 0.8
 
 
+@pytest.mark.slow
 def test_the_truth_has_no_finite_psnr(targets):
     views = targets[2].views
     truth = iter(views.images.split(1))

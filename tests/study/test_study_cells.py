@@ -118,6 +118,7 @@ def test_what_is_missing_is_named(tmp_path):
 # -- one cell ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_cell_measures_and_repeats_bit_for_bit():
     results = [sparse_cell(tiny_cell("progressive 0.2")) for _ in range(2)]
     for result in results:

@@ -88,6 +88,7 @@ def test_a_single_scene_has_no_interval_over_scenes():
     assert math.isfinite(found.low)
 
 
+@pytest.mark.slow
 def test_the_interval_over_scenes_covers_the_mean_of_all_scenes_as_often_as_it_says():
     """Also of the scenes that were not drawn, where that over seeds does not."""
     rng, held, too_sure, repeats = random.Random(2), 0, 0, 300
