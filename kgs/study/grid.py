@@ -179,7 +179,7 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
             rows.append(json.loads(line))
         except ValueError as error:
             if number < len(lines):
-                raise ValueError(f"{path}: line {number} is not JSON ({error})") from error
+                raise ValueError(f"{path}: line {number}: expected JSON, got an error of its parser: {error}") from error
     if repair and lines:
         with path.open("r+b") as file:
             file.seek(max(0, sum(len(line) + 1 for line in lines[: len(rows)]) - 1))

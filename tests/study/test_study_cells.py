@@ -15,7 +15,6 @@ import pytest
 import torch
 from study_rows import tiny_cell
 
-from kgs import DataError
 from kgs.cli import main
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
@@ -102,17 +101,6 @@ def test_methods_of_one_start_follow_each_other(data):
     assert [cell["method"] for cell in cells] == ["off", "progressive 0.2", "fixed 0.1"] * 2
     assert [cell["scene"] for cell in cells] == ["llff/fern"] * 3 + ["llff/flower"] * 3
     assert {cell["seed"] for cell in cells} == {0}
-
-
-def test_what_is_missing_is_named(tmp_path):
-    with pytest.raises(ValueError, match="preset: expected one of"):
-        sparse_cells("fast", tmp_path)
-    with pytest.raises(DataError, match="KGS_DATA"):
-        sparse_cells("cpu", None)
-    with pytest.raises(DataError, match="llff/fern"):
-        sparse_cells("cpu", tmp_path)
-    with pytest.raises(DataError, match="expected scenes"):
-        sparse_cells("paper", tmp_path)
 
 
 # -- one cell ------------------------------------------------------------------------------------------------------
@@ -231,8 +219,3 @@ def test_lpips_is_measured_where_there_are_weights(kgs_data):
         lpips, unscaled = result[part]["lpips_vgg"], result[part]["lpips_vgg_unscaled"]
         assert 0 < lpips < 2
         assert 0 < unscaled != lpips
-
-
-def test_a_real_scene_needs_a_folder():
-    with pytest.raises(DataError, match="KGS_DATA"):
-        sparse_cell(tiny_cell() | {"scene": "llff/fern"})

@@ -246,15 +246,6 @@ def test_the_built_in_scene_is_shown_but_counts_in_no_mean(tmp_path):
     assert f"off:\nPSNR {psnr:.2f} dB, SSIM {psnr / 31:.3f}, LPIPS {psnr / 110:.3f}" in html
 
 
-def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="rows"):
-        write_report([], tmp_path, "command", 0)
-    rows = FULL[:1]
-    longer = {"cell": rows[0]["cell"] | {"fit": {"steps": 10_000}}, "result": rows[0]["result"]}
-    with pytest.raises(ValueError, match="two for 0"):
-        write_report([*rows, longer], tmp_path, "command", 2)
-
-
 @pytest.mark.slow
 def test_text_is_escaped(report):
     out, _ = report("unknown method, no LPIPS")

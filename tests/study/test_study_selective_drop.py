@@ -74,12 +74,6 @@ def test_scores_do_not_touch_the_stream_of_masks():
     assert torch.equal(plain(torch.ones(50)), scored(torch.ones(50)))
 
 
-@pytest.mark.parametrize("shape", [(4,), (5, 1), (2, 5), (0,)])
-def test_scores_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"scores: expected shape \(5,\)"):
-        layer(0.2, torch.zeros(shape))(torch.ones(5))
-
-
 @pytest.mark.parametrize(
     "scores", [torch.arange(4.0), torch.nn.Parameter(torch.arange(4.0)), torch.arange(4.0, requires_grad=True) * 2]
 )

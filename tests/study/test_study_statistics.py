@@ -262,12 +262,6 @@ def test_numbers_that_are_not_there_are_left_out():
     assert frame.coadaptation.count() == 3
 
 
-def test_two_cells_of_one_seed_are_refused():
-    rows = [made_up("s", 3, "sift", "off", seed) for seed in (1, 0)]
-    with pytest.raises(ValueError, match="two for 1"):
-        cells_frame([*rows, rows[0]])
-
-
 def test_the_papers_figures():
     assert benchmark_of("llff/fern", 3) == benchmark_of("colmap/trex", 6) == "LLFF"
     assert benchmark_of("blender/lego", 8) == "Blender"
