@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 
 from kgs import __version__
@@ -36,34 +37,63 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     """
     frame = cells_frame(rows)
     out.mkdir(parents=True, exist_ok=True)
-    lines = frame.sort_index().assign(fit=frame.fit.map(lambda fit: json.dumps(fit, sort_keys=True)))
-    lines = lines[[*KEYS, "seed", *COLUMNS, "init.kind", *ORIGIN, "fit"]]
-    lines.rename(columns=lambda name: name.replace(".", "_")).to_csv(out / "sparse.csv", index=False)
+    _write_csv(frame, out / "sparse.csv")
     real = frame[frame.scene != SYNTHETIC]
     told = real if len(real) else frame
-    tables, plots, results = sparse_tables(told), write_plots(told, out), findings(told)
-    versions = [", ".join(f"{k} {v}" for k, v in sorted(row["result"].get("versions", {}).items())) for row in rows]
-    made = [f"{len(rows)} of {planned} cells"]
-    made += [f"sparse.jsonl at commit {commit}"] if (commit := revision(out / "sparse.jsonl")) else []
-    made += [f"from {dates.min()} to {dates.max()}"] if len(dates := frame.date.dropna()) else []
-    code = [row["result"].get("revision") or "of no known commit" for row in rows]
-    origin = [f"Command: {command}.", f"Figures: {'; '.join(made)}.", f"Cells by commit of kgs: {_counts(code)}."]
-    origin += [f"Cells by versions and machine: {_counts(versions)}."]
+    tables = sparse_tables(told)
+    plots = write_plots(told, out)
+    conclusions = findings(told)
+    origin = _origin(rows, frame, out, command, planned)
     folders = ChoiceLoader([PackageLoader("kgs.study", ""), PackageLoader("kgs.page", "")])
-    page = Environment(loader=folders, autoescape=True, trim_blocks=True)
-    page.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
-    notes = page.get_template("notes.txt").render().splitlines()
-    text = "\n".join([f"# {TITLE}", "", *(f"- {finding}" for finding in (*results, *origin)), "", ""])
+    templates = Environment(loader=folders, autoescape=True, trim_blocks=True)
+    templates.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
+    notes = templates.get_template("notes.txt").render().splitlines()
+    text = "\n".join([f"# {TITLE}", "", *(f"- {sentence}" for sentence in (*conclusions, *origin)), "", ""])
     for title, table in tables.items():
         text += markdown_table(title, table.columns[1:], table.to_numpy().tolist(), table.columns[0])
     text += "\n".join(f"- {note}" for note in notes) + "\n"
-    content: dict[str, Any] = {"title": TITLE, "findings": results, "origin": origin, "notes": notes, "tables": tables}
-    content["shown"] = [row for row in rows if "pictures" in row["result"]]
-    content["pictures"] = {caption: b64encode((out / name).read_bytes()).decode() for name, caption in plots.items()}
-    html = page.get_template("page.html.jinja").render(**content, version=__version__)
+    html = templates.get_template("page.html.jinja").render(
+        title=TITLE,
+        findings=conclusions,
+        origin=origin,
+        notes=notes,
+        tables=tables,
+        shown=[row for row in rows if "pictures" in row["result"]],
+        pictures={caption: b64encode((out / name).read_bytes()).decode() for name, caption in plots.items()},
+        version=__version__,
+    )
     (out / "sparse.md").write_text(text, encoding="utf-8")
     (out / "index.html").write_text(html, encoding="utf-8")
     return text
+
+
+def _write_csv(frame: pd.DataFrame, path: Path) -> None:
+    """A line per cell, in the order of the rows."""
+    lines = frame.sort_index().assign(fit=frame.fit.map(lambda fit: json.dumps(fit, sort_keys=True)))
+    lines = lines[[*KEYS, "seed", *COLUMNS, "init.kind", *ORIGIN, "fit"]]
+    lines.rename(columns=lambda name: name.replace(".", "_")).to_csv(path, index=False)
+
+
+def _origin(rows: Sequence[Mapping[str, Any]], frame: pd.DataFrame, out: Path, command: str, planned: int) -> list[str]:
+    """Sentences: the command, how many cells of which days, and the commits and machines that made them."""
+    figures = [f"{len(rows)} of {planned} cells"]
+    commit = revision(out / "sparse.jsonl")
+    if commit:
+        figures.append(f"sparse.jsonl at commit {commit}")
+    dates = frame.date.dropna()
+    if len(dates):
+        figures.append(f"from {dates.min()} to {dates.max()}")
+    commits = [row["result"].get("revision") or "of no known commit" for row in rows]
+    versions = [
+        ", ".join(f"{name} {value}" for name, value in sorted(row["result"].get("versions", {}).items()))
+        for row in rows
+    ]
+    return [
+        f"Command: {command}.",
+        f"Figures: {'; '.join(figures)}.",
+        f"Cells by commit of kgs: {_counts(commits)}.",
+        f"Cells by versions and machine: {_counts(versions)}.",
+    ]
 
 
 def _counts(values: Iterable[str]) -> str:
