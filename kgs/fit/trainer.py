@@ -26,12 +26,12 @@ from kgs.drop import DropGaussian
 from kgs.errors import DataError, TrainingDiverged
 from kgs.geometry import camera_extent, typical_depths
 from kgs.init_points import InitialPoints
-from kgs.losses import photometric_loss
+from kgs.losses import TargetMoments, photometric_loss
 from kgs.machine import check_device
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import PARAMETERS, GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians, check_kind
+from kgs.types import Gaussians, Rendering, check_kind
 
 from .checkpoint import (
     PLAIN,
@@ -169,7 +169,9 @@ class Trainer:
             for name, rate in _LEARNING_RATES.items()
         ]
         self.optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
-        self.drop = self.make_drop(seed + 1)
+        self.drop: DropGaussian | None = None
+        if config.drop:
+            self.drop = DropGaussian(config.drop, config.drop_schedule, seed=seed + 1, device=self.device)
         self.renderer = GaussianRenderer(
             self.drop,
             near_plane=self.near_plane,
@@ -193,19 +195,6 @@ class Trainer:
         self._loss = float("nan")
         if self.poses is not None:
             self.poses.depth = start.depth
-
-    def make_drop(self, seed: int) -> DropGaussian | None:
-        """The layer on the opacities, None without dropping. A subclass may return another one."""
-        if not self.config.drop:
-            return None
-        return DropGaussian(self.config.drop, self.config.drop_schedule, seed=seed, device=self.device)
-
-    def before_render(self, camera: PinholeCamera) -> None:
-        """Called before each training render; for subclasses."""
-
-    def penalty(self, gaussians: Gaussians, camera: PinholeCamera) -> Tensor | None:
-        """A term that is added to the loss of a step, 0-d; for subclasses."""
-        return None
 
     def fit(self, callback: "Callable[[Trainer, float], bool] | None" = None) -> None:
         """Train to the end, or until `callback`, called after each step with the trainer and the loss, returns True.
@@ -391,14 +380,8 @@ class Trainer:
         if self.drop is not None:
             self.drop.progress = progress
             self.drop.train(self.step <= self.times.drop)
-        self.before_render(camera)
-        gaussians = self.model()
-        out = self.renderer(gaussians, camera, background)
-        image = view.seen(out.image)
-        loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
-        penalty = self.penalty(gaussians, camera)
-        if penalty is not None:
-            loss = loss + penalty
+        out = self.render_view(self.model(), camera, background)
+        loss = self.loss_of(view.seen(out.image), target, moments)
         looks = self.step % self.look_every == 0 or self.step == self.times.steps or math.isnan(self._loss)
         if looks:
             self._loss = float(loss.detach())
@@ -418,6 +401,16 @@ class Trainer:
                     self.scene = self.poses.step(self.scene, progress)
             self.optimizer.zero_grad(set_to_none=True)
         return self._loss
+
+    def render_view(self, gaussians: Gaussians, camera: PinholeCamera, background: Tensor | None) -> Rendering:
+        """Render a training view, with the drop layer and gradients."""
+        rendering: Rendering = self.renderer(gaussians, camera, background)
+        return rendering
+
+    def loss_of(self, image: Tensor, target: Tensor, moments: TargetMoments) -> Tensor:
+        """The loss of a training view's render, 0-d; `moments` are the SSIM statistics of the target."""
+        weight = self.config.recipe.dssim_weight
+        return photometric_loss(image, target, weight, moments=moments, backend=self.backend)
 
     def _stop_if(self, fault: str) -> None:
         if fault:

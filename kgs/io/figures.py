@@ -13,7 +13,7 @@ from kgs.json_files import write_whole
 from .ownership import MADE_BY
 
 # One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The
-# study has more of them (kgs/bench/study/plots.py); pages show black as the colour of their text.
+# study has more of them (kgs/study/plots.py); pages show black as the colour of their text.
 DEFAULT, WITHOUT = "#CC79A7", "#000000"
 
 

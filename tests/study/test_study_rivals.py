@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kgs.bench.study.rivals import Rival, RivalTrainer, gaussian_scores
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.trainer import Trainer
+from kgs.study.rivals import Rival, RivalTrainer, gaussian_scores
 
 CONFIG = FitConfig(steps=40, drop=0.4, seed=2, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
 

@@ -4,7 +4,7 @@ import random
 
 import mpmath
 
-from kgs.bench.study.presets import METHODS
+from kgs.study.presets import METHODS
 
 TINY = {"steps": 3, "max_gaussians": 400, "evaluations": 1}
 MAIN = ("off", "progressive 0.2", "fixed 0.1")

@@ -50,25 +50,31 @@ def study(
     from .grid import finished_rows, read_rows, run_grid
     from .report import write_report
 
-    folder = os.environ.get("KGS_DATA")
-    place = None if folder is None else Path(folder)
+    data = None if "KGS_DATA" not in os.environ else Path(os.environ["KGS_DATA"])
     if preset == "beyond":
-        cells, path = beyond.beyond_cells(place), out / "beyond.jsonl"
-        do, write = beyond.beyond_cell, beyond_report.write_beyond
+        cells = beyond.beyond_cells(data)
+        path = out / "beyond.jsonl"
+        do_cell = beyond.beyond_cell
+        write = beyond_report.write_beyond
     else:
-        cells, path = presets.sparse_cells(preset, place), out / "sparse.jsonl"
-        do, write = sparse_cell, write_report
-    data, weights = (None if place is None else os.path.abspath(place) for place in (folder, lpips_weights))
+        cells = presets.sparse_cells(preset, data)
+        path = out / "sparse.jsonl"
+        do_cell = sparse_cell
+        write = write_report
     if (report_only or read_rows(path)) and not finished_rows(cells, path):
         raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
-    work = partial(do, data=data, lpips_weights=weights)
+    work = partial(
+        do_cell,
+        data=None if data is None else os.path.abspath(data),
+        lpips_weights=None if lpips_weights is None else os.path.abspath(lpips_weights),
+    )
     try:
         if not report_only:
             run_grid(cells, work, path, scheduler=scheduler, processes=processes)
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
-            scenes = "" if preset == "quick" or folder is None else "KGS_DATA=SCENES "
+            scenes = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
             options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
             write(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
     return int(len(rows) < len(cells))

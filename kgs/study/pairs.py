@@ -19,7 +19,8 @@ _OTHERS = ["init.kind", "curve", *(f"thresholds.{key}" for key in ("distance", "
 _OTHERS += [f"protocol.{key}" for key in ("train", "test", "image_size")]
 _OTHERS += [f"needs.sh_degree.{key}" for key in ("chosen", "by", "gain", "noise")]
 STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
-PSNR, LPIPS = "test.psnr", "test.lpips_vgg_unscaled"
+PSNR = "test.psnr"
+LPIPS = "test.lpips_vgg_unscaled"
 
 
 class Difference(NamedTuple):
@@ -44,14 +45,12 @@ class Difference(NamedTuple):
         def signed(value: float) -> str:
             return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no -0.00
 
-        ends = {" over scenes": self.over_scenes, " over seeds": (self.low, self.high)}
-        named = labels or self.scenes > 1
-        known = [
-            f"[{signed(low)}, {signed(high)}]{label if named else ''}"
-            for label, (low, high) in ends.items()
-            if not math.isnan(low)
-        ]
-        return f"{signed(self.mean)} {', '.join(known)}".rstrip()
+        labels = labels or self.scenes > 1
+        intervals = []
+        for label, (low, high) in {" over scenes": self.over_scenes, " over seeds": (self.low, self.high)}.items():
+            if not math.isnan(low):
+                intervals.append(f"[{signed(low)}, {signed(high)}]{label if labels else ''}")
+        return f"{signed(self.mean)} {', '.join(intervals)}".rstrip()
 
 
 class Noise(NamedTuple):
@@ -81,13 +80,24 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     for these scenes. Over scenes they are taken as drawn from all of their kind: Student's t over the scenes' means,
     k - 1 degrees of freedom for k scenes; none for a single one.
     """
-    counts = differences.count()[differences.count() > 0]
-    means, noise, k = differences.mean().dropna(), noise_floor(differences), len(counts)
-    errors = noise.sd * math.sqrt((1 / counts).sum()) / max(1, k), float(means.std()) / math.sqrt(max(1, k))
-    by_seeds, by_scenes = stats.t.ppf(0.975, (noise.freedom, k - 1)) * errors
+    counts = differences.count()[differences.count() > 0]  # pairs of each scene
+    k = len(counts)
+    means = differences.mean().dropna()
     mean = float(means.mean())
-    over_scenes = (mean - by_scenes, mean + by_scenes)
-    return Difference(int(counts.sum()), mean, mean - by_seeds, mean + by_seeds, noise.sd, k, over_scenes)
+    noise = noise_floor(differences)
+    error_by_seeds = noise.sd * math.sqrt((1 / counts).sum()) / max(1, k)
+    error_by_scenes = float(means.std()) / math.sqrt(max(1, k))
+    by_seeds = stats.t.ppf(0.975, noise.freedom) * error_by_seeds
+    by_scenes = stats.t.ppf(0.975, k - 1) * error_by_scenes
+    return Difference(
+        pairs=int(counts.sum()),
+        mean=mean,
+        low=mean - by_seeds,
+        high=mean + by_seeds,
+        sd=noise.sd,
+        scenes=k,
+        over_scenes=(mean - by_scenes, mean + by_scenes),
+    )
 
 
 def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -102,7 +112,9 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         *group, seed = twice[0]
         raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
     order = {name: k for k, name in enumerate([*cells.scene.unique(), *STARTS, *METHODS])}
-    places = cells[[*KEYS]].assign(**{key: cells[key].map(order).fillna(len(order)) for key in KEYS if key != "views"})
+    places = cells[[*KEYS]].copy()
+    for key in ("scene", "start", "method"):
+        places[key] = cells[key].map(order).fillna(len(order))
     return cells.join(results).iloc[places.sort_values([*KEYS], kind="stable").index]
 
 
@@ -127,7 +139,7 @@ def difference(frame: pd.DataFrame, key: str, value: str, base: str, measure: st
 
 def main_cells(frame: pd.DataFrame, starts: Sequence[str] = ("dense",)) -> pd.DataFrame:
     """The cells of each scene's main setting: as many views as `SCENES` has; else the fewest from dense points."""
-    chosen = {}
+    views = {}
     for (scene,), cells in grouped(frame[frame.start == "dense"], "scene"):
-        chosen[scene] = SCENES[scene] if SCENES.get(scene) in {*cells.views} else cells.views.min()
-    return frame[(frame.views == frame.scene.map(chosen)) & frame.start.isin(starts)]
+        views[scene] = SCENES[scene] if SCENES.get(scene) in {*cells.views} else cells.views.min()
+    return frame[(frame.views == frame.scene.map(views)) & frame.start.isin(starts)]

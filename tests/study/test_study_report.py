@@ -13,9 +13,9 @@ from study_rows import ABLATIONS, MAIN, full, made_up, psnrs, student
 pytest.importorskip("pandas")
 
 from kgs import __version__
-from kgs.bench.study.plots import STYLES
-from kgs.bench.study.presets import FAMILIES, METHODS
-from kgs.bench.study.report import write_report
+from kgs.study.plots import STYLES
+from kgs.study.presets import FAMILIES, METHODS
+from kgs.study.report import write_report
 
 TEXTS = ("sparse.csv", "sparse.md", "index.html")
 PLOTS = ("forest.png", "curves.png", "gap.png", "cost.png", "coadaptation.png", "thresholds.png")
@@ -52,7 +52,7 @@ CASES = {
 @pytest.fixture(scope="module", autouse=True)
 def _coarse_plots():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.study.plots.DPI", 40)  # time
+        patch.setattr("kgs.study.plots.DPI", 40)  # time
         yield
 
 
@@ -72,14 +72,15 @@ def report(tmp_path_factory):
 @pytest.fixture(scope="module")
 def markdown(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.bench.study.report.write_plots", lambda *_: {})  # time
+        patch.setattr("kgs.study.report.write_plots", lambda *_: {})  # time
         return write_report(FULL, tmp_path_factory.mktemp("text") / "new", "kgs study --preset cpu", 99)
 
 
-SLOW = pytest.param("full", marks=pytest.mark.slow)
+QUICK = ("one cell", "other starts alone")
+SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in CASES if case not in QUICK]
 
 
-@pytest.mark.parametrize("case", [SLOW, *(case for case in CASES if case != "full")])
+@pytest.mark.parametrize("case", [*QUICK, *SLOW])
 def test_every_part_of_the_study_gives_sound_files(case, report):
     rows, (out, text) = CASES[case], report(case)
     assert text == (out / "sparse.md").read_text()
@@ -122,6 +123,7 @@ def test_plots_are_drawn_of_what_is_there(case, names, report):
     assert {path.name for path in report(case)[0].glob("*.png")} == names
 
 
+@pytest.mark.slow
 def test_plots_without_data_are_left_out(tmp_path):
     rows = full()[:1]
     rows[0]["result"] |= {"curve": [], "coadaptation": None, "thresholds": None, "cpu_seconds": None}
@@ -129,12 +131,14 @@ def test_plots_without_data_are_left_out(tmp_path):
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["gap.png"]
 
 
+@pytest.mark.slow
 def test_the_same_rows_give_the_same_bytes(report, tmp_path):
     write_report(CASES["one cell"], tmp_path, "kgs study --preset cpu", 99)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (report("one cell")[0] / path.name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_main_table(markdown):
     rows = FULL
     for scene, setting in (
@@ -154,6 +158,7 @@ def test_the_main_table(markdown):
     assert "25.42 / 0.888 / 0.089 | +3.86 |" in markdown
 
 
+@pytest.mark.slow
 def test_means_over_scenes(markdown):
     rows = FULL
     scenes = (("llff/fern", 3), ("llff/flower", 3), ("blender/lego", 8))
@@ -179,6 +184,7 @@ def test_means_over_scenes(markdown):
     assert first[2:] == [both, "3", "9", f"{sd:.2f}", *map(interval, differences)]
 
 
+@pytest.mark.slow
 def test_other_tables(markdown):
     rows = FULL
     six = [psnrs(rows, scene, "off", 6)[0] for scene in ("llff/fern", "llff/flower")]
@@ -225,6 +231,7 @@ def test_other_tables(markdown):
     assert scene[1:] == ["8", "2", "18", "252x189", "drop 0.2, steps 2000"]
 
 
+@pytest.mark.slow
 def test_the_built_in_scene_is_shown_but_counts_in_no_mean(tmp_path):
     rows = [made_up(scene, 3, "dense", method, 0) for scene in ("llff/fern", "synthetic") for method in MAIN[:2]]
     uris = [f"data:image/jpeg;base64,{name}" for name in ("cGhvdG8=", "cmVuZGVy", "ZGlmZg==")]
@@ -239,20 +246,13 @@ def test_the_built_in_scene_is_shown_but_counts_in_no_mean(tmp_path):
     assert f"off:\nPSNR {psnr:.2f} dB, SSIM {psnr / 31:.3f}, LPIPS {psnr / 110:.3f}" in html
 
 
-def test_no_cells_and_cells_of_two_settings_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="rows"):
-        write_report([], tmp_path, "command", 0)
-    rows = FULL[:1]
-    longer = {"cell": rows[0]["cell"] | {"fit": {"steps": 10_000}}, "result": rows[0]["result"]}
-    with pytest.raises(ValueError, match="two for 0"):
-        write_report([*rows, longer], tmp_path, "command", 2)
-
-
+@pytest.mark.slow
 def test_text_is_escaped(report):
     out, _ = report("unknown method, no LPIPS")
     assert "<b>" not in (out / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_page_can_be_cited(report):
     page = (report("partial")[0] / "index.html").read_text()
     assert "@software{kgs," in page
@@ -263,6 +263,7 @@ def test_the_page_can_be_cited(report):
     assert page.index("over no dropping (off): ") < page.index("<table")
 
 
+@pytest.mark.slow
 def test_commits_and_dates_of_the_cells_are_named(tmp_path):
     rows = [made_up("llff/fern", 3, "dense", "off", seed) for seed in range(3)]
     for row, day in zip(rows[:2], (3, 1), strict=True):

@@ -41,8 +41,10 @@ def priors(scene: str, views: int, width: int) -> str:
 
 def published_difference(benchmark: str | None, views: int, method: str, base: str) -> str:
     """As `published`: PSNR of a method less that of another, in dB, of the same table if it has both."""
-    table = PUBLISHED.query("benchmark == @benchmark and views == @views").set_index("table")
-    lines, bases = (table.psnr[table.method == name] for name in (method, base))
-    if bases.empty or method == base:
+    lines = PUBLISHED.query("benchmark == @benchmark and views == @views").set_index("table")
+    of_method = lines.psnr[lines.method == method]
+    of_base = lines.psnr[lines.method == base]
+    if of_base.empty or method == base:
         return "-"
-    return " or ".join(dict.fromkeys(f"{psnr - bases.get(t, bases.iloc[0]):+.2f}" for t, psnr in lines.items())) or "-"
+    gains = [f"{psnr - of_base.get(table, of_base.iloc[0]):+.2f}" for table, psnr in of_method.items()]
+    return " or ".join(dict.fromkeys(gains)) or "-"

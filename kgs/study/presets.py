@@ -11,12 +11,19 @@ from kgs.errors import DataError
 from .cells import FULL
 from .grid import Cell
 
-OFF, PAPER, FIXED = MAIN = ("off", "progressive 0.2", "fixed 0.1")
-AUTO, AUTO_OFF = ("auto", "auto, off")  # kgs fit as it comes, and the same without dropping
+OFF = "off"
+PAPER = "progressive 0.2"
+FIXED = "fixed 0.1"
+MAIN = (OFF, PAPER, FIXED)
+AUTO = "auto"  # kgs fit as it comes
+AUTO_OFF = "auto, off"  # the same without dropping
 # The settings of each method's fit that are not those of the preset paper. Tables and plots keep this order.
 METHODS: dict[str, dict[str, Any]] = {
-    **{OFF: {"drop": 0.0}, PAPER: {"drop": 0.2}, FIXED: {"drop": 0.1, "drop_schedule": "constant"}},
-    **{AUTO: {"preset": "auto"}, AUTO_OFF: {"preset": "auto", "drop": 0.0}},
+    OFF: {"drop": 0.0},
+    PAPER: {"drop": 0.2},
+    FIXED: {"drop": 0.1, "drop_schedule": "constant"},
+    AUTO: {"preset": "auto"},
+    AUTO_OFF: {"preset": "auto", "drop": 0.0},
     **{f"progressive {rate}": {"drop": rate} for rate in (0.1, 0.3)},
     **{f"fixed {rate}": {"drop": rate, "drop_schedule": "constant"} for rate in (0.05, 0.15, 0.2, 0.3)},
     **{by: {"drop": 0.2, "drop_by": by.replace(" ", "-")} for by in ("high gradient", "low gradient", "near", "far")},
@@ -30,14 +37,18 @@ FAMILIES = {
     "An L1 penalty on opacities instead of dropping": [name for name in METHODS if name.startswith("L1")],
 }
 # The scenes of the preset "cpu" and how many views each is given; for "paper" the numbers by the scene's folder.
-SCENES = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3, "blender/lego": 8, "nerfstudio/fox": 12}
-SCENES["colmap/monstree"] = 8
+FORWARD = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3}
+OBJECTS = {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/monstree": 8}
+SCENES = FORWARD | OBJECTS
 MORE_VIEWS = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
-# The field's protocol: photos in the size that they have, every eighth held out. LLFF's are 504x378.
-FIELD, OBJECTS = ({scene: SCENES[scene] for scene in part} for part in ([*SCENES][:3], [*SCENES][3:]))
-_FITS: dict[str, dict[str, Any]] = {"quick": {"steps": 200, "max_gaussians": 12_000}, "cpu": {"steps": 2000}}
-_FITS |= {"field": {"steps": 2000}, "field-long": {"steps": 10_000}, "paper": {"steps": 10_000}}
+_FITS: dict[str, dict[str, Any]] = {
+    "quick": {"steps": 200, "max_gaussians": 12_000},
+    "cpu": {"steps": 2000},
+    "field": {"steps": 2000},
+    "field-long": {"steps": 10_000},
+    "paper": {"steps": 10_000},
+}
 Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]  # seeds, scenes, starts, methods
 
 
@@ -54,9 +65,13 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     if preset not in _FITS:
         raise ValueError(f"preset: expected one of {list(_FITS)}, got {preset!r}")
     if preset == "quick":
-        scene, few = [(SYNTHETIC, 3)], ("fixed 0.2", "far", "L1 distance 0.01")
-        blocks: list[Block] = [(range(3), scene, ["dense"], MAIN), ([0], scene, ["dense"], few)]
-        blocks += [([0], scene, ["dense"], (AUTO, AUTO_OFF)), ([0], scene, ["sift", "random"], [PAPER])]
+        scene = [(SYNTHETIC, 3)]
+        blocks: list[Block] = [
+            (range(3), scene, ["dense"], MAIN),
+            ([0], scene, ["dense"], ("fixed 0.2", "far", "L1 distance 0.01")),
+            ([0], scene, ["dense"], (AUTO, AUTO_OFF)),
+            ([0], scene, ["sift", "random"], [PAPER]),
+        ]
     elif data is None:
         raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
     else:
@@ -74,45 +89,63 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
 
 
 def _cpu(data: Path) -> list[Block]:
+    """The six scenes in a quarter of the pixels."""
     check_scenes(data, SCENES)
-    fern, flower, bounds = "llff/fern", "llff/flower", ("random", "model-points", FULL)  # no fit may have the last two
-    every, auto = SCENES.items(), (AUTO, AUTO_OFF)
-    main: list[Any] = [*(([scene], ["dense"], names) for names in (MAIN, auto) for scene in every)]
-    blocks: list[Block] = [([seed], *block) for seed in range(3) for block in main]
-    blocks += [([seed], MORE_VIEWS, ["dense"], names) for seed in range(3) for names in ((OFF, PAPER), auto)]
-    blocks += [([seed], every, ["sift"], [PAPER]) for seed in range(3)]
-    blocks += [(range(3), [("blender/lego", 8)], ["scene"], MAIN)]
-    blocks += [(range(3), [(fern, 3)], ["dense"], [name for name in METHODS if name not in (*MAIN, *auto)])]
-    blocks += [(range(3), [(fern, 3)], [start], [PAPER]) for start in bounds]
-    blocks += [([0], [(SYNTHETIC, 3)], ["dense"], names) for names in (MAIN, auto)]  # pictures for the page
-    return [*blocks, ([0], [(flower, 3)], bounds, [PAPER])]
+    seeds = range(3)
+    fern = [("llff/fern", 3)]
+    flower = [("llff/flower", 3)]
+    lego = [("blender/lego", 8)]
+    auto = (AUTO, AUTO_OFF)
+    rivals = [name for name in METHODS if name not in (*MAIN, *auto)]
+    bounds = ("random", "model-points", FULL)  # no fit may have the last two
+    blocks: list[Block] = []
+    for seed in seeds:
+        for methods in (MAIN, auto):
+            blocks += [([seed], [scene], ["dense"], methods) for scene in SCENES.items()]
+    for seed in seeds:
+        blocks += [([seed], MORE_VIEWS, ["dense"], methods) for methods in ((OFF, PAPER), auto)]
+    blocks += [([seed], SCENES.items(), ["sift"], [PAPER]) for seed in seeds]
+    blocks.append((seeds, lego, ["scene"], MAIN))
+    blocks.append((seeds, fern, ["dense"], rivals))
+    blocks += [(seeds, fern, [start], [PAPER]) for start in bounds]
+    blocks += [([0], [(SYNTHETIC, 3)], ["dense"], methods) for methods in (MAIN, auto)]  # pictures for the page
+    blocks.append(([0], flower, bounds, [PAPER]))
+    return blocks
 
 
 def _field(data: Path) -> list[Block]:
+    """The field's protocol: photos in the size that they have, every eighth held out. LLFF's are 504x378."""
     check_scenes(data, SCENES)
-    seeds, auto = range(3), (AUTO, AUTO_OFF)
-    blocks: list[Block] = [
-        ([seed], [scene], ["dense"], MAIN) for scenes in (FIELD, OBJECTS) for seed in seeds for scene in scenes.items()
-    ]
-    blocks += [([seed], [scene], ["dense"], auto) for seed in seeds for scene in SCENES.items()]
-    more = [*product(FIELD, (6, 9))]
-    return blocks + [
-        ([seed], [setting], ["dense"], names) for seed in seeds for setting in more for names in ((OFF, PAPER), auto)
-    ]
+    seeds = range(3)
+    auto = (AUTO, AUTO_OFF)
+    blocks: list[Block] = []
+    for scenes in (FORWARD, OBJECTS):
+        for seed in seeds:
+            blocks += [([seed], [scene], ["dense"], MAIN) for scene in scenes.items()]
+    for seed in seeds:
+        blocks += [([seed], [scene], ["dense"], auto) for scene in SCENES.items()]
+    for seed in seeds:
+        for setting in product(FORWARD, (6, 9)):
+            blocks += [([seed], [setting], ["dense"], methods) for methods in ((OFF, PAPER), auto)]
+    return blocks
 
 
 def _field_long(data: Path) -> list[Block]:
-    check_scenes(data, FIELD)
-    return [([0], [scene], ["dense"], (OFF, PAPER, AUTO)) for scene in FIELD.items()]
+    check_scenes(data, FORWARD)
+    return [([0], [scene], ["dense"], (OFF, PAPER, AUTO)) for scene in FORWARD.items()]
 
 
 def _paper(data: Path) -> list[Block]:
     folders = [path for path in sorted(data.glob("*/*")) if path.is_dir() and path.parent.name in VIEWS]
     if not folders:
         raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
-    scenes = [(str(path.relative_to(data)), views) for path in folders for views in VIEWS[path.parent.name]]
-    every = [METHODS if scene.startswith("llff/") and views == 3 else MAIN for scene, views in scenes]
-    # Blender scenes also from the layout's random points, as published.
-    starts = [["dense", "scene"] if scene.startswith("blender") else ["dense"] for scene, _ in scenes]
-    main = [([scene], start, methods) for scene, start, methods in zip(scenes, starts, every, strict=True)]
-    return [([seed], *block) for seed in range(5) for block in main]
+    blocks: list[Block] = []
+    for seed in range(5):
+        for path in folders:
+            layout = path.parent.name
+            # Blender scenes also from the layout's random points, as published.
+            starts = ["dense", "scene"] if layout == "blender" else ["dense"]
+            for views in VIEWS[layout]:
+                methods = METHODS if layout == "llff" and views == 3 else MAIN
+                blocks.append(([seed], [(str(path.relative_to(data)), views)], starts, methods))
+    return blocks

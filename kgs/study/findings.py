@@ -28,15 +28,24 @@ _MEAN = "mean and 95 % intervals"
 
 def headline(frame: pd.DataFrame) -> list[dict[str, str]]:
     """Two lines, PSNR and LPIPS, per comparison that has pairs: the mean over scenes, its intervals, and each scene."""
-    lines, main = [], main_cells(frame, STARTS)
+    main = main_cells(frame, STARTS)
+    lines = []
     for (what, (key, value, base)), (measure, (label, decimals)) in product(_COMPARISONS.items(), _MEASURES.items()):
         cells = main[main.start == "dense"] if key == "method" else main[main.method == PAPER]
-        if (found := difference(cells, key, value, base, measure)).pairs:
-            line = {"": what, "measure": label, _MEAN: found.text(decimals, labels=True), "scenes": str(found.scenes)}
-            line |= {"pairs": str(found.pairs), "sd of a pair": mean_sd([found.sd], decimals)}
-            for (scene,), some in grouped(cells, "scene"):
-                line[scene] = difference(some, key, value, base, measure).text(decimals)
-            lines.append(line)
+        gain = difference(cells, key, value, base, measure)
+        if not gain.pairs:
+            continue
+        line = {
+            "": what,
+            "measure": label,
+            _MEAN: gain.text(decimals, labels=True),
+            "scenes": str(gain.scenes),
+            "pairs": str(gain.pairs),
+            "sd of a pair": mean_sd([gain.sd], decimals),
+        }
+        for (scene,), cells_of_scene in grouped(cells, "scene"):
+            line[scene] = difference(cells_of_scene, key, value, base, measure).text(decimals)
+        lines.append(line)
     return lines
 
 
@@ -44,20 +53,23 @@ def findings(frame: pd.DataFrame) -> list[str]:
     """The results in sentences, each with its intervals, scenes and pairs; none of cells without pairs."""
     sentences = []
     for what, lines in groupby(headline(frame), itemgetter("")):
-        first, *others = lines
-        counts = f"scenes: {first['scenes']}, pairs: {first['pairs']}"
-        measures = "; ".join(f"{line['measure']} {line[_MEAN]}" for line in (first, *others))
-        sentences.append(f"{what}: {measures} ({counts}).")
-    if found := [*_best_others(frame, PSNR)]:
-        worst, _, best, gain = min(found, key=lambda one: one[-1].mean)
-        mean = f"{fmean(one[-1].mean for one in found):+.2f} dB in the mean of {len(found)} scenes"
+        measures = [*lines]
+        counts = f"scenes: {measures[0]['scenes']}, pairs: {measures[0]['pairs']}"
+        gains = "; ".join(f"{line['measure']} {line[_MEAN]}" for line in measures)
+        sentences.append(f"{what}: {gains} ({counts}).")
+    best_others = [*_best_others(frame, PSNR)]
+    if best_others:
+        worst, _, best, gain = min(best_others, key=lambda one: one[-1].mean)
+        mean = f"{fmean(one[-1].mean for one in best_others):+.2f} dB in the mean of {len(best_others)} scenes"
         least = f"{gain.text(labels=True)} dB on {worst} (over {best})"
         how = "that one is picked after the fact on the same test views, which flatters it"
         sentences.append(f"The default over the best other method of each scene: {mean}, at worst {least}; {how}.")
-    if (noise := noise_floor(wide(frame, PSNR))).freedom:
-        single, three = (f"{noise.between_means(n):.2f} dB" for n in (1, 3))
-        what = f"two single runs differ by up to {single}, and two means of three by up to {three}, 95 times in 100"
-        sentences.append(f"Where nothing but the seed differs, {what} ({noise.groups} groups of runs).")
+    noise = noise_floor(wide(frame, PSNR))
+    if noise.freedom:
+        single = f"two single runs differ by up to {noise.between_means(1):.2f} dB"
+        three = f"two means of three by up to {noise.between_means(3):.2f} dB"
+        groups = f"{noise.groups} groups of runs"
+        sentences.append(f"Where nothing but the seed differs, {single}, and {three}, 95 times in 100 ({groups}).")
     return sentences
 
 
@@ -75,7 +87,8 @@ def _best_others(frame: pd.DataFrame, measure: str) -> Iterable[tuple[str, int, 
     """Each scene, how many other methods it has, the best of them, and the default over it."""
     for (scene,), cells in grouped(main_cells(frame), "scene"):
         gains = {name: difference(cells, "method", AUTO, name, measure) for name in cells.method.unique()}
+        gains = {name: gain for name, gain in gains.items() if gain.pairs}
         sign = -1 if measure == LPIPS else 1
-        if others := {name: sign * gain.mean for name, gain in gains.items() if gain.pairs}:
-            best = min(others, key=others.__getitem__)
-            yield scene, len(others), best, gains[best]
+        if gains:
+            best = min(gains, key=lambda name: sign * gains[name].mean)
+            yield scene, len(gains), best, gains[best]

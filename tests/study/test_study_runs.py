@@ -1,5 +1,6 @@
 """The study as a run: it goes on where it stopped, and a folder belongs to one."""
 
+import csv
 import json
 import shutil
 
@@ -7,7 +8,7 @@ import pytest
 from study_rows import tiny_cell
 
 from kgs import DataError
-from kgs.bench.study import grid, presets, study
+from kgs.study import grid, presets, study
 
 
 @pytest.mark.slow
@@ -38,6 +39,23 @@ def studied(tmp_path_factory, threads):
         patch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell()])
         study(out=out, scheduler=threads)
     return out
+
+
+def test_a_study_of_one_cell_is_fitted_measured_and_reported(studied):
+    (line,) = (studied / "sparse.jsonl").read_text(encoding="utf-8").splitlines()
+    row = json.loads(line)
+    assert row["cell"] == tiny_cell()
+    result = row["result"]
+    assert result["config"]["drop"] == 0.0
+    assert result["gaussians"] == sum(result["thresholds"]["gaussians"])
+    psnr = result["test"]["psnr"]
+    assert 5 < psnr < 40
+    assert "1 of 1 cells" in (studied / "sparse.md").read_text(encoding="utf-8")
+    (cell,) = csv.DictReader((studied / "sparse.csv").read_text(encoding="utf-8").splitlines())
+    assert float(cell["test_psnr"]) == psnr
+    page = (studied / "index.html").read_text(encoding="utf-8")
+    assert "kgs study --preset quick -o OUT" in page
+    assert f"PSNR {psnr:.2f} dB" in page  # the built-in scene is shown
 
 
 def test_a_report_of_what_is_there_fits_nothing(tmp_path, monkeypatch, threads, studied):

@@ -18,8 +18,8 @@ from kgs.fit.config import FitConfig
 from kgs.fit.trainer import Start, Trainer
 from kgs.geometry import camera_centers
 from kgs.init_points import InitialPoints
-from kgs.losses import opacity_l1
-from kgs.types import Gaussians
+from kgs.losses import TargetMoments, opacity_l1
+from kgs.types import Gaussians, Rendering
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,29 @@ class RivalTrainer(Trainer):
         self.rival = rival
         super().__init__(scene, config, points, needs)
 
-    def make_drop(self, seed: int) -> DropGaussian | None:
-        """The layer, which drops by scores where it has some."""
-        return SelectiveDrop(self.config.drop, self.config.drop_schedule, seed=seed) if self.config.drop else None
+    def _build(self, start: Start) -> None:
+        """As in `Trainer`, with a layer that drops by scores where it has some."""
+        super()._build(start)
+        self._penalty: Tensor | None = None
+        if self.drop is not None:
+            self.drop = SelectiveDrop(self.config.drop, self.config.drop_schedule, seed=self.drop.seed)
+            self.renderer.opacity_layer = self.drop
 
-    def before_render(self, camera: PinholeCamera) -> None:
-        """Give the layer the scores of the present camera."""
-        if isinstance(self.drop, SelectiveDrop) and self.rival.drop_by != "random":
-            self.drop.scores = gaussian_scores(self.rival.drop_by, self.densifier, camera)
+    def render_view(self, gaussians: Gaussians, camera: PinholeCamera, background: Tensor | None) -> Rendering:
+        """Render with the scores of this camera; the penalty of its Gaussians is kept for the loss."""
+        rival = self.rival
+        if isinstance(self.drop, SelectiveDrop) and rival.drop_by != "random":
+            self.drop.scores = gaussian_scores(rival.drop_by, self.densifier, camera)
+        if rival.opacity_l1:
+            by = "low-gradient" if rival.opacity_l1_by == "gradient" else "far"
+            scores = gaussian_scores(by, self.densifier, camera)
+            self._penalty = rival.opacity_l1 * opacity_l1(gaussians.opacities, scores)
+        return super().render_view(gaussians, camera, background)
 
-    def penalty(self, gaussians: Gaussians, camera: PinholeCamera) -> Tensor | None:
-        """The weighted L1 norm of the opacities."""
-        if not self.rival.opacity_l1:
-            return None
-        by = "low-gradient" if self.rival.opacity_l1_by == "gradient" else "far"
-        scores = gaussian_scores(by, self.densifier, camera)
-        return self.rival.opacity_l1 * opacity_l1(gaussians.opacities, scores)
+    def loss_of(self, image: Tensor, target: Tensor, moments: TargetMoments) -> Tensor:
+        """The loss of the render and, where the rival has it, the weighted L1 norm of the opacities."""
+        loss = super().loss_of(image, target, moments)
+        return loss if self._penalty is None else loss + self._penalty
 
 
 class SelectiveDrop(DropGaussian):

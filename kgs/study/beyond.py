@@ -65,14 +65,13 @@ def beyond_cells(data: Path | None) -> list[Cell]:
 
 def _cell(scene: str, views: int, seed: int) -> Cell:
     synthetic = scene in WORLDS
-    fit = {"preset": AUTO, **_FITS[synthetic]}
     return {
         "scene": scene,
         "views": views,
         "downscale": None if synthetic else 2.0,
         "method": AUTO,
         "seed": seed,
-        "fit": fit,
+        "fit": {"preset": AUTO, **_FITS[synthetic]},
     }
 
 
@@ -105,14 +104,16 @@ def synthetic_targets(kind: str, scene: Scene) -> dict[int, Target]:
 
     A pixel counts if at least one training view shows its surface: by exact depths, see `views_that_show`.
     """
-    train, (height, width) = scene.train, scene.train.images.shape[-2:]
-    depths = synthetic_depths(train.cameras, kind)[:, 0]
+    train = scene.train
+    height, width = train.images.shape[-2:]
+    train_depths = list(synthetic_depths(train.cameras, kind)[:, 0])
     targets = {}
     for out in OUT:
         views = views_beyond(kind, out, CAMERAS, (height, width))
-        surfaces = synthetic_depths(views.cameras, kind)[:, 0]
-        counts = (views_that_show(surfaces[i], views.camera(i), list(depths), train.cameras) for i in range(len(views)))
-        targets[out] = Target(views, [count > 0 for count in counts])
+        shown = []
+        for i, depth in enumerate(synthetic_depths(views.cameras, kind)[:, 0]):
+            shown.append(views_that_show(depth, views.camera(i), train_depths, train.cameras) > 0)
+        targets[out] = Target(views, shown)
     return targets
 
 
@@ -127,7 +128,9 @@ def measure_target(
         pixels are the truth's; means over the views with such pixels, None without any or without the network, "psnr"
         also if one is infinite.
     """
-    levels, distances, shares = list[float](), list[float](), list[float]()
+    levels = list[float]()
+    distances = list[float]()
+    shares = list[float]()
     for i, shown in enumerate(target.shown):
         truth = target.views.images[i]
         image = target.views.as_photo(render(target.views.camera(i))[0].cpu())
@@ -156,7 +159,8 @@ def from_the_middle(scene: Scene, count: int) -> Scene:
     centers = camera_centers(views.cameras.extrinsics).double()
     order = (centers - centers.mean(dim=0)).norm(dim=1).argsort(stable=True).tolist()
     held_out = min(ceil(OUTER * len(order)), len(order) - count)
-    train, test = sorted(order[:count]), sorted(order[len(order) - held_out :])
+    train = sorted(order[:count])
+    test = sorted(order[len(order) - held_out :])
     finer = None if scene.finer is None else scene.finer.select(train)
     return replace(scene, train=views.select(train), test=views.select(test), finer=finer)
 

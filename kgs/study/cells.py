@@ -46,8 +46,9 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
     """
     preset = cell["fit"].get("preset", "paper")
-    known = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
-    scene, points, seconds = _start(data, *known, preset)
+    scene, points, seconds = _start(
+        data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"], preset
+    )
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
     settings, rival = _split(cell["fit"])
     config = fit_config(cell["start"], cell["seed"], settings)
@@ -55,14 +56,17 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed, rival)
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
         result["pictures"] = _pictures(scene, trainer)
-    return result | {
-        **{part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")},
-        "test_views": {view["name"]: view["psnr"] for view in metrics["test"]["views"]},
-        "init": {**trainer.init, "seconds": round(seconds, 2)},
-        "coadaptation": coadaptation(trainer.model, scene.test, near_plane=trainer.renderer.options.near_plane),
-        "thresholds": count_over_threshold(trainer, points.points),
-        "protocol": metrics["protocol"] | ({"init": _FULL_MODEL} if cell["start"] == FULL else {}),
-    }
+    for part in ("test", "train"):
+        result[part] = {name: metrics[part][name] for name in MEASURES}
+    result["test_views"] = {view["name"]: view["psnr"] for view in metrics["test"]["views"]}
+    result["init"] = trainer.init | {"seconds": round(seconds, 2)}
+    near_plane = trainer.renderer.options.near_plane
+    result["coadaptation"] = coadaptation(trainer.model, scene.test, near_plane=near_plane)
+    result["thresholds"] = count_over_threshold(trainer, points.points)
+    result["protocol"] = metrics["protocol"]
+    if cell["start"] == FULL:
+        result["protocol"] = metrics["protocol"] | {"init": _FULL_MODEL}
+    return result
 
 
 def fit_and_measure(
@@ -86,21 +90,29 @@ def fit_and_measure(
         trainer = RivalTrainer(scene, config, points, needs, rival=rival)
     trainer.fit()
     prune(trainer)
-    stored: dict[str, Any] = {"cpu_seconds": round(time.process_time() - start, 2)}
+    cpu_seconds = time.process_time() - start
     metrics = measure(trainer, lpips)
-    stored |= {"curve": trainer.curve, "gaussians": len(trainer.shown), "needs": trainer.needs}
-    chosen = trainer.config.to_dict() | ({} if rival is None else asdict(rival))
-    stored |= {"config": chosen, "seen": metrics["seen"]}
-    stored |= {"wall_seconds": round(trainer.seconds, 2), "peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
-    stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
+    stored = {
+        "cpu_seconds": round(cpu_seconds, 2),
+        "curve": trainer.curve,
+        "gaussians": len(trainer.shown),
+        "needs": trainer.needs,
+        "config": trainer.config.to_dict() | ({} if rival is None else asdict(rival)),
+        "seen": metrics["seen"],
+        "wall_seconds": round(trainer.seconds, 2),
+        "peak_rss_mb": peak_rss_mb(),
+        "versions": metrics["versions"],
+        "revision": revision(Path(kgs.__file__).parent),
+        "date": datetime.now(UTC).date().isoformat(),
+    }
     return trainer, metrics, stored
 
 
 def _pictures(scene: Scene, trainer: Trainer) -> list[str]:
     """The first test view, its render and their difference, for the page; of other scenes none may be published."""
     render = trainer.render(scene.test.camera(0))[0]
-    (found,) = encoded([Picture(scene.test.names[0], scene.test.images[0], {"": render})], 2**20)
-    return [found["photo"], *found["renders"][0][1:]]
+    (picture,) = encoded([Picture(scene.test.names[0], scene.test.images[0], {"": render})], 2**20)
+    return [picture["photo"], *picture["renders"][0][1:]]
 
 
 @lru_cache(maxsize=1)  # cells of one start follow each other
@@ -114,7 +126,8 @@ def _start(
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
         scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
-    begin, config = time.process_time(), fit_config(start, seed, {"preset": preset})
+    config = fit_config(start, seed, {"preset": preset})
+    begin = time.process_time()
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback
         points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
     return scene, points, time.process_time() - begin
@@ -123,14 +136,16 @@ def _start(
 def _split(fit: dict[str, Any]) -> tuple[dict[str, Any], Rival | None]:
     """The settings of a cell for `FitConfig`, and those of a rival if it has any."""
     names = {field.name for field in fields(Rival)}
-    own = {name: value for name, value in fit.items() if name in names}
-    return {name: value for name, value in fit.items() if name not in names}, Rival(**own) if own else None
+    settings = {name: value for name, value in fit.items() if name not in names}
+    of_rival = {name: value for name, value in fit.items() if name in names}
+    return settings, Rival(**of_rival) if of_rival else None
 
 
 def fit_config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
     """The configuration of a cell: a preset (paper unless `fit` names one), with a start, a seed and other settings."""
-    values = {"preset": "paper", "init": "model-points" if start == FULL else start, "seed": seed, **fit}
-    return replace(PRESETS[values.pop("preset")], **values)
+    settings = {"init": "model-points" if start == FULL else start, "seed": seed} | fit
+    preset = settings.pop("preset", "paper")
+    return replace(PRESETS[preset], **settings)
 
 
 def _full_model(scene: Scene, seed: int) -> InitialPoints:

@@ -68,8 +68,11 @@ def run_grid(
 def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Callable[[str], None]) -> None:
     """Do the cells on the client's workers and append each to the file when it is done."""
     cell_of: dict[Any, Cell] = {}  # of the futures that are not done
-    waiting, suspects = deque(cells), deque[Cell]()  # suspects died with workers: each is done alone in the end
-    alone, finished, failed = False, 0, 0
+    waiting = deque(cells)
+    suspects = deque[Cell]()  # their workers died: each is done alone in the end
+    alone = False
+    finished = 0
+    failed = 0
     futures = as_completed()
 
     def submit() -> None:
@@ -149,8 +152,8 @@ def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
 def _check_scheduler(address: str) -> None:
     """Raise a ValueError unless a scheduler answers; a Client waits for ever for an open port that says nothing."""
     with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
-        found = thread.submit(asyncio.run, _identify(address))
-    kind = found.exception() or found.result()
+        answer = thread.submit(asyncio.run, _identify(address))
+    kind = answer.exception() or answer.result()
     if kind != "Scheduler":
         expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
         raise ValueError(f"scheduler: {expected}, got {address!r} ({kind!r})")
@@ -179,7 +182,9 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
             rows.append(json.loads(line))
         except ValueError as error:
             if number < len(lines):
-                raise ValueError(f"{path}: line {number} is not JSON ({error})") from error
+                raise ValueError(
+                    f"{path}: line {number}: expected JSON, got an error of its parser: {error}"
+                ) from error
     if repair and lines:
         with path.open("r+b") as file:
             file.seek(max(0, sum(len(line) + 1 for line in lines[: len(rows)]) - 1))

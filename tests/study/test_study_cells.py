@@ -15,13 +15,12 @@ import pytest
 import torch
 from study_rows import tiny_cell
 
-from kgs import DataError
-from kgs.bench.study import cells as cells_module
-from kgs.bench.study.cells import FULL, sparse_cell
-from kgs.bench.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
 from kgs.cli import main
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
+from kgs.study import cells as cells_module
+from kgs.study.cells import FULL, sparse_cell
+from kgs.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
 
 
 @pytest.fixture
@@ -104,20 +103,10 @@ def test_methods_of_one_start_follow_each_other(data):
     assert {cell["seed"] for cell in cells} == {0}
 
 
-def test_what_is_missing_is_named(tmp_path):
-    with pytest.raises(ValueError, match="preset: expected one of"):
-        sparse_cells("fast", tmp_path)
-    with pytest.raises(DataError, match="KGS_DATA"):
-        sparse_cells("cpu", None)
-    with pytest.raises(DataError, match="llff/fern"):
-        sparse_cells("cpu", tmp_path)
-    with pytest.raises(DataError, match="expected scenes"):
-        sparse_cells("paper", tmp_path)
-
-
 # -- one cell ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_cell_measures_and_repeats_bit_for_bit():
     results = [sparse_cell(tiny_cell("progressive 0.2")) for _ in range(2)]
     for result in results:
@@ -230,8 +219,3 @@ def test_lpips_is_measured_where_there_are_weights(kgs_data):
         lpips, unscaled = result[part]["lpips_vgg"], result[part]["lpips_vgg_unscaled"]
         assert 0 < lpips < 2
         assert 0 < unscaled != lpips
-
-
-def test_a_real_scene_needs_a_folder():
-    with pytest.raises(DataError, match="KGS_DATA"):
-        sparse_cell(tiny_cell() | {"scene": "llff/fern"})

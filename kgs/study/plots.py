@@ -29,10 +29,14 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
     (fills the markers; without it a line joins them), and "name" (stands at the y axis).
     """
     styles = {label: (f"C{k}", ".") for k, label in enumerate(points.label.unique())} | styles
-    count, scattered, named = points.panel.nunique(), "start" in points, "name" in points
-    columns, rows = min(2, count), -(-count // 2)
+    count = points.panel.nunique()
+    scattered = "start" in points
+    named = "name" in points
+    columns = min(2, count)
+    rows = -(-count // 2)
     size = (9, 0.9 + 0.2 * len(points)) if named else (3.9 * columns + 0.4, 3.2 * rows + 0.5)
-    figure, found = Figure(size, dpi=DPI, layout="constrained"), dict[str, Any]()
+    figure = Figure(size, dpi=DPI, layout="constrained")
+    legend = dict[str, Any]()
     for place, ((title,), some) in enumerate(grouped(points, "panel"), 1):
         axis = figure.add_subplot(rows, columns, place)
         for (label, start), part in grouped(some.assign(start=some.get("start", "")), "label", "start"):
@@ -40,9 +44,9 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
             look: dict[str, Any] = {"marker": marker, "ls": "" if scattered or named else "-", "alpha": 0.85, "ms": 5}
             fill = _FILLS.get(start, "none" if scattered else "full")
             bars = axis.errorbar(part.x, part.y, part.get("dy"), part.get("dx"), c=color, fillstyle=fill, **look)
-            found.setdefault(label, bars)
+            legend.setdefault(label, bars)
             if scattered:
-                found[f"from {start}"] = axis.plot([], [], "h", color="grey", fillstyle=fill)[0]
+                legend[f"from {start}"] = axis.plot([], [], "h", color="grey", fillstyle=fill)[0]
         axis.set_title(title, fontsize=9)
         axis.set(**axes)
         if axis.get_xscale() == "log":
@@ -54,8 +58,8 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
             axis.set_ylim(len(some) - 0.5, -0.5)
             axis.axvline(0, color="#777777", linewidth=1)
     if not named:
-        found = dict(sorted(found.items(), key=lambda item: item[0].startswith("from ")))
-        figure.legend([*found.values()], [*found], loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+        legend = dict(sorted(legend.items(), key=lambda item: item[0].startswith("from ")))
+        figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
 
 
@@ -63,7 +67,8 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
     """Write a PNG for each plot that has something to show; return the captions by file name."""
     captions = {}
     for name, (points_of, xlabel, ylabel, caption) in _PLOTS.items():
-        if len(points := points_of(frame)):
+        points = points_of(frame)
+        if len(points):
             scale = "log" if name == "thresholds" else "linear"
             panels(points, xlabel=xlabel, ylabel=ylabel, xscale=scale).savefig(out / f"{name}.png")
             captions[f"{name}.png"] = caption
@@ -88,8 +93,11 @@ def _forest(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
     cells = main_cells(frame, STARTS)
-    gap, shared = cells["train.psnr"] - cells["test.psnr"], 1e3 * cells.coadaptation
-    places = {"gap": gap, "coadaptation": shared, "cost": cells.cpu_seconds}
+    places = {
+        "gap": cells["train.psnr"] - cells["test.psnr"],
+        "coadaptation": 1e3 * cells.coadaptation,
+        "cost": cells.cpu_seconds,
+    }
     return _in_panels(cells.assign(x=places[x], y=cells["test.psnr"]).dropna(subset=["x", "y"]))
 
 
@@ -102,7 +110,9 @@ def _curves(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _thresholds(frame: pd.DataFrame) -> pd.DataFrame:
     cells = main_cells(frame)[lambda main: main.method.isin((OFF, PAPER)) & main["thresholds.over"].notna()]
-    over, counts, edges = (cells[f"thresholds.{key}"].map(np.array) for key in ("over", "gaussians", "distance"))
+    over = cells["thresholds.over"].map(np.array)
+    counts = cells["thresholds.gaussians"].map(np.array)
+    edges = cells["thresholds.distance"].map(np.array)
     shares = 100 * over / counts.map(lambda count: np.where(count > 0, count, np.nan))
     middle = edges.map(lambda edge: (edge[1:] + edge[:-1]) / 2)
     return _over_seeds(cells.assign(place=counts.map(lambda count: range(len(count))), x=middle, y=shares))
@@ -123,7 +133,8 @@ def _over_seeds(cells: pd.DataFrame) -> pd.DataFrame:
 def _in_panels(cells: pd.DataFrame) -> pd.DataFrame:
     """The cells with their panel, one per scene and number of views, and their label."""
     counts = cells.groupby([*KEYS]).seed.transform("size").groupby([cells.scene, cells.views])
-    low, high = counts.transform("min").astype(str), counts.transform("max").astype(str)
+    low = counts.transform("min").astype(str)
+    high = counts.transform("max").astype(str)
     n = low.where(low == high, low + " to " + high)
     return cells.assign(panel=cells.scene + ", " + cells.views.astype(str) + " views, n = " + n, label=cells.method)
 
@@ -133,12 +144,19 @@ _SHARES = f"""Gaussians whose mean gradient is over the densification threshold,
 {OFF} and {PAPER}: {_SEEDS}; each point stands for a sixth of the initial points; a fit at its limit of Gaussians \
 keeps those that it could not densify"""
 # What each plot shows, its axes, and its caption.
-_OVER, _PSNR = "test PSNR over off, same seeds and views [dB]", "test PSNR [dB]"
-_FOREST = "Paired differences of test PSNR over off, with 95 % intervals, of one scene over seeds; n pairs"
-_PLOTS = {"forest": (_forest, _OVER, "", f"{_FOREST}; from the same initial points, but for the default's")}
-_PLOTS["curves"] = (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}")
-_SCATTERED = {"gap": "overfitting: PSNR, training less test views [dB]", "cost": "CPU time of the fit [s]"}
-for _name, _x in {**_SCATTERED, "coadaptation": "co-adaptation [1e-3]"}.items():
+_PSNR = "test PSNR [dB]"
+_FOREST = """Paired differences of test PSNR over off, with 95 % intervals, of one scene over seeds; n pairs; from the \
+same initial points, but for the default's"""
+_PLOTS = {
+    "forest": (_forest, "test PSNR over off, same seeds and views [dB]", "", _FOREST),
+    "curves": (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}"),
+}
+_SCATTERED = {
+    "gap": "overfitting: PSNR, training less test views [dB]",
+    "cost": "CPU time of the fit [s]",
+    "coadaptation": "co-adaptation [1e-3]",
+}
+for _name, _x in _SCATTERED.items():
     _caption = f"Test PSNR against {_x}; one point per cell, filled by its start"
     _PLOTS[_name] = (partial(_scattered, x=_name), _x, _PSNR, _caption)
 _PLOTS["thresholds"] = (_thresholds, "distance [median of the initial points]", "over the threshold [%]", _SHARES)

@@ -68,8 +68,12 @@ def _synthetic(scene: str, views: int, method: str, results: list[Mapping[str, A
 
 def _real(scene: str, views: int, method: str, results: list[Mapping[str, Any]]) -> dict[str, str]:
     seen = [result["seen"] for result in results]
-    line = _start(scene, views, method, results) | {"outer views": _pair(results, "test"), "seen": _of(seen, "psnr", 2)}
-    return line | {"share": _of(seen, "share", 2), "training views": _pair(results, "train")} | _end(results)
+    line = _start(scene, views, method, results)
+    line["outer views"] = _pair(results, "test")
+    line["seen"] = _of(seen, "psnr", 2)
+    line["share"] = _of(seen, "share", 2)
+    line["training views"] = _pair(results, "train")
+    return line | _end(results)
 
 
 def _start(scene: str, views: int, method: str, results: Sequence[object]) -> dict[str, str]:

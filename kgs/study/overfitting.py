@@ -28,14 +28,19 @@ def coadaptation(
     """
     if subsets < 2:
         raise ValueError(f"subsets: expected at least 2, got {subsets}")
-    renderer, generator = GaussianRenderer(near_plane=near_plane), torch.Generator().manual_seed(seed)
-    gaussians, total, pixels = model(), 0.0, 0
-    device = gaussians.opacities.device
+    renderer = GaussianRenderer(near_plane=near_plane)
+    generator = torch.Generator().manual_seed(seed)
+    gaussians = model()
+    opacities = gaussians.opacities
+    total = 0.0
+    pixels = 0
     for view in range(len(views)):
-        kept = [torch.rand(gaussians.opacities.shape, generator=generator) < 0.5 for _ in range(subsets)]
-        halves = (replace(gaussians, opacities=gaussians.opacities * keep.to(device)) for keep in kept)
-        camera = move_camera(views.camera(view), device)
-        renders = [renderer(half, camera, outputs=("image", "alpha")) for half in halves]
+        camera = move_camera(views.camera(view), opacities.device)
+        renders = []
+        for _ in range(subsets):
+            half = torch.rand(opacities.shape, generator=generator) < 0.5
+            thinned = replace(gaussians, opacities=opacities * half.to(opacities.device))
+            renders.append(renderer(thinned, camera, outputs=("image", "alpha")))
         covered = torch.stack([out.alpha[0, 0] > 0.8 for out in renders]).all(0)
         images = torch.stack([out.image[0].clamp(0, 1).double() for out in renders])
         total += float(images.var(0).mean(0)[covered].sum())
@@ -50,11 +55,13 @@ def count_over_threshold(trainer: Trainer, initial_points: Tensor) -> dict[str, 
     bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.
     """
     centers = camera_centers(trainer.scene.train.cameras.extrinsics)
-    clouds = (initial_points, trainer.model.means)
-    first, now = (torch.cdist(points.detach().cpu().double(), centers).amin(1) for points in clouds)
-    edges = torch.quantile(first, torch.linspace(0, 1, BINS + 1, dtype=first.dtype))
-    bins = torch.bucketize(now, edges[1:-1])
+    initial = torch.cdist(initial_points.detach().cpu().double(), centers).amin(1)
+    final = torch.cdist(trainer.model.means.detach().cpu().double(), centers).amin(1)
+    edges = torch.quantile(initial, torch.linspace(0, 1, BINS + 1, dtype=initial.dtype))
+    bins = torch.bucketize(final, edges[1:-1])
     over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
-    distance = [round(float(edge / first.median()), 4) for edge in edges]
-    counts = [torch.bincount(chosen, minlength=BINS).tolist() for chosen in (bins, bins[over])]
-    return {"distance": distance, "gaussians": counts[0], "over": counts[1]}
+    return {
+        "distance": [round(float(edge / initial.median()), 4) for edge in edges],
+        "gaussians": torch.bincount(bins, minlength=BINS).tolist(),
+        "over": torch.bincount(bins[over], minlength=BINS).tolist(),
+    }

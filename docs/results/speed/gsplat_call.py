@@ -1,8 +1,8 @@
 """What `kgs.rasterization` costs on this machine beside the renderer, and its options beside the plain call.
 
-    python -m kgs.bench.gsplat_call
+    python docs/results/speed/gsplat_call.py
 
-prints a table: a forward and backward pass of the scene of `kgs bench speed`, each beside the others in turn.
+prints the table of docs/gsplat.md: a forward and backward pass of the scene of `kgs bench speed`, in turn.
 """
 
 import math
@@ -11,12 +11,11 @@ from typing import Any
 
 import torch
 
+from kgs.bench.output import markdown_table
+from kgs.bench.speed import SIZE, Cases
+from kgs.bench.timing import Case, take_turns
 from kgs.gsplat import rasterization
 from kgs.machine import versions
-
-from .output import markdown_table
-from .speed import SIZE, Cases
-from .timing import Case, take_turns
 
 COUNTS = (10_000, 50_000)
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -31,19 +30,30 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 def cases(count: int) -> dict[str, Case]:
     """The renderer and the calls on one scene."""
-    made = Cases(count, SIZE, torch.device("cpu"))
+    scene = Cases(count, SIZE, torch.device("cpu"))
+    height, width = SIZE
 
     def call(**options: Any) -> None:
-        gaussians = made.model()
-        k = made.camera.intrinsics[:, :3, :3]
-        given = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
-        size, degree = (SIZE[1], SIZE[0]), math.isqrt(gaussians.colors.shape[1]) - 1
-        views = (made.camera.extrinsics, k, *size)
-        renders, _, _ = rasterization(*given, *views, sh_degree=degree, pixel_centers="integer", **options)
-        (renders[..., :3] * made.weights.permute(0, 2, 3, 1)).sum().backward()
-        made.model.zero_grad()
+        gaussians = scene.model()
+        renders, _, _ = rasterization(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            gaussians.colors,
+            scene.camera.extrinsics,
+            scene.camera.intrinsics[:, :3, :3],
+            width,
+            height,
+            sh_degree=math.isqrt(gaussians.colors.shape[1]) - 1,
+            pixel_centers="integer",
+            **options,
+        )
+        (renders[..., :3] * scene.weights.permute(0, 2, 3, 1)).sum().backward()
+        scene.model.zero_grad()
 
-    return {"GaussianRenderer": made.both, **{name: partial(call, **options) for name, options in OPTIONS.items()}}
+    calls = {name: partial(call, **options) for name, options in OPTIONS.items()}
+    return {"GaussianRenderer": scene.both, **calls}
 
 
 def main(repeats: int = 7) -> None:
