@@ -425,14 +425,15 @@ def test_features_of_no_width_in_a_batch():
     assert renders.shape == (2, 2, 24, 32, 1)
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value):
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("place", [(0, 1), (0, 0), (1, 1), (2, 2)])
+def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value, place):
     gaussians, cameras = scene(dtype=torch.float32)
     turned = quaternion_to_rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
     covars = turned @ turned.mT
     rest = torch.arange(60) != 7
     expected = call(gaussians[rest], cameras, covars=covars[rest], quats=None, scales=None)[0]
-    covars[7, 0, 1] = value
+    covars[7][place] = value
     covars.requires_grad_()
     renders = call(gaussians, cameras, covars=covars, quats=None, scales=None)[0]
     assert torch.allclose(renders, expected, atol=1e-5)
