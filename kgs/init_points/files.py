@@ -56,5 +56,5 @@ def _cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
     points = (points if origin is None else points - origin).float()
     if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # none, or not those of points
-        return points, torch.full((len(points), 3), 0.5)
+        return points, torch.full((len(points), 3), 0.5, dtype=torch.float32)
     return points, colors[:, :3].float() / 255.0
