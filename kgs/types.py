@@ -209,8 +209,8 @@ class ProjectedGaussians:
     Args:
         camera_ids: `(M,)` int64.
         gaussian_ids: `(M,)` int64.
-        means2d: projected centres in pixels, `(M, 2)`. A render with gradients on keeps its `.grad`; after
-            :func:`kgs.project` call `means2d.retain_grad()`.
+        means2d: projected centres in pixels, `(M, 2)`. Call `means2d.retain_grad()` before `backward` to keep its
+            `.grad`, as :meth:`kgs.Densifier.observe` needs.
         factors: `(M, 2, 3)`, the product J W R S in pixels: the covariance is `factors @ factors.mT + eps2d I`.
         depths: z in the camera frame, `(M,)`.
         radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.

@@ -147,6 +147,7 @@ def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(ke
 def test_gradients_of_the_centres_in_the_image_are_kept(kernel_backend):
     gaussians, _ = leaves(wide_scene()[0])
     out = GaussianRenderer(backend=kernel_backend)(gaussians, wide_scene()[1])
+    out.projected.means2d.retain_grad()
     out.image.square().sum().backward()
     assert out.projected.means2d.grad.abs().sum() > 0
 

@@ -163,6 +163,7 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
     k = cameras.intrinsics[:, :3, :3].clone().requires_grad_()
     pose = cameras.extrinsics.clone().requires_grad_()
     renders, _, meta = rasterization(*inputs, pose, k, 32, 24, sh_degree=1, pixel_centers="integer")
+    meta["means2d"].retain_grad()
     renders.square().sum().backward()
     again, expected = leaves(gaussians)
     image = GaussianRenderer()(again, kgs.pinhole_cameras(cameras.extrinsics, k.detach(), 32, 24)).image
@@ -278,6 +279,7 @@ def test_the_dense_layout_says_what_the_packed_one_does():
     for packed in (True, False):
         leaf, inputs = leaves(gaussians)
         renders, alphas, meta = call(leaf, cameras, packed=packed, absgrad=True)
+        meta["means2d"].retain_grad()
         renders.square().sum().backward()
         found.append((renders, alphas, meta, inputs))
     (renders, alphas, packed, inputs), (again, alphas_again, dense, inputs_again) = found
@@ -333,11 +335,13 @@ def test_leading_dimensions_are_scenes_of_their_own(packed, sh_degree):
     assert renders.shape == (2, 3, 2, 24, 32, 4)
     assert alphas.shape == (2, 3, 2, 24, 32, 1)
     assert (meta["n_batches"], meta["n_cameras"]) == (6, 2)
+    meta["means2d"].retain_grad()
     (renders.square().sum() + alphas.sum()).backward()
     for b, (gaussians, _) in enumerate(scenes):
         inputs = leaves(gaussians)[1]
         one, two = pose.flatten(0, 1)[b].detach(), k.flatten(0, 1)[b].detach()
         image, alpha, alone = rasterization(*inputs, one, two, 32, 24, backgrounds=backgrounds[b], **options)
+        alone["means2d"].retain_grad()
         (image.square().sum() + alpha.sum()).backward()
         assert torch.equal(image, renders.flatten(0, 1)[b])
         assert torch.equal(alpha, alphas.flatten(0, 1)[b])

@@ -394,6 +394,8 @@ class Trainer:
         self.before_render(camera)
         gaussians = self.model()
         out = self.renderer(gaussians, camera, background)
+        if out.projected.means2d.requires_grad:
+            out.projected.means2d.retain_grad()  # for the densifier
         image = view.seen(out.image)
         loss = photometric_loss(image, target, recipe.dssim_weight, moments=moments, backend=self.backend)
         penalty = self.penalty(gaussians, camera)
