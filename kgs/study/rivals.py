@@ -18,7 +18,7 @@ from kgs.fit.config import FitConfig
 from kgs.fit.trainer import Start, Trainer
 from kgs.geometry import camera_centers
 from kgs.init_points import InitialPoints
-from kgs.losses import TargetMoments, opacity_l1
+from kgs.losses import TargetMoments
 from kgs.types import Gaussians, Rendering
 
 
@@ -114,3 +114,26 @@ def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Ten
     if not by.endswith("gradient"):
         scores = (means - camera_centers(camera.extrinsics).to(means)).norm(dim=1)
     return scores if by in ("high-gradient", "far") else -scores
+
+
+def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:
+    """The mean of the opacities, each weighted by (rank - 1/2) / N with the rank of its score from 1 to N.
+
+    Equal scores share the mean of their ranks. So the weights have mean 1/2 whatever the scores are, and nothing
+    depends on the order of the Gaussians.
+
+    Args:
+        opacities: activated, in [0, 1], `(N,)` (else a ValueError); the gradient goes to these alone.
+        scores: which Gaussians to penalise more, `(N,)` (else a ValueError), in any unit.
+
+    Returns:
+        A number in [0, 1]; 0 where there are no Gaussians.
+    """
+    if opacities.ndim != 1:
+        raise ValueError(f"opacities: expected shape (N,), got {tuple(opacities.shape)}")
+    if scores.shape != opacities.shape:
+        raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
+    ordered = scores.detach().sort().values
+    below, not_above = (torch.searchsorted(ordered, scores.detach(), right=right) for right in (False, True))
+    weights = (below + not_above).to(opacities.dtype) / (2 * max(len(scores), 1))
+    return (weights * opacities).sum() / max(len(opacities), 1)
