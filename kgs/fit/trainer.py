@@ -381,6 +381,7 @@ class Trainer:
             self.drop.progress = progress
             self.drop.train(self.step <= self.times.drop)
         out = self.render_view(self.model(), camera, background)
+        assert out.image is not None  # a render without `outputs` has it
         loss = self.loss_of(view.seen(out.image), target, moments)
         looks = self.step % self.look_every == 0 or self.step == self.times.steps or math.isnan(self._loss)
         if looks:
