@@ -52,7 +52,8 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     """
     where = check_device(device)
     out.mkdir(parents=True, exist_ok=True)
-    repeats, counts = (3, (2_000, 10_000)) if quick else (7, (10_000, 50_000, 200_000))
+    repeats = 3 if quick else 7
+    counts = (2_000, 10_000) if quick else (10_000, 50_000, 200_000)
     sizes = [(SIZE[0] // k, SIZE[1] // k) for k in (3, 2, 1)]
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
     plan = [(table, count, SIZE) for count in counts for table in ("main", "busy", "stages")]

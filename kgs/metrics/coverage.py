@@ -39,7 +39,8 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
         "share" of the test pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the
         views that have such pixels; None if no view has, or if the error is 0. None without test views.
     """
-    train, test = scene.train, scene.test
+    train = scene.train
+    test = scene.test
     if not len(test):
         return None
     depths = [median_depth(train.camera(view)) for view in range(len(train))]

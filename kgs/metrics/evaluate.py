@@ -58,8 +58,10 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
 
 def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float | None:
     """Mean PSNR over some views in dB, of clamped renders; None without views, or if one PSNR is infinite."""
-    renders = (views.as_photo(render(views.camera(i))[0].cpu()) for i in range(len(views)))
-    values = [float(psnr(one, photo.float(), 1.0)) for one, photo in zip(renders, views.images, strict=True)]
+    values = list[float]()
+    for i in range(len(views)):
+        image = views.as_photo(render(views.camera(i))[0].cpu())
+        values.append(float(psnr(image, views.images[i].float(), 1.0)))
     mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
     return round(mean, 4) if math.isfinite(mean) else None
 
@@ -87,7 +89,9 @@ def measure_again(
 def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
     level = psnr(image, target, 1.0).item()
     # Kornia's "valid" map of zero-padded images is the whole map with zero padding.
-    padded, padded_target = (F.pad(each, [_WINDOW // 2] * 4) for each in (image, target))
+    border = [_WINDOW // 2] * 4
+    padded = F.pad(image, border)
+    padded_target = F.pad(target, border)
     values = (
         level if math.isfinite(level) else None,
         ssim(image, target, _WINDOW).mean().item(),

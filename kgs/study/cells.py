@@ -143,7 +143,7 @@ def _split(fit: dict[str, Any]) -> tuple[dict[str, Any], Rival | None]:
 
 def fit_config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
     """The configuration of a cell: a preset (paper unless `fit` names one), with a start, a seed and other settings."""
-    settings = {"init": "model-points" if start == FULL else start, "seed": seed} | fit
+    settings: dict[str, Any] = {"init": "model-points" if start == FULL else start, "seed": seed, **fit}
     preset = settings.pop("preset", "paper")
     return replace(PRESETS[preset], **settings)
 

@@ -90,7 +90,8 @@ class SelectiveDrop(DropGaussian):
 
     def forward(self, opacities: Tensor) -> Tensor:
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`; scores have their shape."""
-        scores, rate = self.scores, self.rate
+        scores = self.scores
+        rate = self.rate
         if not self.training or scores is None:
             return super().forward(opacities)
         if scores.shape != opacities.shape:
@@ -110,8 +111,10 @@ def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Ten
     "high-gradient" or "low-gradient": the mean gradient of the projected centre since the last densification. "far" or
     "near": the distance from the camera's centre, in world units.
     """
-    scores, means = densifier.mean_gradients, densifier.model.means.detach()
-    if not by.endswith("gradient"):
+    if by.endswith("gradient"):
+        scores = densifier.mean_gradients
+    else:
+        means = densifier.model.means.detach()
         scores = (means - camera_centers(camera.extrinsics).to(means)).norm(dim=1)
     return scores if by in ("high-gradient", "far") else -scores
 
