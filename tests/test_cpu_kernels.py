@@ -16,8 +16,8 @@ nb = pytest.importorskip("numba")
 
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
-from kgs.backends.cpu.arrays import arrays  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
+from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
 
 # -- lists ---------------------------------------------------------------------------------------------------------
 

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs.compiled.threads import over
+
 from .binning_kernels import (
     SIZE,
     begin_spans,
@@ -26,7 +28,6 @@ from .binning_kernels import (
     find_spans,
     sort_by_depth,
 )
-from .threads import over
 
 BANDS = 16
 LEAST = 4096  # entries of a band: what is done once a band costs as much as some hundreds of them

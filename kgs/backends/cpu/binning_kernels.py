@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
+from kgs.compiled.kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
 
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048

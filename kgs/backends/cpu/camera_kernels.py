@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .kernel import ONE, ZERO, jit
+from kgs.compiled.kernel import ONE, ZERO, jit
+
 from .projection_kernels import camera_point, color_gradients, point_gradient, rotation, rows, turned_back
 
 

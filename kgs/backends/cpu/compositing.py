@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.backends.base import Inputs
+from kgs.compiled.arrays import arrays
+from kgs.compiled.threads import over
 from kgs.raster.binning import row_slices
 from kgs.types import ProjectedGaussians, RasterOptions
 
 from . import compositing_kernels as kernels
-from .arrays import arrays
 from .binning import Band, RowSlice, TileCoverage
-from .threads import over
 
 _NUMBER = 4  # bytes
 Floats = NDArray[np.float32]

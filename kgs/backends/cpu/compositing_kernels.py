@@ -8,8 +8,9 @@ their moments are added.
 
 import numpy as np
 
+from kgs.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
+
 from .binning_kernels import SIZE, variances
-from .kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
 
 P = SIZE * SIZE
 K = 16

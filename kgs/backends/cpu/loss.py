@@ -4,9 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .arrays import arrays
+from kgs.compiled.arrays import arrays
+from kgs.compiled.threads import over
+
 from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
-from .threads import over
 
 PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 

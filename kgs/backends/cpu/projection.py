@@ -10,14 +10,14 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.camera import MARGIN, Cameras, Frame, whole_frame
+from kgs.compiled.arrays import Array, arrays
+from kgs.compiled.threads import over
 from kgs.memory import empty
 from kgs.projection import finite_gaussians, project_torch, seen_within
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
-from .arrays import Array, arrays
 from .camera_kernels import camera_gradients
 from .projection_kernels import BLOCK, footprint_gradients, footprints
-from .threads import over
 
 
 def project(

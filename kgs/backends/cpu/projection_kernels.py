@@ -9,8 +9,9 @@ import math
 
 import numpy as np
 
+from kgs.compiled.kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
+
 from .harmonics_kernels import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
-from .kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
 
 SMALLEST_SQUARE, LARGEST_SQUARE = f32(1e-30), f32(1e36)
 BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
