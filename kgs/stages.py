@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backends import choose
-from .backends.base import Compositor
+from .backends import Backend, choose
+from .backends.base import CompositingCall, CompositingInputs, Compositor
 from .camera import Cameras, image_size, intrinsics
 from .covariance import compensations, reach, variances
 from .types import (
@@ -90,20 +90,21 @@ def project(
 
 
 def _with_options(projected: ProjectedGaussians, options: RasterOptions) -> ProjectedGaussians:
-    """Without what lies behind the far plane or is too small, and antialiased: what few renders ask for."""
+    """Apply far_plane, radius_clip and antialiased, which most renders leave off."""
     if options.far_plane < math.inf or options.radius_clip > 0:
-        kept = projected.depths < options.far_plane
+        visible = projected.depths < options.far_plane
         if options.radius_clip > 0:
             xx, _, yy, _ = variances(projected.factors.detach(), options.eps2d)
-            kept &= reach(xx, yy).amax(1) > options.radius_clip
-        projected = _rows(projected, kept.nonzero()[:, 0])
+            visible &= reach(xx, yy).amax(1) > options.radius_clip
+        projected = _select(projected, visible.nonzero()[:, 0])
     if options.antialiased and options.eps2d > 0:
-        factor = compensations(projected.factors, options.eps2d)
-        projected = replace(projected, opacities=projected.opacities * factor)
+        opacities = projected.opacities * compensations(projected.factors, options.eps2d)
+        projected = replace(projected, opacities=opacities)
     return projected
 
 
-def _rows(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
+def _select(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
+    """Some of the visible pairs."""
     names = ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
     return replace(projected, **{name: getattr(projected, name).index_select(0, rows) for name in names})
 
@@ -121,7 +122,7 @@ def composite(
     """Composite features of projected Gaussians over all pixels of all cameras.
 
     Differentiable once, by `backward`, with respect to `features` and `projected.means2d`, `factors` and `opacities`.
-    `kgs.raster` has the equations.
+    `kgs.backends.torch` has the equations.
 
     Args:
         projected: M visible pairs (camera, Gaussian).
@@ -150,48 +151,40 @@ def composite(
         >>> kgs.composite(projected, torch.rand(len(projected), 8)).features.shape
         torch.Size([1, 8, 24, 32])
     """
-    given = raster_options(options, fields)
+    options = raster_options(options, fields)
     if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
-    return draw(projected, features, given, median_depth=median_depth, chunk_size=chunk_size, backend=backend)
+    call = CompositingCall(projected, features, options, median_depth, chunk_size)
+    return composite_call(call, backend)
 
 
 @outside_graphs
-def draw(
-    projected: ProjectedGaussians,
-    features: Tensor,
-    options: RasterOptions,
-    *,
-    median_depth: bool = False,
-    chunk_size: int | None = None,
-    backend: str = "auto",
-    keep_absgrad: Callable[[Tensor], None] | None = None,
+def composite_call(
+    call: CompositingCall, backend: str = "auto", absgrad_hook: Callable[[Tensor], None] | None = None
 ) -> Composited:
-    """:func:`composite`, where the caller may say what becomes of the absolute gradients, `(M, 2)`."""
-    _check_projected(projected, features)
-    chosen = choose(
-        backend,
-        "compositing",
-        features.device,
-        lambda candidate: (
-            candidate.covers(features) and candidate.covers_compositing(projected, features, options, chunk_size)
-        ),
-    )
-    tile_size = options.tile_size or chosen.tile_size
-    options = replace(options, tile_size=tile_size)
-    compositor = chosen.compositor(projected, features, options, median_depth, chunk_size)
-    inputs = (projected.means2d, projected.factors, projected.opacities, features)
+    """:func:`composite`; with a hook, that gets the absolute gradients `(M, 2)`, and `means2d.absgrad` is not set."""
+    _check_projected(call.projected, call.features)
+
+    def covers(candidate: Backend) -> bool:
+        return candidate.covers(call.features) and candidate.covers_compositing(call)
+
+    chosen = choose(backend, "compositing", call.features.device, covers)
+    tile_size = call.options.tile_size or chosen.tile_size
+    call = replace(call, options=replace(call.options, tile_size=tile_size))
+    projected = call.projected
+    inputs = (projected.means2d, projected.factors, projected.opacities, call.features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    sums, transmittance, median = _Composite.apply(*inputs, compositor, keep, keep_absgrad)
-    return Composited(sums, transmittance, median if median_depth else None, tile_size)
+    sums, transmittance, median = _Composite.apply(*inputs, chosen.compositor(call), keep, absgrad_hook)
+    return Composited(sums, transmittance, median if call.median_depth else None, tile_size)
 
 
 def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
     """Raise a TypeError or ValueError unless the inputs of compositing match."""
     check_tensor("features", features)
-    m, like = len(projected), projected.means2d
+    m = len(projected)
+    like = projected.means2d
     if features.ndim != 2 or len(features) != m:
         got = tuple(features.shape)
         raise ValueError(f"features: expected shape ({m}, F), a row per projected Gaussian, got {got}")
@@ -223,11 +216,12 @@ class _Composite(torch.autograd.Function):
         features: Tensor,
         compositor: Compositor,
         keep: bool,
-        keep_absgrad: Callable[[Tensor], None] | None,
+        absgrad_hook: Callable[[Tensor], None] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = (means2d, factors, opacities, features)
+        inputs = CompositingInputs(means2d, factors, opacities, features)
         images, ctx.kept = compositor.forward(inputs, keep)
-        ctx.compositor, ctx.keep_absgrad = compositor, keep_absgrad
+        ctx.compositor = compositor
+        ctx.absgrad_hook = absgrad_hook
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(images[2])
         return images
@@ -237,16 +231,18 @@ class _Composite(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         needs = ctx.needs_input_grad[:4]
+        inputs = CompositingInputs(*ctx.saved_tensors)
         # what was kept is freed as soon as it has been used; a second backward computes it again
-        inputs = ctx.saved_tensors
-        *found, absolute = ctx.compositor.backward(inputs, _taken(ctx), grad_sums, grad_transmittance, needs)
-        if absolute is not None and ctx.keep_absgrad is not None:
-            ctx.keep_absgrad(absolute)
-        elif absolute is not None:
-            inputs[0].absgrad = absolute  # the tensor that was given, not a copy of it
-        return *found, None, None, None
+        gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), grad_sums, grad_transmittance, needs)
+        if absgrad is not None and ctx.absgrad_hook is not None:
+            ctx.absgrad_hook(absgrad)
+        elif absgrad is not None:
+            inputs.means2d.absgrad = absgrad  # type: ignore[attr-defined]  # the tensor that was given, not a copy
+        return *gradients, None, None, None
 
 
-def _taken(ctx: Any) -> Any:
-    kept, ctx.kept = ctx.kept, None
+def _take(ctx: Any) -> Any:
+    """What `forward` kept, which the context then holds no longer."""
+    kept = ctx.kept
+    ctx.kept = None
     return kept

@@ -10,7 +10,7 @@ from compositing_checks import TH, many_bands  # noqa: F401 - a fixture for all
 from kernel_checks import assembly, avx_assembly
 from tile_checks import scene
 
-from kgs.raster.binning import bin_to_tiles
+from kgs.backends.torch.binning import bin_to_tiles
 
 nb = pytest.importorskip("numba")
 
@@ -25,8 +25,8 @@ from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
 def coverage_of(projected, threshold=TH, max_spans=2**40):
     inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
     fields = arrays(*inputs, projected.depths, projected.camera_ids)
-    rules = np.float32(projected.eps2d), np.float32(threshold)
-    return TileCoverage(fields, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
+    eps2d, threshold = np.float32(projected.eps2d), np.float32(threshold)
+    return TileCoverage(fields, projected.image_size, projected.num_cameras, eps2d, threshold, 3, False, max_spans, 2)
 
 
 @pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])
@@ -78,7 +78,7 @@ def test_pixels_are_the_lanes(kernel):
     types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
     types |= {
         "starts": f[:, ::1],
-        "done": i8[::1],
+        "reached": i8[::1],
         "transmittance": f[:, :, ::1],
         "depths": f[:, :, ::1],
         "grad_transmittance": f[:, :, ::1],

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 import torch
 
+from kgs.backends.torch.binning import bin_to_tiles
 from kgs.camera import pinhole_cameras
-from kgs.raster.binning import bin_to_tiles
 from kgs.renderer import GaussianRenderer
 from kgs.stages import project
 

@@ -1,4 +1,4 @@
-"""Kernels that find which Gaussian reaches which tile, front to back; spans as in `kgs.raster.binning`.
+"""Kernels that find which Gaussian reaches which tile, front to back; spans as in `kgs.backends.torch.binning`.
 
 In depth order, for each of the n Gaussians that reach a row of tiles:
 

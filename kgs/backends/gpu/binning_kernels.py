@@ -1,4 +1,4 @@
-"""Kernels that find which Gaussian reaches which tile; the spans are those of `kgs.raster.binning`.
+"""Kernels that find which Gaussian reaches which tile; the spans are those of `kgs.backends.torch.binning`.
 
 A lane is a Gaussian, in depth order. `count_entries` and `fill_entries` go through the same rows of tiles and columns,
 so that each Gaussian writes its entries where the sum of the counts before it says.
