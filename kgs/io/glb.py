@@ -15,10 +15,10 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
 from torch import Tensor
 
-import kgs
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
 from kgs.types import check_kind
+from kgs.version import __version__
 
 from .json_files import write_whole
 from .ownership import MADE_BY
@@ -69,7 +69,7 @@ def save_glb(
     quaternion = rotation_matrix_to_quaternion(turn)[[1, 2, 3, 0]]
     node: dict[str, Any] = {"name": "splat", "rotation": quaternion.tolist(), "translation": shift.tolist()}
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"{MADE_BY} {kgs.__version__}"},
+        "asset": {"version": "2.0", "generator": f"{MADE_BY} {__version__}"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-import kgs
+import kgs.version
 from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
@@ -92,7 +92,7 @@ def fit_and_measure(
     chosen = trainer.config.to_dict() | ({} if rival is None else asdict(rival))
     stored |= {"config": chosen, "seen": metrics["seen"]}
     stored |= {"wall_seconds": round(trainer.seconds, 2), "peak_rss_mb": peak_rss_mb(), "versions": metrics["versions"]}
-    stored |= {"revision": revision(Path(kgs.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
+    stored |= {"revision": revision(Path(kgs.version.__file__).parent), "date": datetime.now(UTC).date().isoformat()}
     return trainer, metrics, stored
 
 
