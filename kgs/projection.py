@@ -1,4 +1,4 @@
-"""What projection is made of, for the backends and for what is drawn beside colours.
+"""What projection is made of, for the backends and for outputs beside colours.
 
 `kgs.backends.torch.projection` puts it together. The footprint is in `kgs.covariance`, the lens in `kgs.camera`.
 """

@@ -61,14 +61,14 @@ def project(
         gaussians: N Gaussians.
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
         options: None for the defaults. near_plane, far_plane, radius_clip, eps2d, antialiased, frame and
-            alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are seen).
+            alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are visible).
         colors: whether colours are computed.
         backend: "auto", or the name of one, see `kgs.backends`.
         fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Returns:
         The visible pairs (camera, Gaussian): those that would touch the image with an opacity of 2, or with the largest
-        of all opacities if that is more. (Their own opacity is ignored, so that a dropped Gaussian counts as seen.)
+        of all opacities if that is more. (Their own opacity is ignored, so that a dropped Gaussian counts as visible.)
 
     Raises:
         TypeError: `gaussians` or `cameras` are of another type, dtype or device, or both `options` and fields of them
@@ -81,7 +81,9 @@ def project(
     size = image_size(cameras)
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
         check_tensor("cameras", matrix, gaussians.means, " as the Gaussians")
-    shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
+    n = len(gaussians)
+    count = cameras.extrinsics.shape[0]
+    shape = tuple(gaussians.opacities.shape)
     if shape[:-1] not in ((), (count,)):
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
     device = gaussians.means.device
@@ -198,7 +200,8 @@ def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
     if ids.dtype != torch.int64 or ids.device != like.device or tuple(ids.shape) != (m,):
         raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
     if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # on a GPU this would synchronise
-        first, last = (int(find(ids.numpy())) for find in (np.min, np.max))
+        first = int(np.min(ids.numpy()))
+        last = int(np.max(ids.numpy()))
         if first < 0 or last >= projected.num_cameras:
             wrong = first if first < 0 else last
             raise ValueError(f"camera_ids: expected 0 to {projected.num_cameras - 1}, got {wrong}")

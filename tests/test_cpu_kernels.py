@@ -18,6 +18,7 @@ from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
+from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
 
 # -- lists ---------------------------------------------------------------------------------------------------------
 
@@ -114,9 +115,12 @@ def test_loops_over_columns_are_vector_code(name, arguments, operations):
 # -- cache ---------------------------------------------------------------------------------------------------------
 
 
-def test_kernels_are_compiled_anew_when_any_file_of_theirs_changes():
-    stamps = {
-        k._cache._cache_file._source_stamp[-1] for k in (projection_kernels.footprints, binning_kernels.sort_by_depth)
-    }
-    assert len(stamps) == 1
-    assert len(stamps.pop()) == 64
+def stamp(kernel):
+    return kernel._cache._cache_file._source_stamp[-1]
+
+
+def test_kernels_are_compiled_anew_when_any_file_of_their_folder_changes():
+    shared = stamp(projection_kernels.footprints)
+    assert len(shared) == 64
+    assert stamp(binning_kernels.sort_by_depth) == shared
+    assert stamp(matching_kernels.find_nearest) != shared

@@ -30,7 +30,7 @@ from .binning_kernels import (
 )
 
 BANDS = 16
-LEAST = 4096  # entries of a band: what is done once a band costs as much as some hundreds of them
+LEAST = 4096  # entries of a band: the fixed work of a band costs as much as some hundreds of entries
 
 
 @dataclass(frozen=True)

@@ -201,11 +201,11 @@ def composite_backward(
         value += _feature(features, ids, listed, f0 + 2, channels) * grad2[None, :]
         value += _feature(features, ids, listed, f0 + 3, channels) * grad3[None, :]
         # V_k = alpha v + (1 - alpha) V_{k+1}, and V_{k+1} is 0 behind the stop
-        seen = after > 0.0
-        keep = tl.where(seen, 1.0 - alpha, 0.0)
+        before_stop = after > 0.0
+        keep = tl.where(before_stop, 1.0 - alpha, 0.0)
         one, zero = keep * 0.0 + 1.0, keep * 0.0
         m, b, inner_m, inner_b = tl.associative_scan((keep, alpha * value, one, zero), 0, _compose_behind, reverse=True)
-        later = tl.where(seen, inner_m * behind[None, :] + inner_b, 0.0)
+        later = tl.where(before_stop, inner_m * behind[None, :] + inner_b, 0.0)
         behind = tl.sum(tl.where(k[:, None] == 0, m * behind[None, :] + b, 0.0), 0)
         slope = tl.where(alpha < _ALPHA_MAX, weight * (value - later), 0.0)
         by_x, by_y = slope * dx, slope * dy

@@ -24,17 +24,17 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
     b = tl.program_id(0)
     g = b * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
-    good = inside
+    all_finite = inside
     for i in tl.static_range(3):
-        good &= is_finite(tl.load(means + g * 3 + i, mask=inside, other=0.0))
-        good &= is_finite(tl.load(scales + g * 3 + i, mask=inside, other=0.0))
+        all_finite &= is_finite(tl.load(means + g * 3 + i, mask=inside, other=0.0))
+        all_finite &= is_finite(tl.load(scales + g * 3 + i, mask=inside, other=0.0))
     for i in tl.static_range(4):
-        good &= is_finite(tl.load(quats + g * 4 + i, mask=inside, other=0.0))
+        all_finite &= is_finite(tl.load(quats + g * 4 + i, mask=inside, other=0.0))
     most = tl.zeros((BLOCK,), tl.float32)
     view = 0
     while view < views:
         opacity = tl.load(opacities + view * n + g, mask=inside, other=0.0)
-        good &= is_finite(opacity)
+        all_finite &= is_finite(opacity)
         most = tl.maximum(most, opacity)
         view += 1
     f = tl.arange(0, 16)
@@ -42,10 +42,10 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
     first = 0
     while first < features:
         value = tl.load(row + first, mask=inside[:, None] & (f + first < features)[None, :], other=0.0)
-        good &= tl.min(is_finite(value).to(tl.int32), 1) > 0
+        all_finite &= tl.min(is_finite(value).to(tl.int32), 1) > 0
         first += 16
-    tl.store(finite + g, good.to(tl.int8), mask=inside)
-    tl.store(largest + b, tl.max(tl.where(good, most, 0.0), 0))
+    tl.store(finite + g, all_finite.to(tl.int8), mask=inside)
+    tl.store(largest + b, tl.max(tl.where(all_finite, most, 0.0), 0))
 
 
 @triton.jit
@@ -98,12 +98,12 @@ def _rotation(quats, g, inside):
     y = tl.load(quats + g * 4 + 2, mask=inside, other=0.0)
     z = tl.load(quats + g * 4 + 3, mask=inside, other=0.0)
     peak = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
-    some = peak > 0.0
-    scale = tl.where(some, peak, 1.0)  # no square overflows or vanishes
+    turns = peak > 0.0
+    scale = tl.where(turns, peak, 1.0)  # no square overflows or vanishes
     w, x, y, z = w / scale, x / scale, y / scale, z / scale
-    norm = tl.where(some, tl.sqrt(w * w + x * x + y * y + z * z), 1.0)
-    w, x, y, z = tl.where(some, w / norm, 1.0), x / norm, y / norm, z / norm
-    inverse = tl.where(some, 1.0 / norm / scale, 0.0)
+    norm = tl.where(turns, tl.sqrt(w * w + x * x + y * y + z * z), 1.0)
+    w, x, y, z = tl.where(turns, w / norm, 1.0), x / norm, y / norm, z / norm
+    inverse = tl.where(turns, 1.0 / norm / scale, 0.0)
     xx, yy, zz = 2.0 * x * x, 2.0 * y * y, 2.0 * z * z
     xy, xz, yz = 2.0 * x * y, 2.0 * x * z, 2.0 * y * z
     wx, wy, wz = 2.0 * w * x, 2.0 * w * y, 2.0 * w * z
@@ -166,10 +166,10 @@ def find_visible(
     xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
     reach = tl.load(cutoff)
     rx, ry = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
-    some = inside & beyond & (tl.load(finite + g, mask=inside, other=0) > 0)
-    some &= (det > 0.0) & is_finite(det + _largest(xx, xy, yy) + u + v)
-    some &= (u + rx > -0.5) & (u - rx < width - 0.5) & (v + ry > -0.5) & (v - ry < height - 0.5)
-    tl.store(visible + c * n + g, some.to(tl.int32), mask=inside)
+    touches = inside & beyond & (tl.load(finite + g, mask=inside, other=0) > 0)
+    touches &= (det > 0.0) & is_finite(det + _largest(xx, xy, yy) + u + v)
+    touches &= (u + rx > -0.5) & (u - rx < width - 0.5) & (v + ry > -0.5) & (v - ry < height - 0.5)
+    tl.store(visible + c * n + g, touches.to(tl.int32), mask=inside)
 
 
 @triton.jit

@@ -326,7 +326,7 @@ class DepthSlice:
         alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
         assert step.before is not None
         transmittance = self._transmittances(alpha, step.before)
-        if step.ended:  # nothing is seen behind the stop
+        if step.ended:  # nothing counts behind the stop
             F.threshold(transmittance, self._thresholds.transmittance, 0.0, inplace=True)
             alpha.mul_(transmittance[:-1].sign())
         weights = alpha * transmittance[:-1]
