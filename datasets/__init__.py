@@ -1,7 +1,8 @@
 """Scenes as posed images: from disk in the layouts of LLFF, COLMAP, Blender and nerfstudio, or made on the spot."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from kgs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .load import load_scene
@@ -10,11 +11,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Scene", "Views", "load_scene", "synthetic_scene"]
 
-_HOMES = {"Scene": "scene", "Views": "scene", "load_scene": "load", "synthetic_scene": "synthetic"}
-
-
-def __getattr__(name: str) -> Any:
-    """The names are loaded when they are asked for, and torch with them: folders are looked at without it."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+# folders are looked at without torch
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "kgs.datasets.scene": ("Scene", "Views"),
+        "kgs.datasets.load": ("load_scene",),
+        "kgs.datasets.synthetic": ("synthetic_scene",),
+    },
+)

@@ -47,7 +47,8 @@ def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
 class _FootprintFactors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-        a, s = columns(rows), columns(scales)
+        a = columns(rows)
+        s = columns(scales)
         peak = quats.abs().amax(1)
         q = columns(quats).div_(torch.where(peak > 0, peak, 1.0))
         norm = q.square().sum(0).sqrt()
@@ -65,19 +66,19 @@ class _FootprintFactors(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
         a, q, inverse_norm, s, turned = ctx.saved_tensors
-        found: list[Tensor | None] = [None, None, None]
+        d_rows = d_quats = d_scales = None
         g = columns(grad)
         if ctx.needs_input_grad[2]:
-            found[2] = (turned * g).unflatten(0, (2, 3)).sum(0).t()
+            d_scales = (turned * g).unflatten(0, (2, 3)).sum(0).t()
         g = (g.unflatten(0, (2, 3)) * s).flatten(0, 1)
         if ctx.needs_input_grad[0]:
             r = _rotation_columns(q)
             parts = [_dot(g[3 * i : 3 * i + 3], r[3 * k : 3 * k + 3]) for i in (0, 1) for k in (0, 1, 2)]
-            found[0] = torch.stack(parts, 1).unflatten(1, (2, 3))
+            d_rows = torch.stack(parts, 1).unflatten(1, (2, 3))
         if ctx.needs_input_grad[1]:
             d_rotations = (a.unflatten(0, (2, 3, 1)) * g.unflatten(0, (2, 1, 3))).sum(0)
-            found[1] = _quaternion_gradient(q, d_rotations).mul_(inverse_norm).t()
-        return tuple(found)
+            d_quats = _quaternion_gradient(q, d_rotations).mul_(inverse_norm).t()
+        return d_rows, d_quats, d_scales
 
 
 def half_axes(covariances: Tensor) -> Tensor:
@@ -90,19 +91,22 @@ def half_axes(covariances: Tensor) -> Tensor:
     The gradient is (G A^-1 + (G A^-1)^T) / 4 of a gradient G by A: right for every function of A A^T, once. In float32
     its error is about 1e-7 times the ratio of the longest to the shortest axis; of an axis of length 0 it is 0.
     """
-    found: Tensor = _HalfAxes.apply(covariances)
-    return found
+    factors: Tensor = _HalfAxes.apply(covariances)
+    return factors
 
 
 class _HalfAxes(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, covariances: Tensor) -> Tensor:
         xx, xy, xz, yx, yy, yz, zx, zy, zz = covariances.double().flatten(1).unbind(1)
-        xy, xz, yz = (xy + yx) / 2, (xz + zx) / 2, (yz + zy) / 2
+        xy = (xy + yx) / 2
+        xz = (xz + zx) / 2
+        yz = (yz + zy) / 2
         rounding = torch.finfo(covariances.dtype).eps
         a = xx.clamp_min(0.0).sqrt()
         into_a = torch.where(a > 0, 1.0 / a, 0.0)
-        b, c = xy * into_a, xz * into_a
+        b = xy * into_a
+        c = xz * into_a
         d = torch.maximum(yy - b * b, rounding * yy).clamp_min(0.0).sqrt()
         e = (yz - b * c) * torch.where(d > 0, 1.0 / d, 0.0)
         f = torch.maximum(zz - c * c - e * e, rounding * zz).clamp_min(0.0).sqrt()
@@ -122,8 +126,9 @@ class _HalfAxes(torch.autograd.Function):
         flat = factors.diagonal(dim1=1, dim2=2) == 0  # the gradient is 0 there, too
         whole = factors + torch.diag_embed(flat.double())
         solved = torch.linalg.solve_triangular(whole, grad.double(), upper=False, left=False)
-        found: Tensor = ((solved + solved.mT) / 4).to(grad.dtype)
-        return found.masked_fill_(~factors.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), 0.0)
+        d_covariances: Tensor = ((solved + solved.mT) / 4).to(grad.dtype)
+        finite = factors.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+        return d_covariances.masked_fill_(~finite, 0.0)
 
 
 def columns(rows: Tensor) -> Tensor:
@@ -146,22 +151,28 @@ def _rotation_columns(q: Tensor) -> list[Tensor]:
 def _quaternion_gradient(q: Tensor, d: Tensor) -> Tensor:
     """From dL/dR `(3, 3, M)` to dL/dq `(4, M)` along the unit sphere, for q of norm 1."""
     w, x, y, z = q
-    px, py, pz = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]
-    sxy, sxz, syz = d[0, 1] + d[1, 0], d[0, 2] + d[2, 0], d[1, 2] + d[2, 1]
+    px = d[2, 1] - d[1, 2]
+    py = d[0, 2] - d[2, 0]
+    pz = d[1, 0] - d[0, 1]
+    sxy = d[0, 1] + d[1, 0]
+    sxz = d[0, 2] + d[2, 0]
+    syz = d[1, 2] + d[2, 1]
     dx, dy, dz = (2 * (d[i, i] - d[0, 0] - d[1, 1] - d[2, 2]) for i in (0, 1, 2))
     dw = x * px + y * py + z * pz
     dx = w * px + x * dx + y * sxy + z * sxz
     dy = w * py + y * dy + x * sxy + z * syz
     dz = w * pz + z * dz + x * sxz + y * syz
-    found = torch.stack([dw, dx, dy, dz]).mul_(2)
-    return found.sub_(q * (q * found).sum(0))
+    d_quats = torch.stack([dw, dx, dy, dz]).mul_(2)
+    return d_quats.sub_(q * (q * d_quats).sum(0))
 
 
 def variances(factors: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entries xx, xy, yy and determinant of M M^T + eps2d I, each `(M,)`."""
     a, b = columns(factors).unflatten(0, (2, 3))
-    xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
-    cross = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    xx = _dot(a, a)
+    xy = _dot(a, b)
+    yy = _dot(b, b)
+    cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     det = _dot(cross, cross) + eps2d * (xx + yy) + eps2d**2
     return xx + eps2d, xy, yy + eps2d, det
 
@@ -177,8 +188,9 @@ def compensations(factors: Tensor, eps2d: float) -> Tensor:
     The numerator is the norm of a x b for the rows a, b of M, so nothing is cancelled; its gradient is 0 where it is 0.
     """
     a, b = factors.unbind(1)
-    found: Tensor = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=1) * variances(factors, eps2d)[3].rsqrt()
-    return found
+    area: Tensor = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=1)
+    det = variances(factors, eps2d)[3]
+    return area * det.rsqrt()
 
 
 def reach(xx: Tensor, yy: Tensor) -> Tensor:
@@ -193,10 +205,15 @@ def whitening(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> tuple[Tensor, 
     """
     x_larger = xx >= yy
     pivot = torch.where(x_larger, xx, yy)
-    slope, along, across = -xy / pivot, pivot.rsqrt(), (pivot / det).sqrt()
+    slope = -xy / pivot
+    along = pivot.rsqrt()
+    across = (pivot / det).sqrt()
     zero = torch.zeros_like(along)
-    ax, ay = torch.where(x_larger, slope * across, across), torch.where(x_larger, across, slope * across)
-    return ax, ay, torch.where(x_larger, along, zero), torch.where(x_larger, zero, along)
+    ax = torch.where(x_larger, slope * across, across)
+    ay = torch.where(x_larger, across, slope * across)
+    bx = torch.where(x_larger, along, zero)
+    by = torch.where(x_larger, zero, along)
+    return ax, ay, bx, by
 
 
 def footprint_table(means2d: Tensor, factors: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
@@ -218,7 +235,8 @@ def moment_gradients(rows: Tensor, factors: Tensor, opacities: Tensor, eps2d: fl
     def conic(x: Tensor, y: Tensor) -> Tensor:
         return torch.stack([yy * x - xy * y, xx * y - xy * x]).div_(det)
 
-    a, b = m = columns(factors).unflatten(0, (2, 3))
+    m = columns(factors).unflatten(0, (2, 3))
+    a, b = m
     w = torch.linalg.cross(a, b, dim=0)
     turned = torch.stack([torch.linalg.cross(b, w, dim=0), torch.linalg.cross(w, a, dim=0)])
     x, y = turned.add_(m, alpha=eps2d).div_(det)  # Q M

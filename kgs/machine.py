@@ -13,8 +13,8 @@ import cv2
 import kornia
 import torch
 
-from . import __version__
 from .backends import resolve
+from .version import __version__
 
 
 def check_device(name: str) -> torch.device:

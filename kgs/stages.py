@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backends import choose
-from .backends.base import Compositor
+from .backends import Backend, choose
+from .backends.base import CompositingCall, CompositingInputs, Compositor
 from .camera import Cameras, image_size, intrinsics, with_constant_last_rows
 from .covariance import compensations, reach, variances
 from .types import (
@@ -62,14 +62,14 @@ def project(
         cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`. The third row of a pinhole camera's
             intrinsics is (0, 0, 1): a constant, without gradient.
         options: None for the defaults. near_plane, far_plane, radius_clip, eps2d, antialiased, frame and
-            alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are seen).
+            alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are visible).
         colors: whether colours are computed.
         backend: "auto", or the name of one, see `kgs.backends`.
         fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Returns:
         The visible pairs (camera, Gaussian): those that would touch the image with an opacity of 2, or with the largest
-        of all opacities if that is more. (Their own opacity is ignored, so that a dropped Gaussian counts as seen.)
+        of all opacities if that is more. (Their own opacity is ignored, so that a dropped Gaussian counts as visible.)
 
     Raises:
         TypeError: `gaussians` or `cameras` are of another type, dtype or device, or both `options` and fields of them
@@ -82,7 +82,9 @@ def project(
     size = image_size(cameras)
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
         check_tensor("cameras", matrix, gaussians.means, " as the Gaussians")
-    shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
+    n = len(gaussians)
+    count = cameras.extrinsics.shape[0]
+    shape = tuple(gaussians.opacities.shape)
     if shape[:-1] not in ((), (count,)):
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
     cameras = with_constant_last_rows(cameras)
@@ -92,20 +94,21 @@ def project(
 
 
 def _with_options(projected: ProjectedGaussians, options: RasterOptions) -> ProjectedGaussians:
-    """Without what lies behind the far plane or is too small, and antialiased: what few renders ask for."""
+    """Apply far_plane, radius_clip and antialiased, which most renders leave off."""
     if options.far_plane < math.inf or options.radius_clip > 0:
-        kept = projected.depths < options.far_plane
+        visible = projected.depths < options.far_plane
         if options.radius_clip > 0:
             xx, _, yy, _ = variances(projected.factors.detach(), options.eps2d)
-            kept &= reach(xx, yy).amax(1) > options.radius_clip
-        projected = _rows(projected, kept.nonzero()[:, 0])
+            visible &= reach(xx, yy).amax(1) > options.radius_clip
+        projected = _select(projected, visible.nonzero()[:, 0])
     if options.antialiased and options.eps2d > 0:
-        factor = compensations(projected.factors, options.eps2d)
-        projected = replace(projected, opacities=projected.opacities * factor)
+        opacities = projected.opacities * compensations(projected.factors, options.eps2d)
+        projected = replace(projected, opacities=opacities)
     return projected
 
 
-def _rows(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
+def _select(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
+    """Some of the visible pairs."""
     names = ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
     return replace(projected, **{name: getattr(projected, name).index_select(0, rows) for name in names})
 
@@ -123,7 +126,7 @@ def composite(
     """Composite features of projected Gaussians over all pixels of all cameras.
 
     Differentiable once, by `backward`, with respect to `features` and `projected.means2d`, `factors` and `opacities`.
-    `kgs.raster` has the equations.
+    `kgs.backends.torch` has the equations.
 
     Args:
         projected: M visible pairs (camera, Gaussian).
@@ -152,48 +155,40 @@ def composite(
         >>> kgs.composite(projected, torch.rand(len(projected), 8)).features.shape
         torch.Size([1, 8, 24, 32])
     """
-    given = raster_options(options, fields)
+    options = raster_options(options, fields)
     if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
-    return draw(projected, features, given, median_depth=median_depth, chunk_size=chunk_size, backend=backend)
+    call = CompositingCall(projected, features, options, median_depth, chunk_size)
+    return composite_call(call, backend)
 
 
 @outside_graphs
-def draw(
-    projected: ProjectedGaussians,
-    features: Tensor,
-    options: RasterOptions,
-    *,
-    median_depth: bool = False,
-    chunk_size: int | None = None,
-    backend: str = "auto",
-    keep_absgrad: Callable[[Tensor], None] | None = None,
+def composite_call(
+    call: CompositingCall, backend: str = "auto", absgrad_hook: Callable[[Tensor], None] | None = None
 ) -> Composited:
-    """:func:`composite`, where the caller may say what becomes of the absolute gradients, `(M, 2)`."""
-    _check_projected(projected, features)
-    chosen = choose(
-        backend,
-        "compositing",
-        features.device,
-        lambda candidate: (
-            candidate.covers(features) and candidate.covers_compositing(projected, features, options, chunk_size)
-        ),
-    )
-    tile_size = options.tile_size or chosen.tile_size
-    options = replace(options, tile_size=tile_size)
-    compositor = chosen.compositor(projected, features, options, median_depth, chunk_size)
-    inputs = (projected.means2d, projected.factors, projected.opacities, features)
+    """:func:`composite`; with a hook, that gets the absolute gradients `(M, 2)`, and `means2d.absgrad` is not set."""
+    _check_projected(call.projected, call.features)
+
+    def covers(candidate: Backend) -> bool:
+        return candidate.covers(call.features) and candidate.covers_compositing(call)
+
+    chosen = choose(backend, "compositing", call.features.device, covers)
+    tile_size = call.options.tile_size or chosen.tile_size
+    call = replace(call, options=replace(call.options, tile_size=tile_size))
+    projected = call.projected
+    inputs = (projected.means2d, projected.factors, projected.opacities, call.features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    sums, transmittance, median = _Composite.apply(*inputs, compositor, keep, keep_absgrad)
-    return Composited(sums, transmittance, median if median_depth else None, tile_size)
+    sums, transmittance, median = _Composite.apply(*inputs, chosen.compositor(call), keep, absgrad_hook)
+    return Composited(sums, transmittance, median if call.median_depth else None, tile_size)
 
 
 def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
     """Raise a TypeError or ValueError unless the inputs of compositing match."""
     check_tensor("features", features)
-    m, like = len(projected), projected.means2d
+    m = len(projected)
+    like = projected.means2d
     if features.ndim != 2 or len(features) != m:
         got = tuple(features.shape)
         raise ValueError(f"features: expected shape ({m}, F), a row per projected Gaussian, got {got}")
@@ -207,7 +202,8 @@ def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
     if ids.dtype != torch.int64 or ids.device != like.device or tuple(ids.shape) != (m,):
         raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
     if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # on a GPU this would synchronise
-        first, last = (int(find(ids.numpy())) for find in (np.min, np.max))
+        first = int(np.min(ids.numpy()))
+        last = int(np.max(ids.numpy()))
         if first < 0 or last >= projected.num_cameras:
             wrong = first if first < 0 else last
             raise ValueError(f"camera_ids: expected 0 to {projected.num_cameras - 1}, got {wrong}")
@@ -225,11 +221,12 @@ class _Composite(torch.autograd.Function):
         features: Tensor,
         compositor: Compositor,
         keep: bool,
-        keep_absgrad: Callable[[Tensor], None] | None,
+        absgrad_hook: Callable[[Tensor], None] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = (means2d, factors, opacities, features)
+        inputs = CompositingInputs(means2d, factors, opacities, features)
         images, ctx.kept = compositor.forward(inputs, keep)
-        ctx.compositor, ctx.keep_absgrad = compositor, keep_absgrad
+        ctx.compositor = compositor
+        ctx.absgrad_hook = absgrad_hook
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(images[2])
         return images
@@ -239,16 +236,18 @@ class _Composite(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         needs = ctx.needs_input_grad[:4]
+        inputs = CompositingInputs(*ctx.saved_tensors)
         # what was kept is freed as soon as it has been used; a second backward computes it again
-        inputs = ctx.saved_tensors
-        *found, absolute = ctx.compositor.backward(inputs, _taken(ctx), grad_sums, grad_transmittance, needs)
-        if absolute is not None and ctx.keep_absgrad is not None:
-            ctx.keep_absgrad(absolute)
-        elif absolute is not None:
-            inputs[0].absgrad = absolute  # the tensor that was given, not a copy of it
-        return *found, None, None, None
+        gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), grad_sums, grad_transmittance, needs)
+        if absgrad is not None and ctx.absgrad_hook is not None:
+            ctx.absgrad_hook(absgrad)
+        elif absgrad is not None:
+            inputs.means2d.absgrad = absgrad  # type: ignore[attr-defined]  # the tensor that was given, not a copy
+        return *gradients, None, None, None
 
 
-def _taken(ctx: Any) -> Any:
-    kept, ctx.kept = ctx.kept, None
+def _take(ctx: Any) -> Any:
+    """What `forward` kept, which the context then holds no longer."""
+    kept = ctx.kept
+    ctx.kept = None
     return kept

@@ -14,14 +14,16 @@ class Half(backends.TorchBackend):
     name = "half"
     tile_size = 4
 
-    def covers_compositing(self, projected, features, options, chunk_size):
-        return projected.image_size[0] <= 8
+    def covers_compositing(self, call):
+        return call.projected.image_size[0] <= 8
 
-    def compositor(self, projected, features, options, median_depth, chunk_size):
-        whole = super().compositor(projected, features, options, median_depth, chunk_size)
-        forward = whole.forward
-        whole.forward = lambda inputs, keep: forward((*inputs[:3], inputs[3] / 2), keep)
-        return whole
+    @property
+    def compositor(self):
+        class Halved(super().compositor):
+            def forward(self, inputs, keep):
+                return super().forward(inputs._replace(features=inputs.features / 2), keep)
+
+        return Halved
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ def handed_over(kernel_backend, monkeypatch):
     calls = []
     package = next(type(backend).__module__ for backend in BACKENDS if backend.name == kernel_backend)
     module = importlib.import_module(f"{package}.projection")
-    real = module.project_torch
-    monkeypatch.setattr(module, "project_torch", lambda *a: calls.append(1) or real(*a))
+    real = module.project_in_torch
+    monkeypatch.setattr(module, "project_in_torch", lambda *a: calls.append(1) or real(*a))
     return calls
 
 

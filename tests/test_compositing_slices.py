@@ -10,8 +10,8 @@ from oracles import near_threshold
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kgs import GaussianRenderer, backends, composite, project
-from kgs.raster import compositing
-from kgs.raster.binning import bin_to_tiles
+from kgs.backends.torch import compositing
+from kgs.backends.torch.binning import bin_to_tiles
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -61,17 +61,17 @@ def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds, siz
 
 
 def dense(means2d, factors, opacities, features, depths, size, eps2d):
-    """Every footprint at every pixel, with the default thresholds: sums of features and light, by autograd."""
+    """Every footprint at every pixel, with the default thresholds: sums of features and transmittance, by autograd."""
     order = depths.argsort(stable=True)
     covariances = factors @ factors.mT + eps2d * torch.eye(2, dtype=factors.dtype)
     d = torch.cartesian_prod(*map(torch.arange, size)).flip(1) - means2d[:, None]
     squared = torch.einsum("npi,nij,npj->np", d, torch.linalg.inv(covariances), d)
     alphas = (opacities[:, None] * torch.exp(-0.5 * squared)).clamp(max=0.99)[order]
     alphas = torch.where(alphas >= TH, alphas, 0.0)
-    light = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
-    light = torch.where(light >= STOP, light, 0.0)
-    sums = torch.einsum("np,nf->fp", alphas * light[:-1], features[order])
-    return torch.cat([sums, light[-1:]]).view(1, -1, *size)
+    transmittance = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
+    transmittance = torch.where(transmittance >= STOP, transmittance, 0.0)
+    sums = torch.einsum("np,nf->fp", alphas * transmittance[:-1], features[order])
+    return torch.cat([sums, transmittance[-1:]]).view(1, -1, *size)
 
 
 @pytest.mark.usefixtures("torch_alone")  # in float64
@@ -108,16 +108,16 @@ def torch_alone(monkeypatch):
 
 
 @pytest.fixture
-def drawn(monkeypatch, torch_alone):
-    """The depth slices that are drawn from here on, and whether their alphas were kept."""
-    found, draw = [], compositing.DepthSlice.draw
+def composited(monkeypatch, torch_alone):
+    """The depth slices that are composited from here on, and whether their alphas were kept."""
+    slices, real = [], compositing.DepthSlice.composite
 
     def noted(part, canvas, keep, keep_alphas):
-        found.append((part, keep_alphas))
-        return draw(part, canvas, keep, keep_alphas)
+        slices.append((part, keep_alphas))
+        return real(part, canvas, keep, keep_alphas)
 
-    monkeypatch.setattr(compositing.DepthSlice, "draw", noted)
-    return found
+    monkeypatch.setattr(compositing.DepthSlice, "composite", noted)
+    return slices
 
 
 def tightest(projected, features, threshold=TH, **options):
@@ -135,31 +135,31 @@ def tightest(projected, features, threshold=TH, **options):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_byte_budget_changes_nothing(dtype, drawn):
+def test_byte_budget_changes_nothing(dtype, composited):
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     free, free_gradients = loss_and_gradients(projected, colors, weights)
-    assert len(drawn) == 1
+    assert len(composited) == 1
     budget = tightest(projected, colors)
-    drawn.clear()
+    composited.clear()
     tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
-    assert len(drawn) >= 2 * 3, "row slices, forward and again backward"
+    assert len(composited) >= 2 * 3, "row slices, forward and again backward"
     assert torch.equal(tight, free)
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
 
 
 @pytest.mark.parametrize("dtype", [pytest.param(DTYPES[0], marks=pytest.mark.slow), *DTYPES[1:]])
-def test_alphas_made_again_are_those_that_were_kept(dtype, drawn, monkeypatch):
+def test_alphas_made_again_are_those_that_were_kept(dtype, composited, monkeypatch):
     settings = dataclasses.replace(compositing.SETTINGS["cpu"], pairs=2**12)  # steps that fit whatever the budget
     monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     kept, kept_gradients = loss_and_gradients(projected, colors, weights)
-    assert all(keep_alphas for _, keep_alphas in drawn)
+    assert all(keep_alphas for _, keep_alphas in composited)
     budget = 2**24
-    while any(keep_alphas for _, keep_alphas in drawn):  # until there is room for the lists alone
-        drawn.clear()
+    while any(keep_alphas for _, keep_alphas in composited):  # until there is room for the lists alone
+        composited.clear()
         budget = int(0.9 * budget)
         lean, lean_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
-    assert len(drawn) == 1
+    assert len(composited) == 1
     assert torch.equal(lean, kept)
     assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
 
@@ -169,7 +169,7 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, drawn, monkeypatch):
     "thresholds", [*(pytest.param(pair, marks=pytest.mark.slow) for pair in ((0.0, 0.0), (TH, STOP))), (TH, 0.1)]
 )
 @pytest.mark.parametrize("tight", [False, True])
-def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, drawn, monkeypatch):
+def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, composited, monkeypatch):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
     opacities = projected.opacities.sqrt()  # some tiles get dark before the last layer
@@ -178,14 +178,14 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, drawn, mon
     median = composite(projected, colors, median_depth=True, **options).median_depth
     if tight:  # and in row slices
         options["max_bytes"] = tightest(projected, colors, thresholds[0])
-    drawn.clear()
+    composited.clear()
     layers = 6 if thresholds[0] else 20  # without a threshold each of the 300 is in the list of each tile
     settings = dataclasses.replace(compositing.SETTINGS["cpu"], layers=layers)
     monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)
     layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
-    entries = [len(part.lists.entries) for part, _ in drawn]
+    entries = [len(part.lists.entries) for part, _ in composited]
     assert len(entries) > (6 if tight else 3)
-    if thresholds[1] == 0.1:  # what lies behind the end of the light is not listed
+    if thresholds[1] == 0.1:  # what lies behind the stop is not listed
         assert sum(entries) < 0.9 * (2 if tight else 1) * len(bin_to_tiles(projected).entries)
     assert (layered - image).abs().max() <= bound
     assert_gradients_close(layered_gradients, gradients, bound)

@@ -10,14 +10,15 @@ from compositing_checks import TH, many_bands  # noqa: F401 - a fixture for all
 from kernel_checks import assembly, avx_assembly
 from tile_checks import scene
 
-from kgs.raster.binning import bin_to_tiles
+from kgs.backends.torch.binning import bin_to_tiles
 
 nb = pytest.importorskip("numba")
 
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
-from kgs.backends.cpu.arrays import arrays  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
+from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
+from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
 
 # -- lists ---------------------------------------------------------------------------------------------------------
 
@@ -25,8 +26,8 @@ from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 def coverage_of(projected, threshold=TH, max_spans=2**40):
     inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
     fields = arrays(*inputs, projected.depths, projected.camera_ids)
-    rules = np.float32(projected.eps2d), np.float32(threshold)
-    return TileCoverage(fields, projected.image_size, projected.num_cameras, rules, 3, False, max_spans, 2)
+    eps2d, threshold = np.float32(projected.eps2d), np.float32(threshold)
+    return TileCoverage(fields, projected.image_size, projected.num_cameras, eps2d, threshold, 3, False, max_spans, 2)
 
 
 @pytest.mark.parametrize("rows", [None, (2, 5), (4, 5)])
@@ -78,7 +79,7 @@ def test_pixels_are_the_lanes(kernel):
     types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
     types |= {
         "starts": f[:, ::1],
-        "done": i8[::1],
+        "reached": i8[::1],
         "transmittance": f[:, :, ::1],
         "depths": f[:, :, ::1],
         "grad_transmittance": f[:, :, ::1],
@@ -114,9 +115,12 @@ def test_loops_over_columns_are_vector_code(name, arguments, operations):
 # -- cache ---------------------------------------------------------------------------------------------------------
 
 
-def test_kernels_are_compiled_anew_when_any_file_of_theirs_changes():
-    stamps = {
-        k._cache._cache_file._source_stamp[-1] for k in (projection_kernels.footprints, binning_kernels.sort_by_depth)
-    }
-    assert len(stamps) == 1
-    assert len(stamps.pop()) == 64
+def stamp(kernel):
+    return kernel._cache._cache_file._source_stamp[-1]
+
+
+def test_kernels_are_compiled_anew_when_any_file_of_their_folder_changes():
+    shared = stamp(projection_kernels.footprints)
+    assert len(shared) == 64
+    assert stamp(binning_kernels.sort_by_depth) == shared
+    assert stamp(matching_kernels.find_nearest) != shared

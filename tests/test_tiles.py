@@ -6,7 +6,7 @@ from factories import footprints, random_camera, random_gaussians
 from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, scene
 
 from kgs import Gaussians, project
-from kgs.raster.binning import TileCoverage, bin_to_tiles
+from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
 
 
 def needles(seed, ratio, size=(45, 67)):

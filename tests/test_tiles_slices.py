@@ -5,7 +5,7 @@ import torch
 from factories import footprints
 from tile_checks import THRESHOLD, check_structure, dots, listed, scene, tiles_of_entries
 
-from kgs.raster.binning import TileCoverage, bin_to_tiles
+from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
 
 # -- many tiles ----------------------------------------------------------------------------------------------------
 

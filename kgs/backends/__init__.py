@@ -1,21 +1,21 @@
 """Which implementation of the renderer runs a call: `backend=` by name, and what "auto" takes.
 
-    "torch"   every call (`kgs.backends.pytorch`)
+    "torch"   every call (`kgs.backends.torch`)
     "numba"   float32 on a CPU (`kgs.backends.cpu`, extra "fast")
     "triton"  float32 on a GPU (`kgs.backends.gpu`; torch brings Triton on Linux)
 
-A backend is a class with its stages as methods, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`.
+A backend is a class that names its stages, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`.
 """
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
+from torch import device as Device  # `import torch` would be taken for the folder of that name here
 
 from .base import Backend
 from .cpu import CpuBackend
 from .gpu import GpuBackend
-from .pytorch import TorchBackend
+from .torch import TorchBackend
 
 __all__ = ["BACKENDS", "Backend", "available", "check_backend", "choose", "resolve", "takes_kernels"]
 
@@ -38,7 +38,7 @@ def check_backend(name: str) -> None:
             raise ModuleNotFoundError(f'backend: "{name}" needs {package}, {how}', name=package)
 
 
-def resolve(name: str, device: torch.device) -> str:
+def resolve(name: str, device: Device) -> str:
     """The name of the backend that "auto" takes for float32 on a device; other names are returned unchanged.
 
     Raises:
@@ -49,11 +49,11 @@ def resolve(name: str, device: torch.device) -> str:
     for backend in BACKENDS:
         if backend.runs_on(device) and backend.is_installed() and _may_take(backend, name, device):
             return backend.name
-    where = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
-    raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", which runs on {where} alone')
+    devices = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
+    raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", which runs on {devices} alone')
 
 
-def choose(name: str, stage: str, device: torch.device, covers: Callable[[Backend], bool]) -> Backend:
+def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bool]) -> Backend:
     """The backend for a call: for "auto" the first that covers it and is trusted, else the one that is named.
 
     Args:
@@ -91,6 +91,6 @@ def takes_kernels(name: str, stage: str, like: Tensor) -> bool:
     return chosen.name == CpuBackend.name
 
 
-def _may_take(backend: Backend, name: str, device: torch.device) -> bool:
+def _may_take(backend: Backend, name: str, device: Device) -> bool:
     """Whether this is the backend that is named, or one that "auto" may take on a device."""
     return name == backend.name or (name == "auto" and backend.is_trusted(device))

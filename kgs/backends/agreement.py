@@ -8,8 +8,8 @@ from torch import Tensor
 from kgs.camera import image_size, pinhole_cameras
 from kgs.types import Gaussians, RasterOptions
 
-from .base import Backend
-from .pytorch import TorchBackend
+from .base import Backend, CompositingCall, CompositingInputs
+from .torch import TorchBackend
 
 BOUND = 5e-5  # a larger disagreement is no rounding
 _WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
@@ -30,45 +30,51 @@ def disagreement(backend: Backend, device: torch.device) -> float:
         device: where; torch is on the CPU where it has no float64 there.
     """
     place = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    pairs = list(zip(_drawn(backend, device), _drawn(TorchBackend(), place), strict=True))
+    pairs = list(zip(_render(backend, device), _render(TorchBackend(), place), strict=True))
     if backend.has_loss:
         pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
-    return max(_relative(found, expected) for found, expected in pairs)
+    return max(_relative(value, expected) for value, expected in pairs)
 
 
 def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) -> Tensor:
     """Numbers of float32 in float64, so that both backends start from the same."""
     generator = torch.Generator().manual_seed(seed)
-    drawn = torch.rand(shape, generator=generator, dtype=torch.float32, device="cpu")
-    return (drawn * (high - low) + low).double()
+    unit = torch.rand(shape, generator=generator, dtype=torch.float32, device="cpu")
+    return (unit * (high - low) + low).double()
 
 
-def _drawn(backend: Backend, device: torch.device) -> list[Tensor]:
+def _render(backend: Backend, device: torch.device) -> list[Tensor]:
     """Image, depth and transmittance, and the gradients of all inputs; float64 from torch, else float32."""
     dtype = torch.float64 if isinstance(backend, TorchBackend) else torch.float32
-    n, (height, width) = 32, (12, 16)
+    n = 32
+    width, height = 16, 12
     means = (_random(n, 3) + torch.tensor([0.0, 0.0, 3.0], device="cpu")).float()
-    scales, opacities = _random(n, 3, low=0.02, high=0.25, seed=1), _random(n, low=0.1, seed=2)
+    scales = _random(n, 3, low=0.02, high=0.25, seed=1)
+    opacities = _random(n, low=0.1, seed=2)
+    # a stack of opaque Gaussians on one ray
     means[:8] = torch.tensor([0.3, -0.2, 2.5], device="cpu") * torch.linspace(1.0, 1.4, 8, device="cpu")[:, None]
-    scales[:8], opacities[:8] = 0.15, 5.0
+    scales[:8] = 0.15
+    opacities[:8] = 5.0
     poses = torch.eye(4, device="cpu").repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
     values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4), poses)
     focal = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 5.5], [0.0, 0.0, 1.0]], device="cpu").repeat(2, 1, 1)
     leaves = [x.to(device, dtype).requires_grad_() for x in (*values, focal)]
     camera = pinhole_cameras(leaves[5], leaves[6], width, height)
-    seen = backend.project(Gaussians(*leaves[:5]), camera, image_size(camera), _OPTIONS, True)
-    features = torch.cat([seen.colors, seen.depths[:, None], seen.depths[:, None].square()], 1)
-    inputs = (seen.means2d, seen.factors, seen.opacities, features)
+    projected = backend.project(Gaussians(*leaves[:5]), camera, image_size(camera), _OPTIONS, True)
+    depths = projected.depths[:, None]
+    features = torch.cat([projected.colors, depths, depths.square()], 1)
+    inputs = CompositingInputs(projected.means2d, projected.factors, projected.opacities, features)
     with torch.no_grad():
-        compositor = backend.compositor(seen, features, _OPTIONS, False, None)
-        (sums, light, _), kept = compositor.forward(inputs, True)
-        by_sums, by_light = (_random(*x.shape, seed=5).to(device, dtype) for x in (sums, light))
-        *found, _ = compositor.backward(inputs, kept, by_sums, by_light, (True,) * 4)
-    return [sums, light, *torch.autograd.grad(inputs, leaves, found)]
+        compositor = backend.compositor(CompositingCall(projected, features, _OPTIONS))
+        (sums, transmittance, _), kept = compositor.forward(inputs, True)
+        by_sums, by_transmittance = (_random(*x.shape, seed=5).to(device, dtype) for x in (sums, transmittance))
+        gradients, _ = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
+    return [sums, transmittance, *torch.autograd.grad(inputs, leaves, gradients)]
 
 
 def _pictures() -> tuple[Tensor, Tensor]:
+    """An image and a target."""
     return _random(1, 3, 16, 20, low=0.0, seed=6), _random(1, 3, 16, 20, low=0.0, seed=7)
 
 
@@ -76,9 +82,9 @@ def _loss(backend: Backend, device: torch.device) -> tuple[Tensor, Tensor]:
     """The loss of a backend and its gradient."""
     image, target = _pictures()
     mean, square = (gaussian_blur2d(x, (_WINDOW, _WINDOW), (_SIGMA, _SIGMA)) for x in (target, target * target))
-    cpu, kind = torch.device("cpu"), torch.float32
-    x, y, mean, variance = (each.to(device, kind) for each in (image, target, mean, square - mean * mean))
-    taps: list[float] = get_gaussian_kernel1d(_WINDOW, _SIGMA, device=cpu, dtype=kind).flatten().tolist()
+    x, y, mean, variance = (each.to(device, torch.float32) for each in (image, target, mean, square - mean * mean))
+    window = get_gaussian_kernel1d(_WINDOW, _SIGMA, device=torch.device("cpu"), dtype=torch.float32)
+    taps: list[float] = window.flatten().tolist()
     loss, gradient = backend.loss_and_gradient(x, y, mean, variance, taps, _WEIGHT, True)
     assert gradient is not None
     return loss, gradient
@@ -92,8 +98,8 @@ def _exact_loss() -> tuple[Tensor, Tensor]:
     return loss, torch.autograd.grad(loss, image)[0]
 
 
-def _relative(found: Tensor, expected: Tensor) -> float:
+def _relative(value: Tensor, expected: Tensor) -> float:
     """The largest difference over the largest value; infinite where something is not a number."""
     expected = expected.detach().cpu()
-    worst = float((found.detach().cpu() - expected).abs().max() / expected.abs().max())
+    worst = float((value.detach().cpu() - expected).abs().max() / expected.abs().max())
     return worst if worst == worst else float("inf")

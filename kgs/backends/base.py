@@ -1,9 +1,10 @@
-"""What a backend is: where it runs, and its stages as methods."""
+"""What a backend is: where it runs, and its stages. The signature of each stage is stated here, once."""
 
 import functools
 import importlib.util
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -11,30 +12,102 @@ from torch import Tensor
 from kgs.camera import Cameras
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
-Inputs = tuple[Tensor, Tensor, Tensor, Tensor]  # means2d (M, 2), factors (M, 2, 3), opacities (M,), features (M, F)
+
+class ProjectionStage(Protocol):
+    """The stage of :func:`kgs.project`."""
+
+    def __call__(
+        self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
+    ) -> ProjectedGaussians:
+        """Project Gaussians into all cameras, whose images have `size` (height, width).
+
+        `far_plane`, `radius_clip` and `antialiased` of the options are applied afterwards, by `kgs.stages`. `colors`
+        says whether colours are computed.
+        """
 
 
-class Compositor(Protocol):
+@dataclass(frozen=True, eq=False)
+class CompositingCall:
+    """The arguments of one :func:`kgs.composite`, which have been checked.
+
+    Args:
+        projected: M visible pairs (camera, Gaussian).
+        features: `(M, F)`.
+        options: `tile_size` is a number by the time a compositor is made.
+        median_depth: whether the median depth is wanted.
+        chunk_size: entries of a tile per step of the torch backend; None chooses.
+    """
+
+    projected: ProjectedGaussians
+    features: Tensor
+    options: RasterOptions
+    median_depth: bool = False
+    chunk_size: int | None = None
+
+
+class CompositingInputs(NamedTuple):
+    """The tensors that compositing differentiates with respect to."""
+
+    means2d: Tensor  # (M, 2)
+    factors: Tensor  # (M, 2, 3)
+    opacities: Tensor  # (M,)
+    features: Tensor  # (M, F)
+
+
+Images = tuple[Tensor, Tensor, Tensor]  # features (C, F, H, W), transmittance (C, 1, H, W), median (C, 1 or 0, H, W)
+
+
+class Compositor(ABC):
     """Compositing of one call, forward and backward, on tile lists that its constructor makes.
 
     `kgs.stages` wraps it in the one autograd function. Autograd records none of its methods.
     """
 
-    def forward(self, inputs: Inputs, keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
-        """Features `(C, F, H, W)`, transmittance `(C, 1, H, W)`, median depth `(C, 1 or 0, H, W)`; and what was kept.
+    @abstractmethod
+    def __init__(self, call: CompositingCall) -> None:
+        """Find which tiles each Gaussian reaches, and the row slices whose lists fit into `max_bytes`."""
 
-        With `keep`, any state may be kept for `backward`; None where memory is short.
+    @abstractmethod
+    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
+        """Features, transmittance and median depth of all pixels, and what is kept for `backward`.
+
+        With `keep` any state may be kept, None where memory is short.
         """
 
+    @abstractmethod
     def backward(
-        self, inputs: Inputs, kept: Any, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
-    ) -> tuple[Tensor | None, ...]:
-        """The gradients of the inputs, None for those that are not needed; and last, or None, `(M, 2)`.
+        self,
+        inputs: CompositingInputs,
+        kept: Any,
+        grad_features: Tensor,
+        grad_transmittance: Tensor,
+        needs: tuple[bool, ...],
+    ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
+        """The gradients of the inputs, None for those that are not needed; and the sums of absolute values, or None.
 
-        The last are the sums of absolute values of :class:`kgs.RasterOptions`, made where `options.absgrad` asks for
-        them and a gradient of means2d is needed.
+        The latter, `(M, 2)`, are those of :class:`kgs.RasterOptions`, made where `options.absgrad` asks for them and a
+        gradient of means2d is needed. `kept` is what `forward` kept, or None in a second backward pass: then it is
+        computed again.
+        """
 
-        `kept` is what `forward` kept, or None in a second backward pass: then it is computed again.
+
+class LossStage(Protocol):
+    """The stage of :func:`kgs.losses.photometric_loss`."""
+
+    def __call__(
+        self,
+        image: Tensor,
+        target: Tensor,
+        mean: Tensor,
+        variance: Tensor,
+        taps: list[float],
+        dssim_weight: float,
+        gradient: bool,
+    ) -> tuple[Tensor, Tensor | None]:
+        """L1 + `dssim_weight` (1 - SSIM), 0-d, and its gradient with respect to the image, or None if not wanted.
+
+        Images are `(B, C, H, W)`, H and W at least the window; `mean` and `variance` `(1, B C, H, W)` those of the
+        target under the window with these taps. See `kgs.losses.photometric`, which has all of it in torch.
         """
 
 
@@ -72,47 +145,28 @@ class Backend(ABC):
         return True
 
     def covers(self, like: Tensor) -> bool:
-        """Whether it works on tensors of this dtype, on this device; cheap, reads no values."""
+        """Whether it works on tensors of this dtype and device, while no graph is traced; cheap, reads no values."""
+        if torch.compiler.is_compiling():
+            return False
         return like.dtype in self.dtypes and self.runs_on(like.device) and self.is_installed()
 
-    def covers_compositing(
-        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, chunk_size: int | None
-    ) -> bool:
-        """Whether it composites under these options; cheap, reads no values of tensors."""
+    def covers_compositing(self, call: CompositingCall) -> bool:
+        """Whether it composites with these options; cheap, reads no values of tensors."""
         return True
 
+    @property
     @abstractmethod
-    def project(
-        self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
-    ) -> ProjectedGaussians:
-        """The stage of :func:`kgs.project`, for images of `size` (height, width); `colors`: whether they are wanted."""
+    def project(self) -> ProjectionStage:
+        """Its projection."""
 
+    @property
     @abstractmethod
-    def compositor(
-        self,
-        projected: ProjectedGaussians,
-        features: Tensor,
-        options: RasterOptions,
-        median_depth: bool,
-        chunk_size: int | None,
-    ) -> Compositor:
-        """The stage of :func:`kgs.composite`: bins the Gaussians to tiles; `options.tile_size` is a number."""
+    def compositor(self) -> type[Compositor]:
+        """Its compositing."""
 
-    def loss_and_gradient(
-        self,
-        image: Tensor,
-        target: Tensor,
-        mean: Tensor,
-        variance: Tensor,
-        taps: list[float],
-        dssim_weight: float,
-        gradient: bool,
-    ) -> tuple[Tensor, Tensor | None]:
-        """L1 + `dssim_weight` (1 - SSIM), 0-d, and its gradient by the image if that is wanted.
-
-        Images are `(B, C, H, W)`, H and W at least the window; `mean` and `variance` `(1, B C, H, W)` those of the
-        target under the window with these taps. See `kgs.losses.photometric`, which has all of it in torch.
-        """
+    @property
+    def loss_and_gradient(self) -> LossStage:
+        """Its photometric loss, where it has one."""
         raise NotImplementedError(f"{self.name} has no photometric loss")
 
 

@@ -11,8 +11,9 @@ Examples:
     ...     loss = trainer.train_step()
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from kgs.lazy import lazy_names
 
 from .config import FitConfig
 
@@ -24,16 +25,12 @@ if TYPE_CHECKING:
 
 __all__ = ["InitialPoints", "FitConfig", "Trainer", "initial_points", "fit_scene"]
 
-_MODULES = {
-    "InitialPoints": "kgs.init_points",
-    "Trainer": "kgs.fit.trainer",
-    "initial_points": "kgs.init_points",
-    "fit_scene": "kgs.fit.run",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Load the other names on first use: they import OpenCV and trimesh."""
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+# the other names import OpenCV and trimesh
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "kgs.init_points": ("InitialPoints", "initial_points"),
+        "kgs.fit.run": ("fit_scene",),
+        "kgs.fit.trainer": ("Trainer",),
+    },
+)

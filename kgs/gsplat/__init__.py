@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs.backends.base import CompositingCall
 from kgs.projection import normals
 from kgs.renderer import blend
-from kgs.stages import draw, project
+from kgs.stages import composite_call, project
 from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
 from .arguments import check_words, refuse
@@ -183,16 +184,16 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     pairs = Pairs(projected, batch, count, n, packed)
     half = 0.5 if pixel_centers == "half" else 0.0
     means2d = pairs.spread(joined([p.means2d for p in projected]) + half)
-    drawn = []
+    composited = []
     for b, (scene, rows) in enumerate(zip(scenes, pairs.gathered(means2d), strict=True)):
         projected[b] = dataclasses.replace(projected[b], means2d=rows - half)
         features = _features(scene, projected[b], render_mode.endswith("D"), return_normals)
         values = torch.cat(list(features.values()), 1)
-        keep = keep_absgrad(means2d, pairs.places(b)) if absgrad else None
-        drawn.append(draw(projected[b], values, options, backend=backend, keep_absgrad=keep))
-    transmittance = joined([x.transmittance for x in drawn])
+        hook = keep_absgrad(means2d, pairs.places(b)) if absgrad else None
+        composited.append(composite_call(CompositingCall(projected[b], values, options), backend, hook))
+    transmittance = joined([x.transmittance for x in composited])
     widths = [x.shape[1] for x in features.values()]
-    found = dict(zip(features, joined([x.features for x in drawn]).split(widths, 1), strict=True))
+    found = dict(zip(features, joined([x.features for x in composited]).split(widths, 1), strict=True))
     shown = _over(found, transmittance, backgrounds, (*batch, count))
     alphas = 1.0 - transmittance
     if "depth" in found:
@@ -203,7 +204,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         return images
 
     meta = pairs.meta(means2d)
-    tile = drawn[0].tile_size
+    tile = composited[0].tile_size
     meta |= {"width": width, "height": height, "tile_size": tile}
     meta |= {"tile_width": -(-width // tile), "tile_height": -(-height // tile)}
     if extra_signals is not None:

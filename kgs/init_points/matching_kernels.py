@@ -10,8 +10,8 @@ threads write to the same place.
 
 import numpy as np
 
-from kgs.backends.cpu.kernel import ZERO, f32, jit
-from kgs.backends.cpu.threads import over
+from kgs.compiled.kernel import ZERO, f32, jit
+from kgs.compiled.threads import over
 
 BANDS = 16
 INFINITY = f32(np.inf)

@@ -12,8 +12,8 @@ Sums over windows are in float64, and all else rounds as written: results differ
 
 import numpy as np
 
-from kgs.backends.cpu.kernel import ONE, ZERO, exact, f32, inline
-from kgs.backends.cpu.threads import over
+from kgs.compiled.kernel import ONE, ZERO, exact, f32, inline
+from kgs.compiled.threads import over
 
 HALO = 3  # pixels of a window on each side of its centre
 BAND = 16  # rows that one task computes

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import kgs
 from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import common_up
+from kgs.version import __version__
 
 from .ownership import MADE_BY
 
@@ -63,7 +63,7 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
                     "fx": float(k[0, 0]),
                     "fy": float(k[1, 1]),
                     **box,
-                    "generator": f"{MADE_BY} {kgs.__version__}",
+                    "generator": f"{MADE_BY} {__version__}",
                 }
             )
     return entries

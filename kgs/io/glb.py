@@ -16,11 +16,11 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
 from torch import Tensor
 
-import kgs
 from kgs.harmonics import SH_C0
 from kgs.json_files import write_whole
 from kgs.model import GaussianModel
 from kgs.types import check_kind
+from kgs.version import __version__
 
 from .ownership import MADE_BY
 from .ply import as_vector
@@ -77,7 +77,7 @@ def save_glb(
         "translation": translation.tolist(),
     }
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"{MADE_BY} {kgs.__version__}"},
+        "asset": {"version": "2.0", "generator": f"{MADE_BY} {__version__}"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

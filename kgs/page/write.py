@@ -10,10 +10,10 @@ from typing import Any
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs import __version__
 from kgs.camera import MARGIN
 from kgs.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
+from kgs.version import __version__
 
 from .cameras import are_training, viewer_scene
 from .data import Packed, pack

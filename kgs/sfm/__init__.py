@@ -4,7 +4,9 @@ The input is a folder of photos as a phone wrote them, the output a scene that k
 have to agree, and gates refuse cameras that cannot be trusted: see :mod:`kgs.sfm.gates`.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from kgs.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .pose import pose_photos
@@ -12,10 +14,5 @@ if TYPE_CHECKING:
 __all__ = ["pose_photos"]
 
 
-def __getattr__(name: str) -> Any:
-    """`pose_photos` is loaded when it is asked for, and torch with it: folders are looked at without it."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from .pose import pose_photos
-
-    return pose_photos
+# folders are looked at without torch
+__getattr__, __dir__ = lazy_names(__name__, {"kgs.sfm.pose": ("pose_photos",)})

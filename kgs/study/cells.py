@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-import kgs
+import kgs.version
 from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
@@ -102,7 +102,7 @@ def fit_and_measure(
         "wall_seconds": round(trainer.seconds, 2),
         "peak_rss_mb": peak_rss_mb(),
         "versions": metrics["versions"],
-        "revision": revision(Path(kgs.__file__).parent),
+        "revision": revision(Path(kgs.version.__file__).parent),
         "date": datetime.now(UTC).date().isoformat(),
     }
     return trainer, metrics, stored

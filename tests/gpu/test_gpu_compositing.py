@@ -54,33 +54,33 @@ def test_several_cameras_in_row_slices():
         composite(projected, features, max_bytes=500, backend="triton")
 
 
-def test_a_row_slice_is_freed_before_the_next_is_drawn(monkeypatch):
+def test_a_row_slice_is_freed_before_the_next_is_made(monkeypatch):
     """In the backward pass too: `max_bytes` is for one of them."""
     projected, certain = sample(10, (24, 9))
-    held, real = [], compositing.GpuCompositing._draw
+    held, real = [], compositing.GpuCompositor._composite_rows
 
-    def draw(self, *arguments):
+    def composite_rows(self, *arguments):
         assert not [1 for reference in held if reference() is not None]
-        found = real(self, *arguments)
-        held[:] = [weakref.ref(x) for x in (found.entries, found.places, found.offsets, found.starts)]
-        return found
+        lists = real(self, *arguments)
+        held[:] = [weakref.ref(x) for x in (lists.entries, lists.places, lists.offsets, lists.starts)]
+        return lists
 
-    monkeypatch.setattr(compositing.GpuCompositing, "_draw", draw)
+    monkeypatch.setattr(compositing.GpuCompositor, "_composite_rows", composite_rows)
     run(projected, random(len(projected), 3), certain, max_bytes=2**13)
     assert held
 
 
 def test_no_gaussians_and_no_entries():
     projected, certain = sample(0, (9, 11))
-    (sums, light, median), gradients = run(projected, torch.zeros(0, 3), certain)
+    (sums, transmittance, median), gradients = run(projected, torch.zeros(0, 3), certain)
     assert not sums.any()
     assert not median.any()
-    assert (light == 1).all()
+    assert (transmittance == 1).all()
     assert [len(x) for x in gradients] == [0] * 4
     unseen = footprints([0.0, 0.5], [[5.0, 4.0], [500.0, 4.0]], random(2, 2, 3), size=(9, 11), dtype=torch.float32)
-    (sums, light, _), gradients = run(unseen, random(2, 3), certain)
+    (sums, transmittance, _), gradients = run(unseen, random(2, 3), certain)
     assert not sums.any()
-    assert (light == 1).all()
+    assert (transmittance == 1).all()
     assert not any(x.any() for x in gradients)
 
 
@@ -167,4 +167,4 @@ def test_long_lists_end_where_the_light_does():
     layers = footprints([0.8] * 60, size=(5, 3))
     features = random(60, 3)
     assert_close(run(layers, features, torch.ones(())), outcome(layers, features, torch.ones(())), torch.ones(()))
-    assert STOP < 0.1  # the light ends after a few layers
+    assert STOP < 0.1  # the transmittance ends after a few layers

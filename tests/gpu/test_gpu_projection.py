@@ -14,8 +14,8 @@ from kgs.backends.gpu import projection
 @pytest.fixture
 def handed_over(monkeypatch):
     """How often the kernels ask torch."""
-    calls, real = [], projection.project_torch
-    monkeypatch.setattr(projection, "project_torch", lambda *a: calls.append(1) or real(*a))
+    calls, real = [], projection.project_in_torch
+    monkeypatch.setattr(projection, "project_in_torch", lambda *a: calls.append(1) or real(*a))
     return calls
 
 

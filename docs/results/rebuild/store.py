@@ -226,7 +226,7 @@ def settings_of_a_gpu() -> Iterator[None]:
         try:
             from kgs.raster import tasks, torch_passes
         except ImportError:
-            from kgs.raster import compositing
+            from kgs.backends.torch import compositing
 
             stack.enter_context(mock.patch.dict(compositing.SETTINGS, cpu=compositing.SETTINGS["cuda"]))
             yield

@@ -20,11 +20,8 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 """
 
 import torch
-from torch import Tensor
 
-from kgs.backends.base import Backend, Compositor
-from kgs.camera import Cameras
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
 
 
 class CpuBackend(Backend):
@@ -37,50 +34,29 @@ class CpuBackend(Backend):
     package = ("numba", 'run pip install "kgs-splat[fast]"')
     has_loss = True
 
-    def covers(self, like: Tensor) -> bool:
-        """Float32 on a CPU, while no graph is traced."""
-        return not torch.compiler.is_compiling() and super().covers(like)
-
-    def covers_compositing(
-        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, chunk_size: int | None
-    ) -> bool:
+    def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
-        narrow = projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
-        one_block = not options.absgrad or features.shape[1] <= 8
-        return options.tile_size in (None, self.tile_size) and chunk_size is None and narrow and one_block
+        narrow = call.projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
+        one_block = not call.options.absgrad or call.features.shape[1] <= 8
+        return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and narrow and one_block
 
-    def project(
-        self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
-    ) -> ProjectedGaussians:
-        """See `Backend`."""
+    @property
+    def project(self) -> ProjectionStage:
+        """See `Backend.project`."""
         from .projection import project
 
-        return project(gaussians, cameras, size, options, colors)
+        return project
 
-    def compositor(
-        self,
-        projected: ProjectedGaussians,
-        features: Tensor,
-        options: RasterOptions,
-        median_depth: bool,
-        chunk_size: int | None,
-    ) -> Compositor:
-        """See `Backend`."""
-        from .compositing import CpuCompositing
+    @property
+    def compositor(self) -> type[Compositor]:
+        """See `Backend.compositor`."""
+        from .compositing import CpuCompositor
 
-        return CpuCompositing(projected, features, options, median_depth)
+        return CpuCompositor
 
-    def loss_and_gradient(
-        self,
-        image: Tensor,
-        target: Tensor,
-        mean: Tensor,
-        variance: Tensor,
-        taps: list[float],
-        dssim_weight: float,
-        gradient: bool,
-    ) -> tuple[Tensor, Tensor | None]:
-        """See `Backend`."""
+    @property
+    def loss_and_gradient(self) -> LossStage:
+        """See `Backend.loss_and_gradient`."""
         from .loss import loss_and_gradient
 
-        return loss_and_gradient(image, target, mean, variance, taps, dssim_weight, gradient)
+        return loss_and_gradient

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs.compiled.threads import over
+
 from .binning_kernels import (
     SIZE,
     begin_spans,
@@ -26,10 +28,9 @@ from .binning_kernels import (
     find_spans,
     sort_by_depth,
 )
-from .threads import over
 
 BANDS = 16
-LEAST = 4096  # entries of a band: what is done once a band costs as much as some hundreds of them
+LEAST = 4096  # entries of a band: the fixed work of a band costs as much as some hundreds of entries
 
 
 @dataclass(frozen=True)
@@ -74,42 +75,50 @@ class TileCoverage:
         arrays: Sequence[NDArray[Any]],
         image_size: tuple[int, int],
         cameras: int,
-        rules: tuple[np.float32, np.float32],
+        eps2d: np.float32,
+        alpha_threshold: np.float32,
         channels: int,
         median_depth: bool,
         max_spans: int,
         threads: int,
     ) -> None:
-        height, self._width = image_size
-        self.grid = -(-height // SIZE), -(-self._width // SIZE)
-        self.total_rows, self._over = cameras * self.grid[0], partial(over, threads)
+        height, width = image_size
+        self.grid = (-(-height // SIZE), -(-width // SIZE))
+        self.total_rows = cameras * self.grid[0]
+        self._width = width
+        self._over = partial(over, threads)
         means2d, factors, opacities, features, depths, camera_ids = arrays
         m = len(depths)
-        rows, ids, self.ranks = np.empty((m, 2), np.int32), *np.empty((2, m), np.int32)
-        self._over(m, find_rows, means2d, factors, opacities, *rules, height, rows)
-        self.ids = ids = ids[: sort_by_depth(depths.view(np.uint32), rows, ids, self.ranks)]
-        n, width = len(ids), 7 + channels + median_depth
-        self.heads, self.geometry = np.empty((n, 2), np.int32), np.empty((n, 8), np.float32)
-        self.table = np.empty((n, width), np.float32)
-        inputs = (means2d, factors, opacities, features, depths, camera_ids, *rules, self.grid[0], rows, channels)
-        self._over(n, fill_tables, ids, *inputs, self.heads, self.geometry, self.table)
+        rows = np.empty((m, 2), np.int32)
+        ids, self.ranks = np.empty((2, m), np.int32)
+        self._over(m, find_rows, means2d, factors, opacities, eps2d, alpha_threshold, height, rows)
+        n = sort_by_depth(depths.view(np.uint32), rows, ids, self.ranks)
+        self.ids = ids[:n]
+        self.heads = np.empty((n, 2), np.int32)
+        self.geometry = np.empty((n, 8), np.float32)
+        self.table = np.empty((n, 7 + channels + median_depth), np.float32)
+        inputs = (means2d, factors, opacities, features, depths, camera_ids)
+        sizes = (eps2d, alpha_threshold, self.grid[0], rows, channels)
+        self._over(n, fill_tables, self.ids, *inputs, *sizes, self.heads, self.geometry, self.table)
         self._count(max_spans)
 
     def _count(self, max_spans: int) -> None:
         """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
-        ends, n = np.cumsum(self.heads[:, 1]), len(self.ids)
+        n = len(self.ids)
+        ends = np.cumsum(self.heads[:, 1])
         total = int(ends[-1]) if n else 0
         bounds = [0, *sorted({*np.searchsorted(ends, range(max_spans, total, max_spans)).tolist()}), n]
         self.spans_per_row, self.entries_per_row = np.zeros((2, self.total_rows), np.int64)
-        self._all = None
+        self._all_spans = None
         for low, high in pairwise(bounds):
             spans = self._spans(0, self.total_rows, low, high)
             count_rows(self.heads[low:high], *spans, self.spans_per_row, self.entries_per_row)
-            self._all = spans if len(bounds) == 2 else None
+            self._all_spans = spans if len(bounds) == 2 else None
 
     def _spans(self, begin: int, end: int, low: int, high: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """Where the spans of each Gaussian start, and the spans of the Gaussians `low` to `high` in some rows."""
-        heads, starts = self.heads[low:high], np.empty(high - low + 1, np.int64)
+        heads = self.heads[low:high]
+        starts = np.empty(high - low + 1, np.int64)
         begin_spans(heads, begin, end, starts)
         spans = np.empty(starts[-1], np.int32)
         rest = (begin, end, self.grid[0], self._width, heads, self.geometry[low:high], starts, spans)
@@ -118,29 +127,34 @@ class TileCoverage:
 
     def row_slice(self, begin: int, end: int) -> RowSlice:
         """The rows `begin` to `end` (exclusive), in bands of about equal work."""
-        if self._all is None or (begin, end) != (0, self.total_rows):
-            self._all = None
+        if self._all_spans is None or (begin, end) != (0, self.total_rows):
+            self._all_spans = None
             starts, spans = self._spans(begin, end, 0, len(self.ids))
         else:
-            starts, spans = self._all
+            starts, spans = self._all_spans
         work = np.cumsum(self.entries_per_row + self.grid[1])
         before = work[begin - 1] if begin else 0
         count = max(1, round(min(BANDS, work[-1] / LEAST) * (work[end - 1] - before) / work[-1]))
         targets = before + np.arange(1, count) * (work[end - 1] - before) / count
         bounds = np.unique([begin, *(np.searchsorted(work, targets) + 1), end])
-        offsets, members = np.zeros(len(bounds), np.int64), np.empty(len(spans), np.int32)
+        offsets = np.zeros(len(bounds), np.int64)
+        members = np.empty(len(spans), np.int32)
         band_of_row = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
         find_members(self.heads, begin, end, band_of_row, offsets, members)
         ends = np.concatenate([[0], np.cumsum(self.entries_per_row[begin:end])])[bounds - begin]
         table = np.empty((offsets[-1], self.table.shape[1]), np.float32)
-        lists = (members[: offsets[-1]], table, np.empty(ends[-1], np.int32), ends)
-        return RowSlice(begin, starts, spans, bounds, offsets, *lists)
+        entries = np.empty(ends[-1], np.int32)
+        return RowSlice(begin, starts, spans, bounds, offsets, members[: offsets[-1]], table, entries, ends)
 
     def band(self, part: RowSlice, b: int) -> Band:
         """The lists of a band."""
-        (begin, end), own, columns = part.bounds[b : b + 2], slice(*part.offsets[b : b + 2]), self.grid[1]
-        members, offsets = part.members[own], np.zeros((end - begin) * columns + 1, np.int64)
+        begin, end = part.bounds[b : b + 2]
+        own = slice(*part.offsets[b : b + 2])
+        columns = self.grid[1]
+        members = part.members[own]
+        table = part.table[own]
+        entries = part.entries[slice(*part.entry_offsets[b : b + 2])]
+        offsets = np.zeros((end - begin) * columns + 1, np.int64)
         spans = (part.first_row, columns, self.heads, part.starts, part.spans, members)
-        entries, rows = part.entries[slice(*part.entry_offsets[b : b + 2])], part.table[own]
-        fill_band(begin, end, *spans, self.table, offsets, entries, rows)
-        return Band(begin * columns, own, rows, offsets, entries)
+        fill_band(begin, end, *spans, self.table, offsets, entries, table)
+        return Band(begin * columns, own, table, offsets, entries)

@@ -1,4 +1,4 @@
-"""Kernels that find which Gaussian reaches which tile, front to back; spans as in `kgs.raster.binning`.
+"""Kernels that find which Gaussian reaches which tile, front to back; spans as in `kgs.backends.torch.binning`.
 
 In depth order, for each of the n Gaussians that reach a row of tiles:
 
@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
+from kgs.compiled.kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
 
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048

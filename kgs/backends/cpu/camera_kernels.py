@@ -2,15 +2,16 @@
 
 import numpy as np
 
-from .kernel import ONE, ZERO, jit
+from kgs.compiled.kernel import ONE, ZERO, jit
+
 from .projection_kernels import camera_point, color_gradients, point_gradient, rotation, rows, turned_back
 
 
 @jit
-def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, gradients, found):
+def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, gradients, outs):
     """From gradients of what a camera sees, a range of its list, to those of its matrices, one row for each Gaussian.
 
-    `ids` and `gradients` are those of :func:`.projection_kernels.footprint_gradients`. Written are `found` `(M, 21)`:
+    `ids` and `gradients` are those of :func:`.projection_kernels.footprint_gradients`. Written are `outs` `(M, 21)`:
     world to camera `(3, 4)`, then the intrinsics `(3, 3)`.
     """
     v, k, limits, back, centre = camera
@@ -18,7 +19,7 @@ def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, grad
     bands = colors.shape[1] // 3 if g_rgb.shape[1] else 0
     b, h, none = np.empty(16, np.float32), np.empty(16, np.float32), np.empty((0, 0), np.float32)
     for m in range(begin, end):
-        g, out = ids[m], found[m]
+        g, out = ids[m], outs[m]
         x, y, z = local = camera_point(means, g, v)
         world, inverse = (means[g, 0], means[g, 1], means[g, 2]), ONE / z
         j, _, tx, ty = rows(x, y, inverse, v, k, limits)

@@ -8,14 +8,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs.backends.base import Inputs
-from kgs.raster.binning import row_slices
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
+from kgs.backends.row_slices import row_slices
+from kgs.compiled.arrays import arrays
+from kgs.compiled.threads import over
 
 from . import compositing_kernels as kernels
-from .arrays import arrays
 from .binning import Band, RowSlice, TileCoverage
-from .threads import over
 
 _NUMBER = 4  # bytes
 Floats = NDArray[np.float32]
@@ -23,98 +22,120 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class _Done:
-    """A band after the forward pass: its lists, T at the beginning of each chunk, how many entries were reached."""
+    """A band after the forward pass."""
 
     band: Band
-    starts: Floats
-    done: NDArray[np.int64]
+    starts: Floats  # T at the beginning of each chunk
+    reached: NDArray[np.int64]  # how many entries of each tile were composited
 
 
-class CpuCompositing:
+class CpuCompositor(Compositor):
     """Compositing of one call: row slices one after another, the bands of each on several threads."""
 
-    def __init__(
-        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, median_depth: bool
-    ) -> None:
-        """Find what each Gaussian reaches, and the row slices that fit."""
+    def __init__(self, call: CompositingCall) -> None:
+        projected = call.projected
+        features = call.features
+        options = call.options
         self._blocks = _blocks(features.shape[1])
         channels = sum(width for _, width in self._blocks)
         # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of kept T
-        per_span = _NUMBER * (1 + 1 + 7 + channels + median_depth + 6 + channels + 2 * options.absgrad)
+        table_width = 7 + channels + call.median_depth
+        sums_width = 6 + channels + 2 * options.absgrad
+        per_span = _NUMBER * (1 + 1 + table_width + sums_width)
         per_entry = _NUMBER * (1 + kernels.P // kernels.K)
         inputs = (projected.means2d, projected.factors, projected.opacities, features)
-        fields = arrays(*inputs, projected.depths, projected.camera_ids)
-        self._size, self._cameras, self._median_depth = projected.image_size, projected.num_cameras, median_depth
-        self._eps2d, self._absgrad = np.float32(projected.eps2d), options.absgrad
-        rules = self._eps2d, np.float32(options.alpha_threshold)
-        most = max(2**12, options.max_bytes // (2 * per_span))
-        threads = torch.get_num_threads()
-        self._coverage = TileCoverage(fields, self._size, self._cameras, rules, channels, median_depth, most, threads)
-        needs = self._coverage.spans_per_row * per_span + self._coverage.entries_per_row * per_entry
-        self._row_slices = row_slices(needs.tolist(), options.max_bytes)
-        self._threshold, self._stop = (
-            np.float32(max(x, kernels.TINY)) for x in (options.alpha_threshold, options.transmittance_stop)
+        self._size = projected.image_size
+        self._cameras = projected.num_cameras
+        self._median_depth = call.median_depth
+        self._absgrad = options.absgrad
+        self._eps2d = np.float32(projected.eps2d)
+        self._coverage = TileCoverage(
+            arrays(*inputs, projected.depths, projected.camera_ids),
+            self._size,
+            self._cameras,
+            self._eps2d,
+            np.float32(options.alpha_threshold),
+            channels,
+            self._median_depth,
+            max_spans=max(2**12, options.max_bytes // (2 * per_span)),
+            threads=torch.get_num_threads(),
         )
+        row_bytes = self._coverage.spans_per_row * per_span + self._coverage.entries_per_row * per_entry
+        self._row_slices = row_slices(row_bytes.tolist(), options.max_bytes)
+        self._threshold = np.float32(max(options.alpha_threshold, kernels.TINY))
+        self._stop = np.float32(max(options.transmittance_stop, kernels.TINY))
 
-    def forward(self, inputs: Inputs, keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
-        """See `Compositor`: one row slice is kept, several are computed again."""
-        features = inputs[3]
-        widths = (1, 1 if self._median_depth else 0, features.shape[1])
-        transmittance, median, sums = (features.new_empty(self._cameras, width, *self._size) for width in widths)
+    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
+        """See `Compositor`. One row slice is kept, several are computed again."""
+        features = inputs.features
+        transmittance = features.new_empty(self._cameras, 1, *self._size)
+        median = features.new_empty(self._cameras, 1 if self._median_depth else 0, *self._size)
+        sums = features.new_empty(self._cameras, features.shape[1], *self._size)
         outputs = (
             transmittance[:, 0].numpy(),
             median[:, 0].numpy() if self._median_depth else _nothing(3),
             sums.numpy(),
         )
         keep_slice = keep and len(self._row_slices) == 1
-        done = [self._forward(rows, outputs, keep_slice) for rows in self._row_slices]
-        return (sums, transmittance, median), done[0] if keep_slice else None
+        slices = [self._forward(rows, outputs, keep_slice) for rows in self._row_slices]
+        return (sums, transmittance, median), slices[0] if keep_slice else None
 
     def backward(
-        self, inputs: Inputs, kept: Any, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
-    ) -> tuple[Tensor | None, ...]:
+        self,
+        inputs: CompositingInputs,
+        kept: Any,
+        grad_features: Tensor,
+        grad_transmittance: Tensor,
+        needs: tuple[bool, ...],
+    ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
         """See `Compositor`."""
-        needs_moments, needs_features = any(needs[:3]), needs[3]
+        needs_moments = any(needs[:3])
+        needs_features = needs[3]
         needs_absolute = self._absgrad and needs[0]
         grads, behind = arrays(grad_features, grad_transmittance[:, 0])
         columns = self._coverage.table.shape[1] - 1 - self._median_depth
         totals = np.zeros((len(self._coverage.ids), columns + 2 * needs_absolute), np.float32)
-        blank = (np.empty_like(behind), _nothing(3), _nothing(4))
+        no_images = (np.empty_like(behind), _nothing(3), _nothing(4))
         for rows in self._row_slices:
-            part, done = self._forward(rows, blank, True) if kept is None else kept
+            part, done = self._forward(rows, no_images, True) if kept is None else kept
             kept = None
             self._backward(part, done, grads, behind, totals, (needs_moments, needs_absolute, needs_features))
             del part, done  # before the next is made
         wanted = (*[needs_moments] * 3, needs_features)
-        found = [x.new_empty(x.shape if need else (0, *x.shape[1:])) for x, need in zip(inputs, wanted, strict=True)]
-        own = arrays(*inputs[1:3])
-        rest = (self._coverage.ranks, totals, *own, self._eps2d, *arrays(*found))
-        over(torch.get_num_threads(), len(inputs[0]), kernels.fill_gradients, *rest)
-        absolute = None
-        if needs_absolute:
-            ranks = torch.from_numpy(self._coverage.ranks)
-            sums = torch.from_numpy(totals[:, -2:])
-            absolute = inputs[0].new_zeros(inputs[0].shape)
-            absolute[ranks >= 0] = sums[ranks[ranks >= 0]]
-        return *(x if need else None for x, need in zip(found, needs, strict=True)), absolute
+        shapes = [x.shape if want else (0, *x.shape[1:]) for x, want in zip(inputs, wanted, strict=True)]
+        input_grads = [inputs.features.new_empty(shape) for shape in shapes]
+        factors, opacities = arrays(inputs.factors, inputs.opacities)
+        moments = (self._coverage.ranks, totals, factors, opacities, self._eps2d)
+        over(torch.get_num_threads(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*input_grads))
+        gradients = tuple(x if need else None for x, need in zip(input_grads, needs, strict=True))
+        return gradients, self._absolute(inputs.means2d, totals) if needs_absolute else None
+
+    def _absolute(self, means2d: Tensor, totals: Floats) -> Tensor:
+        """The sums of absolute values, the last two columns of `totals`, for all Gaussians."""
+        ranks = torch.from_numpy(self._coverage.ranks)
+        sums = torch.from_numpy(totals[:, -2:])
+        absolute = means2d.new_zeros(means2d.shape)
+        absolute[ranks >= 0] = sums[ranks[ranks >= 0]]
+        return absolute
 
     def _forward(self, rows: tuple[int, int], outputs: tuple[Floats, ...], keep: bool) -> tuple[RowSlice, list[_Done]]:
         """Fill transmittance, median depth and sums; without sums only compute what `backward` needs again."""
-        part, (transmittance, median, sums) = self._coverage.row_slice(*rows), outputs
+        part = self._coverage.row_slice(*rows)
+        transmittance, median, sums = outputs
         count = len(part.bounds) - 1
         done: list[_Done] = [None] * count  # type: ignore[list-item]
-        rules = (self._threshold, self._stop)
 
         def work(begin: int, end: int) -> None:
             for b in range(begin, end):
                 band = self._coverage.band(part, b)
                 tiles = len(band.offsets) - 1
                 chunks = len(band.entries) // kernels.K + tiles if keep else 0
-                starts, reached = np.empty((chunks, kernels.P), np.float32), np.empty(tiles, np.int64)
-                lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table, *rules)
+                starts = np.empty((chunks, kernels.P), np.float32)
+                reached = np.empty(tiles, np.int64)
+                lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
                 for first, width in self._blocks if len(sums) else self._blocks[:1]:
-                    rest = (starts, reached, transmittance, median, sums)
-                    kernels.composite_forward(*lists, first, (0,) * width, *rest)
+                    out = (starts, reached, transmittance, median, sums)
+                    kernels.composite_forward(*lists, self._threshold, self._stop, first, (0,) * width, *out)
                 if keep:
                     done[b] = _Done(band, starts, reached)
 
@@ -132,7 +153,7 @@ class CpuCompositing:
                 band = own.band
                 lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
                 for first, width in self._blocks:
-                    rest = (own.starts, own.done, grads, grad_transmittance, *wanted, sums[band.members])
+                    rest = (own.starts, own.reached, grads, grad_transmittance, *wanted, sums[band.members])
                     kernels.composite_backward(*lists, self._threshold, self._stop, first, (0,) * width, *rest)
 
         threads = torch.get_num_threads()

@@ -1,15 +1,29 @@
-"""Front-to-back compositing of the lists of a band, and its gradient; formulas as in `kgs.raster`.
+"""Front-to-back compositing of the lists of a band, and its gradient; formulas as in `kgs.backends.torch`.
 
 A tile is P pixels, the lanes. T is kept at the beginning of every chunk of K entries; the backward pass goes from chunk
 to chunk, back to front, and computes alphas and T of each again, with the same bits. Features come in blocks that a
 kernel is compiled for: V is linear in the features and in dL/dT, so blocks are differentiated one after the other, and
 their moments are added.
+
+What the kernels take, for C cameras, T tiles of a band and blocks of F features:
+
+    first_tile, offsets, entries, table   those of the `Band`
+    grid                                  (rows, columns) of tiles of one image
+    threshold, stop                       smaller alphas count as 0, and so does a smaller transmittance
+    feature                               where the block of features begins
+    channels                              any tuple of as many numbers as the block has features
+    starts                                (chunks, P), T at the beginning of each chunk; or empty
+    reached                               (T,), how many entries of each tile were composited
+    transmittance, depths                 (C, H, W), the latter the median depth; or empty
+    sums                                  (C, features, H, W); in the backward pass (members, 6 + features)
+    grads, grad_transmittance             (C, features, H, W) and (C, H, W), derivatives of the loss
 """
 
 import numpy as np
 
+from kgs.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
+
 from .binning_kernels import SIZE, variances
-from .kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
 
 P = SIZE * SIZE
 K = 16
@@ -52,27 +66,10 @@ def alpha_of(o, ax, ay, bx, by, dx, dy, threshold):
 
 @jit
 def composite_forward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, transmittance, depths,
-    sums,
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, reached,
+    transmittance, depths, sums,
 ):  # fmt: skip
-    """A block of features: sums over layers, transmittance and median depth, straight into the images.
-
-    Args:
-        first_tile: of the band.
-        grid: (rows, columns) of tiles of one image.
-        offsets: with `entries` and `table` those of the `Band`.
-        entries: see there.
-        table: see there.
-        threshold: smaller alphas are 0.
-        stop: transmittance below this is 0.
-        feature: where the block begins.
-        channels: any tuple of as many numbers as the block has features.
-        starts: out, T at the beginning of each chunk, `(chunks, P)`; or empty.
-        done: out, how many entries of each tile were reached.
-        transmittance: out, `(C, H, W)`.
-        depths: out, the median depth, `(C, H, W)`; or empty.
-        sums: out, `(C, F, H, W)`.
-    """
+    """A block of features: sums over layers, transmittance and median depth, straight into the images."""
     height, width = transmittance.shape[1], transmittance.shape[2]
     F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
@@ -81,7 +78,7 @@ def composite_forward(
     layers = np.empty((K, 7 + F), np.float32)
     last_column = table.shape[1] - 1
     keep = len(starts) > 0
-    for t in range(len(done)):
+    for t in range(len(reached)):
         camera, tile = (first_tile + t) // (grid[0] * grid[1]), (first_tile + t) % (grid[0] * grid[1])
         y0, x0 = tile // grid[1] * SIZE, tile % grid[1] * SIZE
         cx, cy = f32(x0) + _CENTRE, f32(y0) + _CENTRE
@@ -123,7 +120,7 @@ def composite_forward(
                     for p in range(P):
                         s[(2 + f) * P + p] += c * s[P + p]
             e += n
-        done[t] = e - first
+        reached[t] = e - first
         for y in range(min(SIZE, height - y0)):
             for x in range(min(SIZE, width - x0)):
                 left = transmittance[camera, y0 + y, x0 + x] = s[y * SIZE + x]
@@ -135,30 +132,14 @@ def composite_forward(
 
 @jit
 def composite_backward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, done, grads,
-    grad_transmittance,
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, reached,
+    grads, grad_transmittance,
     needs_moments, needs_absolute, needs_features, sums,
 ):  # fmt: skip
-    """For each member the six moments of dL/d ln alpha about its centre, and dL/d features.
+    """For each member the six moments of dL/d ln alpha about its centre, and dL/d features, added to `sums`.
 
-    Args:
-        first_tile: and the following as in `composite_forward`, `starts` and `done` as it left them.
-        grid: see there.
-        offsets: see there.
-        entries: see there.
-        table: see there.
-        threshold: see there.
-        stop: see there.
-        feature: see there.
-        channels: see there.
-        starts: see there.
-        done: see there.
-        grads: dL/d sums, `(C, F, H, W)`.
-        grad_transmittance: dL/d transmittance, `(C, H, W)`; used with the first block.
-        needs_moments: whether the moments are needed.
-        needs_absolute: whether the sums of |dL/d mean| are needed, too.
-        needs_features: whether dL/d features is needed.
-        sums: added to, `(members, 6 + F)`, with those sums `(members, 6 + F + 2)`.
+    `sums` is `(members, 6 + F)`, and two columns wider where the sums of |dL/d mean| are needed, too. `starts` and
+    `reached` are as `composite_forward` left them; `grad_transmittance` is used with the first block.
     """
     height, width = grad_transmittance.shape[1], grad_transmittance.shape[2]
     F = len(channels)
@@ -167,8 +148,8 @@ def composite_backward(
     g = scratch(F * P)
     layers = np.empty((K, 7 + F), np.float32)
     s = scratch((K + 1) * _SLAB)  # of each layer of a chunk: alpha, w, T before it, V from this layer on
-    for t in range(len(done)):
-        count = done[t]
+    for t in range(len(reached)):
+        count = reached[t]
         if count == 0:
             continue
         camera, tile = (first_tile + t) // (grid[0] * grid[1]), (first_tile + t) % (grid[0] * grid[1])

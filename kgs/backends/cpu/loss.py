@@ -4,9 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .arrays import arrays
+from kgs.compiled.arrays import arrays
+from kgs.compiled.threads import over
+
 from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
-from .threads import over
 
 PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 
@@ -20,23 +21,26 @@ def loss_and_gradient(
     dssim_weight: float,
     gradient: bool,
 ) -> tuple[Tensor, Tensor | None]:
-    """See `kgs.backends.Backend`."""
+    """See `LossStage`."""
     x, y, mean_y, variance_y = arrays(*(x.flatten(0, 1) for x in (image, target, mean, variance)))
     half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
     threads = torch.get_num_threads()
     channels, height, width = x.shape
-    bands, pieces = channels * -(-height // BAND), min(PIECES, -(-x.size // LEAST))
-    maps, sums = np.empty((3, *x.shape), np.float32), np.zeros((bands, 2))
+    bands = channels * -(-height // BAND)
+    pieces = min(PIECES, -(-x.size // LEAST))
+    maps = np.empty((3, *x.shape), np.float32)
+    sums = np.zeros((bands, 2))
     over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
     absolute, ssim = sums.sum(0) / x.size
     loss = image.new_tensor(absolute + dssim_weight * (1.0 - np.minimum(ssim, 1.0)))
     if not gradient:
         return loss, None
-    found = torch.empty_like(image, memory_format=torch.contiguous_format)
+    image_gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
     padded = np.empty((channels, height + 2 * RADIUS, width), np.float32)
     bands = channels * -(-padded.shape[1] // BAND)
     over(threads, bands, ssim_gradient, half, x, y, maps, padded, pieces=pieces)
-    factors = np.float32(-dssim_weight / x.size), np.float32(1 / x.size)
-    rows, out = channels * height, found.flatten(0, 1).numpy()
-    over(threads, rows, total_gradient, x, y, padded, *factors, out, pieces=pieces)
-    return loss, found
+    by_ssim = np.float32(-dssim_weight / x.size)
+    by_l1 = np.float32(1 / x.size)
+    out = image_gradient.flatten(0, 1).numpy()
+    over(threads, channels * height, total_gradient, x, y, padded, by_ssim, by_l1, out, pieces=pieces)
+    return loss, image_gradient

@@ -9,117 +9,141 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, Frame, whole_frame
+from kgs.compiled.arrays import Array, arrays
+from kgs.compiled.threads import over
 from kgs.memory import empty
-from kgs.projection import finite_gaussians, project_torch, seen_within
+from kgs.projection import finite_gaussians, visibility_cutoff
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
-from .arrays import Array, arrays
 from .camera_kernels import camera_gradients
 from .projection_kernels import BLOCK, footprint_gradients, footprints
-from .threads import over
 
 
 def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
-    """`kgs.projection.project_torch` on the kernels, where they can do the call."""
+    """See `ProjectionStage`; what the kernels cannot do is done in torch."""
     if not _is_plain(cameras) or gaussians.quats.ndim == 3 or options.near_plane < 1e-8:  # Kornia divides by no less
-        return project_torch(gaussians, cameras, size, options, colors)
+        return project_in_torch(gaussians, cameras, size, options, colors)
     opacities = gaussians.opacities.detach()
     wide = bool((opacities > 2.0).any())  # only these change the cutoff
     opacities = opacities.masked_fill(~finite_gaussians(gaussians), 0.0) if wide else opacities[..., :0]
-    cutoff = float(seen_within(opacities, options.alpha_threshold))
-    rules = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, cutoff))
+    cutoff = float(visibility_cutoff(opacities, options.alpha_threshold))
+    frustum = tuple(np.float32(x) for x in (*size, options.near_plane, options.eps2d, cutoff))
     harmonics = colors and gaussians.colors.ndim == 3
     views = _views(cameras, options.frame or whole_frame(size))
-    inputs = *vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics
-    fields = _Projection.apply(*inputs, views, rules, harmonics)
-    means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, broken = fields
+    inputs = (*vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics)
+    fields = _Projection.apply(*inputs, views, frustum, harmonics)
+    means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, num_nonfinite = fields
     if colors and not harmonics:
         rgb = gaussians.colors.index_select(0, ids)
-    tensors = (camera_ids, ids, means2d, factors, depths, radii, alphas, rgb)
-    return ProjectedGaussians(*tensors, size, len(cameras.extrinsics), len(gaussians), broken, options.eps2d)
+    return ProjectedGaussians(
+        camera_ids,
+        ids,
+        means2d,
+        factors,
+        depths,
+        radii,
+        alphas,
+        rgb,
+        image_size=size,
+        num_cameras=len(cameras.extrinsics),
+        num_gaussians=len(gaussians),
+        num_nonfinite=num_nonfinite,
+        eps2d=options.eps2d,
+    )
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *inputs, _, _, views, rules, harmonics = arguments
+        *inputs, _, _, views, frustum, harmonics = arguments
         ctx.save_for_backward(*inputs)
-        arrays, n, parts = _fields(inputs), len(inputs[0]), []
+        n = len(inputs[0])
+        values = _fields(inputs)
         shapes = ((n, 2), (n, 6), (n,), (n,), (n, 3 if harmonics else 0), (n,))
-        counts = np.zeros((-(-n // BLOCK), 2), np.int64)
+        counts = np.zeros((-(-n // BLOCK), 2), np.int64)  # visible and not finite, of each block
+        parts = []
         for c, view in enumerate(views):
             lists = [*(inputs[0].new_empty(shape) for shape in shapes), inputs[0].new_empty(n, dtype=torch.int64)]
             out = tuple(x.numpy() for x in lists)
             threads = torch.get_num_threads()
-            over(threads, len(counts), footprints, *arrays, c, view, rules, out, counts, pieces=16)
-            seen = _close_up(out, counts[:, 0])
-            parts.append([x[:seen] for x in lists])
+            over(threads, len(counts), footprints, *values, c, view, frustum, out, counts, pieces=16)
+            visible = _close_up(out, counts[:, 0])
+            parts.append([x[:visible] for x in lists])
         joined = [x[0] if len(parts) == 1 else torch.cat(x) for x in zip(*parts, strict=True)]
         means2d, factors, depths, alphas, rgb, radii, ids = joined
-        ctx.views, ctx.ids = views, [part[-1].numpy() for part in parts]
+        factors = factors.view(-1, 2, 3)
+        num_nonfinite = ids.new_tensor(int(counts[:, 1].sum()))
+        ctx.views = views
+        ctx.ids = [part[-1].numpy() for part in parts]
         camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(x) for x in ctx.ids]))
-        broken, factors = ids.new_tensor(int(counts[:, 1].sum())), factors.view(-1, 2, 3)
-        by_mean, by_turn, by_scale, by_opacity, by_color = ctx.needs_input_grad[:5]
-        by_pose, by_lens = ctx.needs_input_grad[5:7]
+        by_mean, by_turn, by_scale, by_opacity, by_color, by_pose, by_lens = ctx.needs_input_grad[:7]
         by_place = by_mean or by_pose
-        colored = harmonics and (by_color or (by_place and inputs[4].shape[1] > 1))
         by_shape = by_place or by_lens or by_turn or by_scale
-        wants = (by_place or by_lens, by_shape, by_place, by_opacity, colored)
-        outputs = means2d, factors, depths, alphas, rgb
-        constant = [x for x, wanted in zip(outputs, wants, strict=True) if not wanted]
-        ctx.mark_non_differentiable(*constant, ids, camera_ids, radii, broken)
-        return *outputs, ids, camera_ids, radii, broken
+        colored = harmonics and (by_color or (by_place and inputs[4].shape[1] > 1))
+        outputs = (means2d, factors, depths, alphas, rgb)
+        differentiable = (by_place or by_lens, by_shape, by_place, by_opacity, colored)
+        constant = [x for x, varies in zip(outputs, differentiable, strict=True) if not varies]
+        ctx.mark_non_differentiable(*constant, ids, camera_ids, radii, num_nonfinite)
+        return *outputs, ids, camera_ids, radii, num_nonfinite
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
-        inputs, begin = ctx.saved_tensors, 0
+        inputs = ctx.saved_tensors
+        needs = ctx.needs_input_grad[:7]
         means, quats, scales, _, colors = _fields(inputs)
-        found = [empty(x.shape, x) for x in inputs]
-        outs, colored = _fields(found), ctx.needs_input_grad[4] and gradients[4].shape[1] > 0
+        input_grads = [empty(x.shape, x) for x in inputs]
+        outs = _fields(input_grads)
+        colored = needs[4] and gradients[4].shape[1] > 0
         if not colored:  # the largest by far
-            outs = *outs[:4], outs[4][:, :0]
+            outs = (*outs[:4], outs[4][:, :0])
         gradients = arrays(gradients[0], gradients[1].flatten(1), *gradients[2:5])
-        matrices = np.zeros((2, len(ctx.views), 4, 4), np.float32)  # poses, intrinsics
+        poses, intrinsics = np.zeros((2, len(ctx.views), 4, 4), np.float32)
+        begin = 0
         for c, (view, ids) in enumerate(zip(ctx.views, ctx.ids, strict=True)):
-            part = tuple(x[begin : begin + len(ids)] for x in gradients)
-            if any(ctx.needs_input_grad[:5]):
-                arguments = means, quats, scales, colors, c, view, ids, part, outs
-                over(torch.get_num_threads(), len(means), footprint_gradients, *arguments)
-            if any(ctx.needs_input_grad[5:7]):
+            own = tuple(x[begin : begin + len(ids)] for x in gradients)
+            if any(needs[:5]):
+                of_gaussians = (means, quats, scales, colors, c, view, ids, own, outs)
+                over(torch.get_num_threads(), len(means), footprint_gradients, *of_gaussians)
+            if any(needs[5:]):
                 rows = np.empty((len(ids), 21), np.float32)
-                inside = means, quats, scales, colors, view, ids, part, rows
-                over(torch.get_num_threads(), len(ids), camera_gradients, *inside)
+                of_camera = (means, quats, scales, colors, view, ids, own, rows)
+                over(torch.get_num_threads(), len(ids), camera_gradients, *of_camera)
                 total = rows.sum(0, np.float64)
-                matrices[0][c, :3], matrices[1][c, :3, :3] = total[:12].reshape(3, 4), total[12:].reshape(3, 3)
+                poses[c, :3] = total[:12].reshape(3, 4)
+                intrinsics[c, :3, :3] = total[12:].reshape(3, 3)
             begin += len(ids)
-        found += map(torch.from_numpy, matrices)
-        wanted = *ctx.needs_input_grad[:4], colored, *ctx.needs_input_grad[5:7]
-        return *(x if w else None for x, w in zip(found, wanted, strict=True)), None, None, None
+        input_grads += [torch.from_numpy(poses), torch.from_numpy(intrinsics)]
+        wanted = (*needs[:4], colored, *needs[5:])
+        return *(x if want else None for x, want in zip(input_grads, wanted, strict=True)), None, None, None
 
 
 def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
     """Whether these are pinhole cameras with affine intrinsics and poses, the poses invertible."""
     if not isinstance(cameras, PinholeCamera):
         return False
-    (k, pose), unit = arrays(cameras.intrinsics, cameras.extrinsics), np.eye(4)
-    last = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
+    k, pose = arrays(cameras.intrinsics, cameras.extrinsics)
+    unit = np.eye(4)
+    affine = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
     finite = np.isfinite(k).all() and np.isfinite(pose).all()
-    return bool(last and finite and k[:, 0, 0].all() and k[:, 1, 1].all() and np.linalg.det(pose[:, :3, :3]).all())
+    return bool(affine and finite and k[:, 0, 0].all() and k[:, 1, 1].all() and np.linalg.det(pose[:, :3, :3]).all())
 
 
 def _views(cameras: PinholeCamera, frame: Frame) -> list[tuple[Array, ...]]:
     """The cameras as the kernels take them; in NumPy, which is faster for so few numbers."""
     views = list[tuple[Array, ...]]()
     for matrix, pose in zip(*arrays(cameras.intrinsics, cameras.extrinsics), strict=True):
-        focal, centre = matrix.diagonal()[:2], matrix[:2, 2]
+        focal = matrix.diagonal()[:2]
+        centre = matrix[:2, 2]
         begin, end = np.array([frame[:2], frame[2:]], matrix.dtype)
         margin = MARGIN * (end - begin)
-        first, last = -(centre - begin + margin) / focal, (end - centre + margin) / focal
+        first = -(centre - begin + margin) / focal
+        last = (end - centre + margin) / focal
         limits = np.stack([np.minimum(first, last), np.maximum(first, last)], 1)  # as `tangent_limits`
         inverse = np.linalg.inv(pose[:3, :3])
         # copies: a user may change a camera in place before the backward pass

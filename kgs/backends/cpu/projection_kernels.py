@@ -9,8 +9,9 @@ import math
 
 import numpy as np
 
+from kgs.compiled.kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
+
 from .harmonics_kernels import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
-from .kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
 
 SMALLEST_SQUARE, LARGEST_SQUARE = f32(1e-30), f32(1e36)
 BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
@@ -115,29 +116,29 @@ def _is_finite(g, means, quats, scales, opacities, colors):
         total += opacities[i, g]
     for i in range(colors.shape[1]):
         total += colors[g, i]
-    good = True
+    finite = True
     if not is_finite(total):  # a finite sum has finite terms
-        good = is_finite(quats[g, 3])
+        finite = is_finite(quats[g, 3])
         for i in range(3):
-            good &= is_finite(means[g, i]) and is_finite(quats[g, i]) and is_finite(scales[g, i])
+            finite &= is_finite(means[g, i]) and is_finite(quats[g, i]) and is_finite(scales[g, i])
         for i in range(opacities.shape[0]):
-            good &= is_finite(opacities[i, g])
+            finite &= is_finite(opacities[i, g])
         for i in range(colors.shape[1]):
-            good &= is_finite(colors[g, i])
-    return good
+            finite &= is_finite(colors[g, i])
+    return finite
 
 
 @jit
-def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, rules, lists, counts):
-    """List what camera c sees of the blocks of Gaussians from `begin` to `end`.
+def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, frustum, lists, counts):
+    """List which Gaussians camera c sees, of the blocks from `begin` to `end`.
 
-    Opacities are `(1, N)` or a row per camera, colours `(N, F)`; `rules` are height, width, near plane, eps2d, and how
-    many standard deviations wide a footprint counts as seen. Written are the `lists`, means2d, factors `(N, 6)`,
+    Opacities are `(1, N)` or a row per camera, colours `(N, F)`; `frustum` is height, width, near plane, eps2d, and how
+    many standard deviations wide a footprint counts as visible. Written are the `lists`, means2d, factors `(N, 6)`,
     depths, opacities, colours of harmonics `(N, 3)` (`(N, 0)` where none are wanted), radii and numbers of the
-    Gaussians, and in `counts` how many of each block are seen and how many are not finite, `(blocks, 2)`.
+    Gaussians, and in `counts` how many of each block are visible and how many are not finite, `(blocks, 2)`.
     """
     v, k, limits, _, centre = camera
-    height, width, near, eps2d, cutoff = rules
+    height, width, near, eps2d, cutoff = frustum
     means2d, factors, depths, alphas, rgb, radii, ids = lists
     bands = colors.shape[1] // 3 if rgb.shape[1] else 0
     b = np.empty(16, np.float32)
@@ -184,7 +185,7 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, r
 
 @inline
 def color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors):
-    """Add to the harmonics' gradients; returns what the colour says of the centre."""
+    """Add to the harmonics' gradients; returns the colour's contribution to the gradient of the centre."""
     x, y, z, inverse = _direction(means, g, centre)
     harmonics_basis(x, y, z, bands, b)
     red, green, blue = evaluate_harmonics(colors, g, bands, b)
@@ -251,16 +252,16 @@ def point_gradient(x, y, z, v, k, limits, u, g_mean, g_depth):
 
 
 @jit
-def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids, gradients, found):
+def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids, gradients, outs):
     """From gradients of what camera c sees to those of a range of Gaussians; the first camera also fills with zeros.
 
     `ids` are the Gaussians that it sees, ascending, `(M,)`; `gradients` those of means2d, factors `(M, 6)`, depths,
-    opacities and colours `(M, 3)` or `(M, 0)`. Added to are `found`, of means, quats, scales, opacities `(1, N)` or
+    opacities and colours `(M, 3)` or `(M, 0)`. Added to are `outs`, of means, quats, scales, opacities `(1, N)` or
     `(C, N)`, and colours `(N, F)`, or `(N, 0)` where that is not wanted.
     """
     v, k, limits, _, centre = camera
     g_means2d, g_factors, g_depths, g_opacities, g_rgb = gradients
-    d_means, d_quats, d_scales, d_opacities, d_colors = found
+    d_means, d_quats, d_scales, d_opacities, d_colors = outs
     bands = colors.shape[1] // 3 if g_rgb.shape[1] else 0
     b, h = np.empty(16, np.float32), np.empty(16, np.float32)
     row = min(c, d_opacities.shape[0] - 1)

@@ -22,11 +22,8 @@ import os
 import warnings
 
 import torch
-from torch import Tensor
 
-from kgs.backends.base import Backend, Compositor
-from kgs.camera import Cameras
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
 
 
 class GpuBackend(Backend):
@@ -53,52 +50,31 @@ class GpuBackend(Backend):
         except torch.OutOfMemoryError:  # says nothing about the kernels
             return False
 
-    def covers(self, like: Tensor) -> bool:
-        """Float32 on a GPU, while no graph is traced."""
-        return not torch.compiler.is_compiling() and super().covers(like)
-
-    def covers_compositing(
-        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, chunk_size: int | None
-    ) -> bool:
+    def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
-        one_block = not options.absgrad or features.shape[1] <= 4
-        return options.tile_size in (None, self.tile_size) and chunk_size is None and one_block
+        one_block = not call.options.absgrad or call.features.shape[1] <= 4
+        return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and one_block
 
-    def project(
-        self, gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
-    ) -> ProjectedGaussians:
-        """See `Backend`."""
+    @property
+    def project(self) -> ProjectionStage:
+        """See `Backend.project`."""
         from .projection import project
 
-        return project(gaussians, cameras, size, options, colors)
+        return project
 
-    def compositor(
-        self,
-        projected: ProjectedGaussians,
-        features: Tensor,
-        options: RasterOptions,
-        median_depth: bool,
-        chunk_size: int | None,
-    ) -> Compositor:
-        """See `Backend`."""
-        from .compositing import GpuCompositing
+    @property
+    def compositor(self) -> type[Compositor]:
+        """See `Backend.compositor`."""
+        from .compositing import GpuCompositor
 
-        return GpuCompositing(projected, features, options, median_depth)
+        return GpuCompositor
 
-    def loss_and_gradient(
-        self,
-        image: Tensor,
-        target: Tensor,
-        mean: Tensor,
-        variance: Tensor,
-        taps: list[float],
-        dssim_weight: float,
-        gradient: bool,
-    ) -> tuple[Tensor, Tensor | None]:
-        """See `Backend`."""
+    @property
+    def loss_and_gradient(self) -> LossStage:
+        """See `Backend.loss_and_gradient`."""
         from .loss import loss_and_gradient
 
-        return loss_and_gradient(image, target, mean, variance, taps, dssim_weight, gradient)
+        return loss_and_gradient
 
 
 def _is_interpreted() -> bool:
@@ -117,14 +93,14 @@ def self_check(device: torch.device) -> bool:
     from kgs.backends.agreement import BOUND, disagreement
 
     try:
-        found = disagreement(GpuBackend(), device)
+        difference = disagreement(GpuBackend(), device)
     except torch.OutOfMemoryError:
         raise
     except Exception as error:  # a compiler that does not know the card, a driver: kgs can do without
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
     else:
-        if found <= BOUND:
+        if difference <= BOUND:
             return True
-        reason = f"they differ from torch by {found:.1e}, more than {BOUND:g}"
+        reason = f"they differ from torch by {difference:.1e}, more than {BOUND:g}"
     warnings.warn(f"kgs: Triton's kernels are not used on {device}, torch is: {reason}", stacklevel=2)
     return False

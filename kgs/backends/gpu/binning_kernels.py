@@ -1,4 +1,4 @@
-"""Kernels that find which Gaussian reaches which tile; the spans are those of `kgs.raster.binning`.
+"""Kernels that find which Gaussian reaches which tile; the spans are those of `kgs.backends.torch.binning`.
 
 A lane is a Gaussian, in depth order. `count_entries` and `fill_entries` go through the same rows of tiles and columns,
 so that each Gaussian writes its entries where the sum of the counts before it says.
@@ -55,11 +55,13 @@ def _reach(means2d, factors, opacities, g, inside, eps2d, log2_threshold, height
     half = tl.sqrt(tl.maximum(cut, 0.0) * yy)
     top, bottom = tl.ceil(y - half), tl.floor(y + half)
     # nothing that is not a number passes
-    some = inside & (cut > 0.0) & (xx + yy < float("inf")) & (bottom >= top) & (bottom >= 0.0) & (top <= height - 1.0)
-    top = tl.where(some, tl.maximum(top, 0.0), 0.0)
-    bottom = tl.where(some, tl.minimum(bottom, height - 1.0), 0.0)
+    reaches = (
+        inside & (cut > 0.0) & (xx + yy < float("inf")) & (bottom >= top) & (bottom >= 0.0) & (top <= height - 1.0)
+    )
+    top = tl.where(reaches, tl.maximum(top, 0.0), 0.0)
+    bottom = tl.where(reaches, tl.minimum(bottom, height - 1.0), 0.0)
     row = tl.maximum(top.to(tl.int32) // _S, first_row)
-    end = tl.where(some, tl.minimum(bottom.to(tl.int32) // _S + 1, last_row), row)
+    end = tl.where(reaches, tl.minimum(bottom.to(tl.int32) // _S + 1, last_row), row)
     return row, end, x, y, half, cut, xy / yy, det / yy, 1.0 / yy, xy * tl.sqrt(cut / xx)
 
 
@@ -76,10 +78,10 @@ def _span(row, active, x, y, half, cut, slope, across, inverse, rightmost, width
     everywhere = cut == float("inf")
     left = tl.where(everywhere, 0.0, left)
     right = tl.where(everywhere, width - 1.0, right)
-    some = active & (right >= left) & (right >= 0.0) & (left <= width - 1.0)  # nothing that is not a number passes
-    first = tl.where(some, tl.maximum(left, 0.0), 0.0).to(tl.int32) // _S
-    last = tl.where(some, tl.minimum(right, width - 1.0), 0.0).to(tl.int32) // _S
-    return first, tl.where(some, last - first + 1, 0)
+    reaches = active & (right >= left) & (right >= 0.0) & (left <= width - 1.0)  # nothing that is not a number passes
+    first = tl.where(reaches, tl.maximum(left, 0.0), 0.0).to(tl.int32) // _S
+    last = tl.where(reaches, tl.minimum(right, width - 1.0), 0.0).to(tl.int32) // _S
+    return first, tl.where(reaches, last - first + 1, 0)
 
 
 @triton.jit(do_not_specialize=["begin", "end"])
@@ -134,9 +136,9 @@ def fill_entries(
         most = tl.max(count, 0)
         c = 0
         while c < most:
-            some = (c < count) & (at + c < full)
-            tl.store(tiles + at + c, tile + c, mask=some)
-            tl.store(ranks + at + c, i, mask=some)
+            fits = (c < count) & (at + c < full)
+            tl.store(tiles + at + c, tile + c, mask=fits)
+            tl.store(ranks + at + c, i, mask=fits)
             c += 1
         at += count
         row += 1

@@ -1,7 +1,7 @@
 """What kernels read of a pinhole camera, as one row of numbers; and the gradients of cameras.
 
 A row, `WIDTH` numbers: world to camera (3, 4), intrinsics (2, 3), limits of x / z, then of y / z, the centre (3,),
-whether the kernels can draw it, and the inverse of the pose's 3x3 block.
+whether the kernels cover it, and the inverse of the pose's 3x3 block.
 """
 
 import triton

@@ -7,9 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.backends.base import Inputs
-from kgs.raster.binning import check_fits
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
+from kgs.backends.row_slices import check_fits
 
 from .binning_kernels import count_entries, fill_entries, fill_table
 from .compositing_kernels import FEATURES, ROW, SIZE, K, composite_backward, composite_forward, sum_entries
@@ -32,8 +31,8 @@ class _Rows:
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """A row slice after the forward pass; the tensors are those of `.compositing_kernels`."""
+class _Lists:
+    """The lists of a row slice, and what its forward pass left; the tensors are those of `.compositing_kernels`."""
 
     entries: Tensor
     places: Tensor
@@ -42,20 +41,22 @@ class _Drawn:
     reached: Tensor
 
 
-class GpuCompositing:
-    """Compositing of one call, see `kgs.backends.base.Compositor`; row slices where lists do not fit."""
+class GpuCompositor(Compositor):
+    """Compositing of one call; its constructor reads one number for each row slice that it tries."""
 
-    def __init__(
-        self, projected: ProjectedGaussians, features: Tensor, options: RasterOptions, median_depth: bool
-    ) -> None:
-        """Sort by depth, and find the row slices that fit; reads one number for each that is tried."""
+    def __init__(self, call: CompositingCall) -> None:
+        projected = call.projected
+        options = call.options
         fields = (projected.means2d, projected.factors, projected.opacities, projected.depths)
         means2d, factors, opacities, depths = (x.detach().contiguous() for x in fields)
-        self._size, self._cameras, self._eps2d = projected.image_size, projected.num_cameras, projected.eps2d
+        self._size = projected.image_size
+        self._cameras = projected.num_cameras
+        self._eps2d = projected.eps2d
         self._image_rows, self._columns = (blocks(length, SIZE) for length in self._size)
-        self._features = range(0, max(features.shape[1], 1), FEATURES)  # where blocks of them begin
-        self._median_depth, self._absgrad = median_depth, options.absgrad
-        self._stops = tuple(max(x, _TINY) for x in (options.alpha_threshold, options.transmittance_stop))
+        self._features = range(0, max(call.features.shape[1], 1), FEATURES)  # where blocks of them begin
+        self._median_depth = call.median_depth
+        self._absgrad = options.absgrad
+        self._thresholds = (max(options.alpha_threshold, _TINY), max(options.transmittance_stop, _TINY))
         self._order = torch.argsort(depths, stable=True)
         self._table = depths.new_empty(len(projected), 8)
         footprints = (means2d, factors, opacities)
@@ -66,40 +67,48 @@ class GpuCompositing:
         self._ellipses = (*ellipses, *self._size, self._image_rows)
         self._slices = self._fitting(0, self._cameras * self._image_rows, options.max_bytes)
 
-    def forward(self, inputs: Inputs, keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
-        """See `Compositor`: one row slice is kept, several are computed again."""
-        features = inputs[3]
+    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
+        """See `Compositor`. One row slice is kept, several are computed again."""
+        features = inputs.features
         widths = (features.shape[1], 1, 1 if self._median_depth else 0)
         images = [features.new_empty(self._cameras, width, *self._size) for width in widths]
         keep = keep and len(self._slices) == 1
-        drawn = [self._draw(rows, features, images, keep) for rows in self._slices]
-        return (images[0], images[1], images[2]), drawn[0] if keep else None
+        lists = [self._composite_rows(rows, features, images, keep) for rows in self._slices]
+        return (images[0], images[1], images[2]), lists[0] if keep else None
 
     def backward(
-        self, inputs: Inputs, kept: Any, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
-    ) -> tuple[Tensor | None, ...]:
+        self,
+        inputs: CompositingInputs,
+        kept: Any,
+        grad_features: Tensor,
+        grad_transmittance: Tensor,
+        needs: tuple[bool, ...],
+    ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
         """See `Compositor`."""
-        features = inputs[3]
+        features = inputs.features.contiguous()
         n, channels = features.shape
         needs_absolute = self._absgrad and needs[0]
-        found = [x.new_empty(x.shape) for x in inputs]
-        absolute = found[0].new_empty(found[0].shape if needs_absolute else (0,))
-        values = features.contiguous()
-        factors, opacities, grads, behind = (x.contiguous() for x in (*inputs[1:3], grad_features, grad_transmittance))
+        input_grads = [x.new_empty(x.shape) for x in inputs]
+        absolute = features.new_empty((n, 2) if needs_absolute else (0,))
+        factors = inputs.factors.contiguous()
+        opacities = inputs.opacities.contiguous()
+        grads = grad_features.contiguous()
+        behind = grad_transmittance.contiguous()
 
-        def add(rows: _Rows, drawn: _Drawn) -> None:
-            """Add the gradients of a row slice; what it needs is freed before the next is drawn."""
+        def add(rows: _Rows, lists: _Lists) -> None:
+            """Add the gradients of a row slice; what it needs is freed before the next is made."""
             later_slice = rows is not self._slices[0]
-            lists = (drawn.entries, drawn.places, drawn.offsets, *self._tiles(rows), channels, *self._stops)
-            given = (self._table, values, self._order, *lists, drawn.starts, drawn.reached, grads, behind)
-            moments, tiles = features.new_zeros(rows.entries, ROW), (len(drawn.reached),)
+            tiles = (lists.entries, lists.places, lists.offsets, *self._tiles(rows), channels, *self._thresholds)
+            given = (self._table, features, self._order, *tiles, lists.starts, lists.reached, grads, behind)
+            moments = features.new_zeros(rows.entries, ROW)
             for first in self._features:
-                launch(composite_backward, tiles, *given, first, moments, ABSOLUTE=needs_absolute, warps=1)
+                grid = (len(lists.reached),)
+                launch(composite_backward, grid, *given, first, moments, ABSOLUTE=needs_absolute, warps=1)
                 launch(
                     sum_entries,
                     (blocks(n, 8),),
                     *(self._order, rows.begins, moments, factors, opacities, self._eps2d, n, channels, first),
-                    *(*found, absolute),
+                    *(*input_grads, absolute),
                     MOMENTS=any(needs[:3]),
                     WITH_FEATURES=needs[3],
                     ABSOLUTE=needs_absolute,
@@ -110,10 +119,10 @@ class GpuCompositing:
                 )
 
         for rows in self._slices:
-            add(rows, self._draw(rows, features, None, True) if kept is None else kept)
+            add(rows, self._composite_rows(rows, features, None, True) if kept is None else kept)
             kept = None
-        wanted = (x if needed else None for x, needed in zip(found, needs, strict=True))
-        return *wanted, absolute if needs_absolute else None
+        gradients = tuple(x if need else None for x, need in zip(input_grads, needs, strict=True))
+        return gradients, absolute if needs_absolute else None
 
     def _fitting(self, begin: int, end: int, max_bytes: int) -> list[_Rows]:
         """Row slices of the rows `begin` to `end` whose lists take at most `max_bytes`: halves, where they do not."""
@@ -123,21 +132,22 @@ class GpuCompositing:
         begins = self._order.new_zeros(n + 1)
         torch.cumsum(counts, 0, out=begins[1:])
         entries = int(begins[-1])
-        need = entries * _PER_ENTRY + (end - begin) * self._columns * SIZE * SIZE * 4
-        if need > max_bytes and end - begin > 1:
+        size = entries * _PER_ENTRY + (end - begin) * self._columns * SIZE * SIZE * 4
+        if size > max_bytes and end - begin > 1:
             middle = (begin + end) // 2
             del counts, begins
             return self._fitting(begin, middle, max_bytes) + self._fitting(middle, end, max_bytes)
-        check_fits(need, max_bytes)
+        check_fits(size, max_bytes)
         return [_Rows(begin, end, begins, entries)]
 
     def _tiles(self, rows: _Rows) -> tuple[int, ...]:
         """How the tiles of a row slice lie in the images."""
         return (rows.begin * self._columns, self._columns, self._image_rows, *self._size)
 
-    def _draw(self, rows: _Rows, features: Tensor, images: list[Tensor] | None, keep: bool) -> _Drawn:
+    def _composite_rows(self, rows: _Rows, features: Tensor, images: list[Tensor] | None, keep: bool) -> _Lists:
         """Fill sums, transmittance and median depth; without images only compute what `backward` needs again."""
-        n, tiles = len(self._order), (rows.end - rows.begin) * self._columns
+        n = len(self._order)
+        tiles = (rows.end - rows.begin) * self._columns
         kind = torch.int16 if tiles < 2**15 else torch.int32  # sorted in half the time
         keys = self._order.new_full((rows.entries,), tiles, dtype=kind)  # behind all tiles
         ranks = self._order.new_empty(rows.entries, dtype=torch.int32)
@@ -149,14 +159,14 @@ class GpuCompositing:
         chunks = rows.entries // K + tiles if keep else 0
         starts = features.new_empty(chunks, SIZE * SIZE)
         reached = self._order.new_empty(tiles, dtype=torch.int32)
-        rest = (*self._tiles(rows), features.shape[1], *self._stops, starts, reached)
+        rest = (*self._tiles(rows), features.shape[1], *self._thresholds, starts, reached)
         launch(
             composite_forward,
             (tiles, len(self._features) if images else 1),
             *(self._table, features.contiguous(), self._order, entries, offsets, *rest, *(images or [starts] * 3)),
             KEEP=keep,
-            DRAW=images is not None,
+            IMAGES=images is not None,
             MEDIAN=images is not None and self._median_depth,
             warps=1,
         )
-        return _Drawn(entries, places, offsets, starts, reached)
+        return _Lists(entries, places, offsets, starts, reached)

@@ -1,6 +1,6 @@
-"""Front-to-back compositing of the lists of tiles, and its gradient; formulas as in `kgs.raster`.
+"""Front-to-back compositing of the lists of tiles, and its gradient; formulas as in `kgs.backends.torch`.
 
-A program draws a tile, P pixels by K entries at a time, for a block of `FEATURES` features. Along the entries of a
+A program composites a tile, P pixels by K entries at a time, for a block of `FEATURES` features. Along the entries of a
 chunk, scans give the transmittance before and after each, and V behind each; nothing is divided. T at the beginning of
 each chunk is kept, and the backward pass computes the alphas of a chunk again. It writes a row of moments for each
 entry, where no other program writes, in the order of the Gaussians: `sum_entries` adds up neighbouring rows in a fixed
@@ -40,13 +40,13 @@ _TWICE_LN2: tl.constexpr = tl.constexpr(1.3862943611198906)  # of the derivative
 
 
 @triton.jit
-def _light(after1, before1, after2, before2):
-    """Of some layers, how much light is left behind them, and before the last of them."""
+def _compose_transmittances(after1, before1, after2, before2):
+    """Of some layers, the transmittance behind them, and before the last of them."""
     return after1 * after2, after1 * before2
 
 
 @triton.jit
-def _behind(m1, b1, inner_m1, inner_b1, m2, b2, inner_m2, inner_b2):
+def _compose_behind(m1, b1, inner_m1, inner_b1, m2, b2, inner_m2, inner_b2):
     """V -> m V + b through some layers, from the back; and the same without the foremost."""
     return m1 * m2, m2 * b1 + b2, m1 * inner_m2, inner_m2 * b1 + inner_b2
 
@@ -82,7 +82,7 @@ def _alphas(table, ranks, listed, x, y, threshold):
 def _transmittances(alpha, start, stop):
     """The transmittance before and after each of K layers; 0 behind the stop."""
     keep = 1.0 - alpha
-    after, before = tl.associative_scan((keep, keep * 0.0 + 1.0), 0, _light)
+    after, before = tl.associative_scan((keep, keep * 0.0 + 1.0), 0, _compose_transmittances)
     after = start[None, :] * after
     before = start[None, :] * before
     return tl.where(before >= stop, before, 0.0), tl.where(after >= stop, after, 0.0)
@@ -104,21 +104,21 @@ def _feature(features, ids, listed, f, width):
 def composite_forward(
     table, features, order, entries, offsets, first_tile, columns, rows, height, width, channels, threshold, stop,
     starts, reached, sums, transmittance, depths,
-    KEEP: tl.constexpr, DRAW: tl.constexpr, MEDIAN: tl.constexpr,
+    KEEP: tl.constexpr, IMAGES: tl.constexpr, MEDIAN: tl.constexpr,
 ):  # fmt: skip
-    """Sums over layers, transmittance and median depth, straight into the images; `DRAW`: whether these are wanted."""
+    """Sums over layers, transmittance and median depth, straight into the images, with `IMAGES`."""
     t = tl.program_id(0)
     block = tl.program_id(1)
     camera, column, row = _pixels(first_tile + t, columns, rows)
     x, y = column.to(tl.float32), row.to(tl.float32)
-    shown = (column < width) & (row < height)
-    light = tl.where(shown, 1.0, 0.0)  # pixels beyond the image are opaque
+    inside = (column < width) & (row < height)
+    T = tl.where(inside, 1.0, 0.0)  # pixels beyond the image are opaque
     f0 = block * _F
-    sum0 = light * 0.0
-    sum1 = light * 0.0
-    sum2 = light * 0.0
-    sum3 = light * 0.0
-    median = light * 0.0
+    sum0 = T * 0.0
+    sum1 = T * 0.0
+    sum2 = T * 0.0
+    sum3 = T * 0.0
+    median = T * 0.0
     first = tl.load(offsets + t)
     last = tl.load(offsets + t + 1)
     k = tl.arange(0, _K)
@@ -129,13 +129,13 @@ def composite_forward(
     while (e < last) & (open_ > 0):
         if KEEP:  # noqa: SIM102 - a constant and a number of the device do not go into one condition
             if block == 0:
-                tl.store(starts + chunk * _P + p, light)
+                tl.store(starts + chunk * _P + p, T)
         chunk += 1
         listed = e + k < last
         ranks = tl.load(entries + e + k, mask=listed, other=0)
         ids = tl.load(order + ranks, mask=listed, other=0)
         alpha, _, _ = _alphas(table, ranks, listed, x, y, threshold)
-        before, after = _transmittances(alpha, light, stop)
+        before, after = _transmittances(alpha, T, stop)
         weight = alpha * before
         sum0 += tl.sum(weight * _feature(features, ids, listed, f0, channels), 0)
         sum1 += tl.sum(weight * _feature(features, ids, listed, f0 + 1, channels), 0)
@@ -144,23 +144,23 @@ def composite_forward(
         if MEDIAN:
             depth = tl.load(table + ranks * 8 + 7, mask=listed, other=0.0)[:, None]
             median += tl.sum(tl.where((before >= 0.5) & (after < 0.5), depth, 0.0), 0)
-        light = tl.min(after, 0)  # T never grows
-        open_ = tl.max((light > 0.0).to(tl.int32), 0)
+        T = tl.min(after, 0)  # T never grows
+        open_ = tl.max((T > 0.0).to(tl.int32), 0)
         e += _K
     pixel = row * width + column
     size = height * width
     if block == 0:
         tl.store(reached + t, tl.minimum(e, last) - first)
-    if DRAW:
+    if IMAGES:
         if block == 0:
-            tl.store(transmittance + camera * size + pixel, light, mask=shown)
+            tl.store(transmittance + camera * size + pixel, T, mask=inside)
             if MEDIAN:
-                tl.store(depths + camera * size + pixel, median, mask=shown)
+                tl.store(depths + camera * size + pixel, median, mask=inside)
         image = sums + (camera * channels + f0) * size + pixel
-        tl.store(image, sum0, mask=shown & _exists(f0, channels, pixel))
-        tl.store(image + size, sum1, mask=shown & _exists(f0 + 1, channels, pixel))
-        tl.store(image + size * 2, sum2, mask=shown & _exists(f0 + 2, channels, pixel))
-        tl.store(image + size * 3, sum3, mask=shown & _exists(f0 + 3, channels, pixel))
+        tl.store(image, sum0, mask=inside & _exists(f0, channels, pixel))
+        tl.store(image + size, sum1, mask=inside & _exists(f0 + 1, channels, pixel))
+        tl.store(image + size * 2, sum2, mask=inside & _exists(f0 + 2, channels, pixel))
+        tl.store(image + size * 3, sum3, mask=inside & _exists(f0 + 3, channels, pixel))
 
 
 @triton.jit(do_not_specialize=["first_tile", "f0"])
@@ -173,15 +173,15 @@ def composite_backward(
     t = tl.program_id(0)
     camera, column, row = _pixels(first_tile + t, columns, rows)
     x, y = column.to(tl.float32), row.to(tl.float32)
-    shown = (column < width) & (row < height)
+    inside = (column < width) & (row < height)
     pixel = row * width + column
     size = height * width
     image = grads + (camera * channels + f0) * size + pixel
-    grad0 = tl.load(image, mask=shown & _exists(f0, channels, pixel), other=0.0)
-    grad1 = tl.load(image + size, mask=shown & _exists(f0 + 1, channels, pixel), other=0.0)
-    grad2 = tl.load(image + size * 2, mask=shown & _exists(f0 + 2, channels, pixel), other=0.0)
-    grad3 = tl.load(image + size * 3, mask=shown & _exists(f0 + 3, channels, pixel), other=0.0)
-    behind = tl.load(grad_transmittance + camera * size + pixel, mask=shown & (pixel * 0 + f0 == 0), other=0.0)
+    grad0 = tl.load(image, mask=inside & _exists(f0, channels, pixel), other=0.0)
+    grad1 = tl.load(image + size, mask=inside & _exists(f0 + 1, channels, pixel), other=0.0)
+    grad2 = tl.load(image + size * 2, mask=inside & _exists(f0 + 2, channels, pixel), other=0.0)
+    grad3 = tl.load(image + size * 3, mask=inside & _exists(f0 + 3, channels, pixel), other=0.0)
+    behind = tl.load(grad_transmittance + camera * size + pixel, mask=inside & (pixel * 0 + f0 == 0), other=0.0)
     first = tl.load(offsets + t)
     count = tl.load(reached + t)
     k = tl.arange(0, _K)
@@ -201,11 +201,11 @@ def composite_backward(
         value += _feature(features, ids, listed, f0 + 2, channels) * grad2[None, :]
         value += _feature(features, ids, listed, f0 + 3, channels) * grad3[None, :]
         # V_k = alpha v + (1 - alpha) V_{k+1}, and V_{k+1} is 0 behind the stop
-        seen = after > 0.0
-        keep = tl.where(seen, 1.0 - alpha, 0.0)
+        before_stop = after > 0.0
+        keep = tl.where(before_stop, 1.0 - alpha, 0.0)
         one, zero = keep * 0.0 + 1.0, keep * 0.0
-        m, b, inner_m, inner_b = tl.associative_scan((keep, alpha * value, one, zero), 0, _behind, reverse=True)
-        later = tl.where(seen, inner_m * behind[None, :] + inner_b, 0.0)
+        m, b, inner_m, inner_b = tl.associative_scan((keep, alpha * value, one, zero), 0, _compose_behind, reverse=True)
+        later = tl.where(before_stop, inner_m * behind[None, :] + inner_b, 0.0)
         behind = tl.sum(tl.where(k[:, None] == 0, m * behind[None, :] + b, 0.0), 0)
         slope = tl.where(alpha < _ALPHA_MAX, weight * (value - later), 0.0)
         by_x, by_y = slope * dx, slope * dy

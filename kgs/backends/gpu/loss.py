@@ -18,11 +18,14 @@ def loss_and_gradient(
     dssim_weight: float,
     gradient: bool,
 ) -> tuple[Tensor, Tensor | None]:
-    """See `kgs.backends.Backend`; reads nothing from the device."""
+    """See `LossStage`; reads nothing from the device."""
     x, y, mean_y, variance_y = (each.detach().contiguous() for each in (image, target, mean, variance))
-    pixels, (height, width) = x.numel(), image.shape[-2:]
-    half, count = tuple(taps[:6]), blocks(pixels, _BLOCK)
-    across, maps = x.new_empty(3, pixels), x.new_empty(3, pixels)
+    height, width = image.shape[-2:]
+    pixels = x.numel()
+    half = tuple(taps[:6])
+    count = blocks(pixels, _BLOCK)
+    across = x.new_empty(3, pixels)
+    maps = x.new_empty(3, pixels)
     sums = x.new_empty(2, count)
     launch(sum_across, (count,), x, y, pixels, width, *half, across, BLOCK=_BLOCK)
     shape = (pixels, height, width)
@@ -31,8 +34,11 @@ def loss_and_gradient(
     loss = (absolute + dssim_weight * (1.0 - ssim.clamp_max(1.0))).to(image.dtype)
     if not gradient:
         return loss, None
-    down, found = across, torch.empty_like(x)
+    down = across  # its memory
+    image_gradient = torch.empty_like(x)
     launch(fold_down, (count, 3), maps, *shape, *half, down, BLOCK=_BLOCK)
-    factors = (-dssim_weight / pixels, 1 / pixels)
-    launch(gradient_across, (count,), x, y, pixels, width, *half, down, *factors, found, BLOCK=_BLOCK)
-    return loss, found
+    by_ssim = -dssim_weight / pixels
+    by_l1 = 1 / pixels
+    lines = (pixels, width, *half, down)
+    launch(gradient_across, (count,), x, y, *lines, by_ssim, by_l1, image_gradient, BLOCK=_BLOCK)
+    return loss, image_gradient

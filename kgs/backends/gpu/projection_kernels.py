@@ -5,7 +5,7 @@ The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; a
 
     opacities   (1, N) or (C, N)
     finite      (N,)      whether all of a Gaussian's numbers are
-    places      (C, N)    how many pairs are seen up to and including this one: a pair that is seen has row places - 1
+    places      (C, N)    how many pairs are visible up to and including this one: that of a visible pair is its row + 1
 """
 
 import triton
@@ -24,17 +24,17 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
     b = tl.program_id(0)
     g = b * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
-    good = inside
+    all_finite = inside
     for i in tl.static_range(3):
-        good &= is_finite(tl.load(means + g * 3 + i, mask=inside, other=0.0))
-        good &= is_finite(tl.load(scales + g * 3 + i, mask=inside, other=0.0))
+        all_finite &= is_finite(tl.load(means + g * 3 + i, mask=inside, other=0.0))
+        all_finite &= is_finite(tl.load(scales + g * 3 + i, mask=inside, other=0.0))
     for i in tl.static_range(4):
-        good &= is_finite(tl.load(quats + g * 4 + i, mask=inside, other=0.0))
+        all_finite &= is_finite(tl.load(quats + g * 4 + i, mask=inside, other=0.0))
     most = tl.zeros((BLOCK,), tl.float32)
     view = 0
     while view < views:
         opacity = tl.load(opacities + view * n + g, mask=inside, other=0.0)
-        good &= is_finite(opacity)
+        all_finite &= is_finite(opacity)
         most = tl.maximum(most, opacity)
         view += 1
     f = tl.arange(0, 16)
@@ -42,10 +42,10 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
     first = 0
     while first < features:
         value = tl.load(row + first, mask=inside[:, None] & (f + first < features)[None, :], other=0.0)
-        good &= tl.min(is_finite(value).to(tl.int32), 1) > 0
+        all_finite &= tl.min(is_finite(value).to(tl.int32), 1) > 0
         first += 16
-    tl.store(finite + g, good.to(tl.int8), mask=inside)
-    tl.store(largest + b, tl.max(tl.where(good, most, 0.0), 0))
+    tl.store(finite + g, all_finite.to(tl.int8), mask=inside)
+    tl.store(largest + b, tl.max(tl.where(all_finite, most, 0.0), 0))
 
 
 @triton.jit
@@ -98,12 +98,12 @@ def _rotation(quats, g, inside):
     y = tl.load(quats + g * 4 + 2, mask=inside, other=0.0)
     z = tl.load(quats + g * 4 + 3, mask=inside, other=0.0)
     peak = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
-    some = peak > 0.0
-    scale = tl.where(some, peak, 1.0)  # no square overflows or vanishes
+    turns = peak > 0.0
+    scale = tl.where(turns, peak, 1.0)  # no square overflows or vanishes
     w, x, y, z = w / scale, x / scale, y / scale, z / scale
-    norm = tl.where(some, tl.sqrt(w * w + x * x + y * y + z * z), 1.0)
-    w, x, y, z = tl.where(some, w / norm, 1.0), x / norm, y / norm, z / norm
-    inverse = tl.where(some, 1.0 / norm / scale, 0.0)
+    norm = tl.where(turns, tl.sqrt(w * w + x * x + y * y + z * z), 1.0)
+    w, x, y, z = tl.where(turns, w / norm, 1.0), x / norm, y / norm, z / norm
+    inverse = tl.where(turns, 1.0 / norm / scale, 0.0)
     xx, yy, zz = 2.0 * x * x, 2.0 * y * y, 2.0 * z * z
     xy, xz, yz = 2.0 * x * y, 2.0 * x * z, 2.0 * y * z
     wx, wy, wz = 2.0 * w * x, 2.0 * w * y, 2.0 * w * z
@@ -155,10 +155,10 @@ def _largest(xx, xy, yy):
 
 
 @triton.jit
-def find_seen(
-    means, quats, scales, finite, cameras, cutoff, near, eps2d, height, width, n, seen, BLOCK: tl.constexpr
+def find_visible(
+    means, quats, scales, finite, cameras, cutoff, near, eps2d, height, width, n, visible, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """Which pairs (camera, Gaussian) are seen: a footprint of so many standard deviations touches the image."""
+    """Which pairs (camera, Gaussian) are visible: a footprint of `cutoff` standard deviations touches the image."""
     c = tl.program_id(1)
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
@@ -166,10 +166,10 @@ def find_seen(
     xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
     reach = tl.load(cutoff)
     rx, ry = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
-    some = inside & beyond & (tl.load(finite + g, mask=inside, other=0) > 0)
-    some &= (det > 0.0) & is_finite(det + _largest(xx, xy, yy) + u + v)
-    some &= (u + rx > -0.5) & (u - rx < width - 0.5) & (v + ry > -0.5) & (v - ry < height - 0.5)
-    tl.store(seen + c * n + g, some.to(tl.int32), mask=inside)
+    touches = inside & beyond & (tl.load(finite + g, mask=inside, other=0) > 0)
+    touches &= (det > 0.0) & is_finite(det + _largest(xx, xy, yy) + u + v)
+    touches &= (u + rx > -0.5) & (u - rx < width - 0.5) & (v + ry > -0.5) & (v - ry < height - 0.5)
+    tl.store(visible + c * n + g, touches.to(tl.int32), mask=inside)
 
 
 @triton.jit
@@ -183,45 +183,45 @@ def _direction(camera, mx, my, mz):
 
 
 @triton.jit
-def list_seen(
+def list_visible(
     means, quats, scales, opacities, colors, cameras, places, near, eps2d, n, views, means2d, factors, depths, alphas,
     rgb, radii, camera_ids, ids,
     BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write what is seen to its row: the fields of `kgs.ProjectedGaussians`."""
+    """Write what is visible to its row: the fields of `kgs.ProjectedGaussians`."""
     c = tl.program_id(1)
     camera = cameras + c * _WIDTH
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     place = c * n + g
     inside = g < n
     end = tl.load(places + place, mask=inside, other=0)
-    seen = inside & (end > tl.load(places + place - 1, mask=inside & (place > 0), other=0))
+    visible = inside & (end > tl.load(places + place - 1, mask=inside & (place > 0), other=0))
     m = end - 1
-    _, z, u, v, a0, a1, a2, b0, b1, b2 = _footprint(camera, means, quats, scales, g, seen, near)
+    _, z, u, v, a0, a1, a2, b0, b1, b2 = _footprint(camera, means, quats, scales, g, visible, near)
     xx, xy, yy, _ = variances(a0, a1, a2, b0, b1, b2, eps2d)
-    tl.store(means2d + m * 2, u, mask=seen)
-    tl.store(means2d + m * 2 + 1, v, mask=seen)
-    tl.store(factors + m * 6, a0, mask=seen)
-    tl.store(factors + m * 6 + 1, a1, mask=seen)
-    tl.store(factors + m * 6 + 2, a2, mask=seen)
-    tl.store(factors + m * 6 + 3, b0, mask=seen)
-    tl.store(factors + m * 6 + 4, b1, mask=seen)
-    tl.store(factors + m * 6 + 5, b2, mask=seen)
-    tl.store(depths + m, z, mask=seen)
-    tl.store(radii + m, tl.ceil(3.0 * tl.sqrt(_largest(xx, xy, yy))), mask=seen)
+    tl.store(means2d + m * 2, u, mask=visible)
+    tl.store(means2d + m * 2 + 1, v, mask=visible)
+    tl.store(factors + m * 6, a0, mask=visible)
+    tl.store(factors + m * 6 + 1, a1, mask=visible)
+    tl.store(factors + m * 6 + 2, a2, mask=visible)
+    tl.store(factors + m * 6 + 3, b0, mask=visible)
+    tl.store(factors + m * 6 + 4, b1, mask=visible)
+    tl.store(factors + m * 6 + 5, b2, mask=visible)
+    tl.store(depths + m, z, mask=visible)
+    tl.store(radii + m, tl.ceil(3.0 * tl.sqrt(_largest(xx, xy, yy))), mask=visible)
     row = tl.minimum(c, views - 1) * n
-    tl.store(alphas + m, tl.load(opacities + row + g, mask=seen, other=0.0), mask=seen)
-    tl.store(camera_ids + m, c + g * 0, mask=seen)
-    tl.store(ids + m, g, mask=seen)
+    tl.store(alphas + m, tl.load(opacities + row + g, mask=visible, other=0.0), mask=visible)
+    tl.store(camera_ids + m, c + g * 0, mask=visible)
+    tl.store(ids + m, g, mask=visible)
     if BANDS > 0:
-        mx = tl.load(means + g * 3, mask=seen, other=0.0)
-        my = tl.load(means + g * 3 + 1, mask=seen, other=0.0)
-        mz = tl.load(means + g * 3 + 2, mask=seen, other=0.0)
+        mx = tl.load(means + g * 3, mask=visible, other=0.0)
+        my = tl.load(means + g * 3 + 1, mask=visible, other=0.0)
+        mz = tl.load(means + g * 3 + 2, mask=visible, other=0.0)
         x, y, z, _ = _direction(camera, mx, my, mz)
-        red, green, blue = evaluate(colors, g, seen, x, y, z, BANDS)
-        tl.store(rgb + m * 3, tl.where(red < 0.0, 0.0, red), mask=seen)
-        tl.store(rgb + m * 3 + 1, tl.where(green < 0.0, 0.0, green), mask=seen)
-        tl.store(rgb + m * 3 + 2, tl.where(blue < 0.0, 0.0, blue), mask=seen)
+        red, green, blue = evaluate(colors, g, visible, x, y, z, BANDS)
+        tl.store(rgb + m * 3, tl.where(red < 0.0, 0.0, red), mask=visible)
+        tl.store(rgb + m * 3 + 1, tl.where(green < 0.0, 0.0, green), mask=visible)
+        tl.store(rgb + m * 3 + 2, tl.where(blue < 0.0, 0.0, blue), mask=visible)
 
 
 @triton.jit
@@ -285,27 +285,30 @@ def _limit_gradients(camera, x, y, inverse, h02, h12):
 
 @triton.jit
 def _color_gradients(
-    camera, mx, my, mz, colors, g, seen, g_rgb, m, d_colors, inside,
+    camera, mx, my, mz, colors, g, visible, g_rgb, m, d_colors, inside,
     BANDS: tl.constexpr, WRITE: tl.constexpr, ADD: tl.constexpr,
 ):  # fmt: skip
-    """What the colour says of the centre; with `WRITE` the gradients of the harmonics are stored, or added."""
+    """The colour's contribution to the gradient of the centre.
+
+    With `WRITE` the gradients of the harmonics are stored, or with `ADD` added to what is there.
+    """
     x, y, z, inverse = _direction(camera, mx, my, mz)
-    red, green, blue = evaluate(colors, g, seen, x, y, z, BANDS)
-    red = tl.where(red < 0.0, 0.0, tl.load(g_rgb + m * 3, mask=seen, other=0.0))
-    green = tl.where(green < 0.0, 0.0, tl.load(g_rgb + m * 3 + 1, mask=seen, other=0.0))
-    blue = tl.where(blue < 0.0, 0.0, tl.load(g_rgb + m * 3 + 2, mask=seen, other=0.0))
+    red, green, blue = evaluate(colors, g, visible, x, y, z, BANDS)
+    red = tl.where(red < 0.0, 0.0, tl.load(g_rgb + m * 3, mask=visible, other=0.0))
+    green = tl.where(green < 0.0, 0.0, tl.load(g_rgb + m * 3 + 1, mask=visible, other=0.0))
+    blue = tl.where(blue < 0.0, 0.0, tl.load(g_rgb + m * 3 + 2, mask=visible, other=0.0))
     gx, gy, gz = red * 0.0, red * 0.0, red * 0.0
     row = g.to(tl.int64) * (3 * BANDS)
     for k in tl.static_range(BANDS):
         if WRITE:
-            b = tl.where(seen, basis(x, y, z, k), 0.0)
+            b = tl.where(visible, basis(x, y, z, k), 0.0)
             put(d_colors + row + 3 * k, b * red, inside, ADD)
             put(d_colors + row + 3 * k + 1, b * green, inside, ADD)
             put(d_colors + row + 3 * k + 2, b * blue, inside, ADD)
         if k > 0:
-            h = red * tl.load(colors + row + 3 * k, mask=seen, other=0.0)
-            h += green * tl.load(colors + row + 3 * k + 1, mask=seen, other=0.0)
-            h += blue * tl.load(colors + row + 3 * k + 2, mask=seen, other=0.0)
+            h = red * tl.load(colors + row + 3 * k, mask=visible, other=0.0)
+            h += green * tl.load(colors + row + 3 * k + 1, mask=visible, other=0.0)
+            h += blue * tl.load(colors + row + 3 * k + 2, mask=visible, other=0.0)
             bx, by, bz = basis_gradient(x, y, z, h, k)
             gx, gy, gz = gx + bx, gy + by, gz + bz
     along = gx * x + gy * y + gz * z
@@ -313,19 +316,19 @@ def _color_gradients(
 
 
 @triton.jit
-def _total(out, value, seen):
-    """Store the sum over the Gaussians that are seen."""
-    tl.store(out, tl.sum(tl.where(seen, value, 0.0), 0))
+def _total(out, value, visible):
+    """Store the sum over the Gaussians that are visible."""
+    tl.store(out, tl.sum(tl.where(visible, value, 0.0), 0))
 
 
 @triton.jit
-def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, seen):
+def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, visible):
     """The gradient of row i of a pose: by the point, by J W, and by the direction of the colours."""
     turned = tl.load(camera + 26 + i) * wx + tl.load(camera + 29 + i) * wy + tl.load(camera + 32 + i) * wz
-    _total(out + 4 * i, moved * mx + j * u0 + h * v0 + turned * tl.load(camera + 22), seen)
-    _total(out + 4 * i + 1, moved * my + j * u1 + h * v1 + turned * tl.load(camera + 23), seen)
-    _total(out + 4 * i + 2, moved * mz + j * u2 + h * v2 + turned * tl.load(camera + 24), seen)
-    _total(out + 4 * i + 3, moved + turned, seen)
+    _total(out + 4 * i, moved * mx + j * u0 + h * v0 + turned * tl.load(camera + 22), visible)
+    _total(out + 4 * i + 1, moved * my + j * u1 + h * v1 + turned * tl.load(camera + 23), visible)
+    _total(out + 4 * i + 2, moved * mz + j * u2 + h * v2 + turned * tl.load(camera + 24), visible)
+    _total(out + 4 * i + 3, moved + turned, visible)
 
 
 @triton.jit(do_not_specialize=["c"])
@@ -344,23 +347,23 @@ def footprint_gradients(
     place = c * n + g
     inside = g < n
     end = tl.load(places + place, mask=inside, other=0)
-    seen = inside & (end > tl.load(places + place - 1, mask=inside & (place > 0), other=0))
+    visible = inside & (end > tl.load(places + place - 1, mask=inside & (place > 0), other=0))
     m = end - 1
-    mx, my, mz, x, y, z = _camera_point(camera, means, g, seen)
-    z = tl.where(seen, z, 1.0)
+    mx, my, mz, x, y, z = _camera_point(camera, means, g, visible)
+    z = tl.where(visible, z, 1.0)
     inverse = 1.0 / z
     j00, j01, j02, j10, j11, j12, tx, ty = _jacobian(camera, x, y, inverse)
     a0, a1, a2 = _to_world(camera, j00, j01, j02)
     b0, b1, b2 = _to_world(camera, j10, j11, j12)
-    qw, qx, qy, qz, by_norm, r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(quats, g, seen)
+    qw, qx, qy, qz, by_norm, r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(quats, g, visible)
     f0, f1, f2, f3, f4, f5 = _turned(a0, a1, a2, b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    t0, t1, t2, t3, t4, t5 = load_factors(g_factors, m, seen)
+    t0, t1, t2, t3, t4, t5 = load_factors(g_factors, m, visible)
     put(d_scales + g * 3, t0 * f0 + t3 * f3, inside, ADD)
     put(d_scales + g * 3 + 1, t1 * f1 + t4 * f4, inside, ADD)
     put(d_scales + g * 3 + 2, t2 * f2 + t5 * f5, inside, ADD)
-    s0 = tl.load(scales + g * 3, mask=seen, other=0.0)
-    s1 = tl.load(scales + g * 3 + 1, mask=seen, other=0.0)
-    s2 = tl.load(scales + g * 3 + 2, mask=seen, other=0.0)
+    s0 = tl.load(scales + g * 3, mask=visible, other=0.0)
+    s1 = tl.load(scales + g * 3 + 1, mask=visible, other=0.0)
+    s2 = tl.load(scales + g * 3 + 2, mask=visible, other=0.0)
     t0, t1, t2, t3, t4, t5 = t0 * s0, t1 * s1, t2 * s2, t3 * s0, t4 * s1, t5 * s2
     dw, dx, dy, dz = _quaternion_gradient(qw, qx, qy, qz, by_norm, a0, a1, a2, b0, b1, b2, t0, t1, t2, t3, t4, t5)
     put(d_quats + g * 4, dw, inside, ADD)
@@ -368,22 +371,22 @@ def footprint_gradients(
     put(d_quats + g * 4 + 2, dy, inside, ADD)
     put(d_quats + g * 4 + 3, dz, inside, ADD)
     u0, u1, u2, v0, v1, v2 = _turned_back(t0, t1, t2, t3, t4, t5, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    g_u = tl.load(g_means2d + m * 2, mask=seen, other=0.0)
-    g_v = tl.load(g_means2d + m * 2 + 1, mask=seen, other=0.0)
-    g_depth = tl.load(g_depths + m, mask=seen, other=0.0)
+    g_u = tl.load(g_means2d + m * 2, mask=visible, other=0.0)
+    g_v = tl.load(g_means2d + m * 2 + 1, mask=visible, other=0.0)
+    g_depth = tl.load(g_depths + m, mask=visible, other=0.0)
     gx, gy, gz, h00, h01, h02, h10, h11, h12 = _point_gradient(
         camera, x, y, z, u0, u1, u2, v0, v1, v2, g_u, g_v, g_depth
     )
     wx, wy, wz = gx * 0.0, gx * 0.0, gx * 0.0
     if BANDS > 0:
         wx, wy, wz = _color_gradients(
-            camera, mx, my, mz, colors, g, seen, g_rgb, m, d_colors, inside, BANDS, WITH_COLORS, ADD
+            camera, mx, my, mz, colors, g, visible, g_rgb, m, d_colors, inside, BANDS, WITH_COLORS, ADD
         )
     px, py, pz = _to_world(camera, gx, gy, gz)
-    put(d_means + g * 3, tl.where(seen, px + wx, 0.0), inside, ADD)
-    put(d_means + g * 3 + 1, tl.where(seen, py + wy, 0.0), inside, ADD)
-    put(d_means + g * 3 + 2, tl.where(seen, pz + wz, 0.0), inside, ADD)
-    alpha = tl.load(g_alphas + m, mask=seen, other=0.0)
+    put(d_means + g * 3, tl.where(visible, px + wx, 0.0), inside, ADD)
+    put(d_means + g * 3 + 1, tl.where(visible, py + wy, 0.0), inside, ADD)
+    put(d_means + g * 3 + 2, tl.where(visible, pz + wz, 0.0), inside, ADD)
+    alpha = tl.load(g_alphas + m, mask=visible, other=0.0)
     view = 0
     while view < views:  # each has its own opacities, or all have one
         own = (views == 1) | (view == c)
@@ -391,19 +394,19 @@ def footprint_gradients(
         view += 1
     if WITH_CAMERA:
         out = totals + b * 21
-        _pose_totals(out, 0, camera, gx, j00, j10, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, seen)
-        _pose_totals(out, 1, camera, gy, j01, j11, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, seen)
-        _pose_totals(out, 2, camera, gz, j02, j12, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, seen)
+        _pose_totals(out, 0, camera, gx, j00, j10, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, visible)
+        _pose_totals(out, 1, camera, gy, j01, j11, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, visible)
+        _pose_totals(out, 2, camera, gz, j02, j12, mx, my, mz, u0, u1, u2, v0, v1, v2, wx, wy, wz, visible)
         u = (tl.load(camera + 12) * x + tl.load(camera + 13) * y) * inverse + tl.load(camera + 14)
         v = (tl.load(camera + 15) * x + tl.load(camera + 16) * y) * inverse + tl.load(camera + 17)
         g_u, g_v, g_w = g_u * inverse, g_v * inverse, -(g_u * u + g_v * v) * inverse
         by_x, by_y = _limit_gradients(camera, x, y, inverse, h02, h12)
-        _total(out + 12, g_u * x + (h00 - h02 * tx) * inverse + by_x * tx, seen)
-        _total(out + 13, g_u * y + (h01 - h02 * ty) * inverse, seen)
-        _total(out + 14, g_u * z + by_x, seen)
-        _total(out + 15, g_v * x + (h10 - h12 * tx) * inverse, seen)
-        _total(out + 16, g_v * y + (h11 - h12 * ty) * inverse + by_y * ty, seen)
-        _total(out + 17, g_v * z + by_y, seen)
-        _total(out + 18, g_w * x, seen)
-        _total(out + 19, g_w * y, seen)
-        _total(out + 20, g_w * z, seen)
+        _total(out + 12, g_u * x + (h00 - h02 * tx) * inverse + by_x * tx, visible)
+        _total(out + 13, g_u * y + (h01 - h02 * ty) * inverse, visible)
+        _total(out + 14, g_u * z + by_x, visible)
+        _total(out + 15, g_v * x + (h10 - h12 * tx) * inverse, visible)
+        _total(out + 16, g_v * y + (h11 - h12 * ty) * inverse + by_y * ty, visible)
+        _total(out + 17, g_v * z + by_y, visible)
+        _total(out + 18, g_w * x, visible)
+        _total(out + 19, g_w * y, visible)
+        _total(out + 20, g_w * z, visible)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from kgs.bench.study.rivals import opacity_l1
+from kgs.study.rivals import opacity_l1
 
 
 def test_weights_are_mid_ranks():

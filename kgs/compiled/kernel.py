@@ -1,5 +1,6 @@
 """What all kernels share: how they are compiled, constants, scratch memory, 2^x."""
 
+import functools
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,18 +17,24 @@ ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
 _LARGEST = np.finfo(np.float32).max
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # without nnan and ninf: see `is_finite`
-_FILES = sorted([Path(__file__), *Path(__file__).parent.glob("*_kernels.py")])
-_SOURCES = sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()
+
+
+@functools.cache
+def _hash_of_kernels(folder: Path) -> str:
+    """A hash of this file and of all kernels of a folder, which contain each other's code."""
+    files = [Path(__file__), *sorted(folder.glob("*_kernels.py"))]
+    return sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
 def _cached(**options: Any) -> Callable[[Any], Any]:
-    """Numba's decorator; cached on the disk until any file of kernels changes: they contain each other's code."""
+    """Numba's decorator. Compiled code stays on the disk until this file or a kernel beside it changes."""
 
     def decorate(function: Any) -> Any:
         kernel = nb.njit(nogil=True, cache=True, error_model="numpy", **options)(function)
         with suppress(AttributeError):  # without compiling (NUMBA_DISABLE_JIT) there is no cache
             file = kernel._cache._cache_file
-            file._source_stamp = file._source_stamp, _SOURCES
+            sources = _hash_of_kernels(Path(function.__code__.co_filename).parent)
+            file._source_stamp = file._source_stamp, sources
         return kernel
 
     return decorate

@@ -16,6 +16,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from kgs.backends.row_slices import row_slices
 from kgs.covariance import variances
 from kgs.projection import cut_squared
 from kgs.types import ProjectedGaussians, RasterOptions
@@ -81,16 +82,20 @@ class TileCoverage:
     def __init__(
         self, projected: ProjectedGaussians, tile_size: int, alpha_threshold: float, max_spans: int = 2**40
     ) -> None:
-        height, self._width = projected.image_size
-        self.tile_size, self.grid = tile_size, (-(-height // tile_size), -(-self._width // tile_size))
+        height, width = projected.image_size
+        self.tile_size = tile_size
+        self.grid = (-(-height // tile_size), -(-width // tile_size))
         self.total_rows = projected.num_cameras * self.grid[0]
+        self._width = width
         xx, xy, yy, det = variances(projected.factors, projected.eps2d)
         cut = torch.where(xx + yy < torch.inf, cut_squared(projected.opacities, alpha_threshold), -torch.inf)
         half_height = (cut.clamp_min(0.0) * yy).sqrt()
         x, y = projected.means2d.unbind(1)
-        top, bottom = torch.ceil(y - half_height).clamp(0, height), torch.floor(y + half_height).clamp(-1, height - 1)
+        top = torch.ceil(y - half_height).clamp(0, height)
+        bottom = torch.floor(y + half_height).clamp(-1, height - 1)
         ids = ((cut > 0) & (bottom >= top)).nonzero()[:, 0]
-        self.ids = ids = ids.index_select(0, projected.depths.index_select(0, ids).argsort(stable=True))
+        ids = ids.index_select(0, projected.depths.index_select(0, ids).argsort(stable=True))
+        self.ids = ids
         self._camera_row = projected.camera_ids.index_select(0, ids).int().mul_(self.grid[0])
         self._first_row = (top.index_select(0, ids) / tile_size).floor().int()
         self._num_rows = (bottom.index_select(0, ids) / tile_size).floor().int() - self._first_row + 1
@@ -102,33 +107,37 @@ class TileCoverage:
 
     def _count(self, max_spans: int) -> None:
         """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
-        ends, n = torch.cumsum(self._num_rows, 0), self.ids.shape[0]
+        n = self.ids.shape[0]
+        ends = torch.cumsum(self._num_rows, 0)
         self.num_spans = int(ends[-1]) if n else 0
-        self._all: Spans | None = None
+        self._all_spans: Spans | None = None
         cuts = range(max_spans, self.num_spans, max_spans)
         inner = torch.searchsorted(ends, ends.new_tensor(cuts)).tolist() if cuts else []
         bounds = [0, *sorted(set(inner) - {0, n}), n]
-        per_row = ends.new_zeros(2, self.total_rows)  # spans, entries
-        up_to = []
+        counts_per_row = ends.new_zeros(2, self.total_rows)  # spans, entries
+        entries_up_to = []
         for low, high in pairwise(bounds):
             spans = self.spans(0, self.total_rows, low, high)
             last_spans = ends[low:high] - 1 - (ends[low - 1] if low else 0)
-            up_to.append(torch.cumsum(spans.counts, 0).index_select(0, last_spans) + per_row[1].sum())
+            entries_before = counts_per_row[1].sum()
+            entries_up_to.append(torch.cumsum(spans.counts, 0).index_select(0, last_spans) + entries_before)
             added = torch.stack([torch.ones_like(spans.counts), spans.counts]).long()
-            per_row.index_add_(1, spans.rows, added)
-            self._all = spans if len(bounds) == 2 else None
-        self._entries_up_to = torch.cat(up_to)
-        self.spans_per_row, self.entries_per_row = per_row.tolist()
+            counts_per_row.index_add_(1, spans.rows, added)
+            self._all_spans = spans if len(bounds) == 2 else None
+        self._entries_up_to = torch.cat(entries_up_to)
+        self.spans_per_row, self.entries_per_row = counts_per_row.tolist()
         self.num_entries = sum(self.entries_per_row)
 
     def row_slices(self, max_bytes: int, per_span: int, per_entry: int) -> list[tuple[int, int]]:
         """Consecutive rows whose spans and entries take at most `max_bytes` together; an error where one takes more."""
         counts = zip(self.spans_per_row, self.entries_per_row, strict=True)
-        return row_slices([spans * per_span + entries * per_entry for spans, entries in counts], max_bytes)
+        row_bytes = [spans * per_span + entries * per_entry for spans, entries in counts]
+        return row_slices(row_bytes, max_bytes)
 
     def depth_slices(self, layers: int) -> list[tuple[int, int]]:
         """Consecutive ranges of `ids`, nearest first, of about `layers` entries per tile each."""
-        n, count = self.ids.shape[0], round(self.num_entries / max(1, layers * self.total_rows * self.grid[1]))
+        n = self.ids.shape[0]
+        count = round(self.num_entries / max(1, layers * self.total_rows * self.grid[1]))
         if count <= 1:
             return [(0, n)]
         targets = torch.arange(1, count, device=self.ids.device) * (self.num_entries // count)
@@ -137,12 +146,16 @@ class TileCoverage:
 
     def spans(self, begin: int, end: int, low: int = 0, high: int | None = None) -> Spans:
         """The spans of the Gaussians `ids[low:high]` in the rows `begin` to `end` (exclusive)."""
-        if (begin, end, low, high) == (0, self.total_rows, 0, None) and self._all is not None:
-            return self._all
-        camera_row, first_row, num_rows = (x[low:high] for x in (self._camera_row, self._first_row, self._num_rows))
+        if (begin, end, low, high) == (0, self.total_rows, 0, None) and self._all_spans is not None:
+            return self._all_spans
+        camera_row = self._camera_row[low:high]
+        first_row = self._first_row[low:high]
+        num_rows = self._num_rows[low:high]
         if (begin, end) != (0, self.total_rows):
-            first, last = ((camera_row + first_row + count).clamp_(begin, end) for count in (0, num_rows))
-            first_row, num_rows = first - camera_row, last - first
+            first = (camera_row + first_row).clamp_(begin, end)
+            last = (camera_row + first_row + num_rows).clamp_(begin, end)
+            first_row = first - camera_row
+            num_rows = last - first
         ranks = torch.repeat_interleave(_arange(num_rows), num_rows, output_size=int(num_rows.sum(dtype=torch.int64)))
         start = torch.cumsum(num_rows, 0, dtype=torch.int32) - num_rows
         rows = _arange(ranks) + (first_row - start).index_select(0, ranks)
@@ -179,7 +192,8 @@ class TileCoverage:
             cuts = torch.searchsorted(spans.ranks, torch.tensor([low, high], device=self.ids.device)).tolist()
             spans = spans.take(slice(*cuts))
             size = int(spans.counts.sum(dtype=torch.int64))
-        columns, counts = self.grid[1], spans.counts
+        columns = self.grid[1]
+        counts = spans.counts
         # in the order of the Gaussians: entry e of a span is tile (row, first + e)
         start = torch.cumsum(counts, 0, dtype=torch.int32) - counts
         span = torch.repeat_interleave(_arange(counts), counts, output_size=size)
@@ -187,32 +201,13 @@ class TileCoverage:
         entries = (spans.ranks - low).index_select(0, span)
         if live is not None:
             inside = live.index_select(0, tiles).nonzero()[:, 0]
-            tiles, entries = tiles.index_select(0, inside), entries.index_select(0, inside)
+            tiles = tiles.index_select(0, inside)
+            entries = entries.index_select(0, inside)
         num_tiles = (end - begin) * columns
         keys, order = torch.sort(tiles.short() if num_tiles < 2**15 else tiles, stable=True)
         offsets = torch.searchsorted(keys, torch.arange(num_tiles + 1, dtype=keys.dtype, device=keys.device))
-        entries, ids = entries.index_select(0, order), self.ids[low:high]
-        return TileLists(self.tile_size, self.grid, begin * columns, offsets, entries, ids, order)
-
-
-def row_slices(needs: list[int], max_bytes: int) -> list[tuple[int, int]]:
-    """Consecutive rows of tiles that need at most `max_bytes` together; an error where one needs more."""
-    slices, begin, total = [], 0, 0
-    for row, need in enumerate(needs):
-        check_fits(need, max_bytes)
-        if total + need > max_bytes:
-            slices.append((begin, row))
-            begin, total = row, 0
-        total += need
-    return [*slices, (begin, len(needs))]
-
-
-def check_fits(need: int, max_bytes: int) -> None:
-    """Raise a ValueError where one row of tiles needs more than `max_bytes`."""
-    if need > max_bytes:
-        got = f"expected at least that, got {max_bytes} for it"
-        ways = "raise max_bytes, or render fewer or smaller Gaussians"
-        raise ValueError(f"max_bytes: one row of tiles needs {need} bytes, {got}; {ways}")
+        entries = entries.index_select(0, order)
+        return TileLists(self.tile_size, self.grid, begin * columns, offsets, entries, self.ids[low:high], order)
 
 
 def bin_to_tiles(

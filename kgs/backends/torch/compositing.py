@@ -1,7 +1,7 @@
-"""Compositing in torch, for every device and dtype; formulas as in `kgs.raster`.
+"""Compositing in torch, for every device and dtype; the formulas are in `kgs.backends.torch`.
 
 Tiles are the last dimension of all tensors here, and P the pixels of a tile: an operator works on the same pixel of
-many tiles side by side. A row slice is drawn in depth slices; within one, tiles are sorted by the length of their lists
+many tiles side by side. A row slice is made of depth slices; within one, tiles are sorted by the length of their lists
 and cut into steps: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
 
 There are no matrix products: torch may round them (`torch.set_float32_matmul_precision`, `torch.autocast`), and the
@@ -19,8 +19,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.covariance import footprint_table, moment_gradients
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.types import RasterOptions
 
 from .binning import TileCoverage, TileLists
 
@@ -42,61 +43,63 @@ _LEAST_LAYERS = 8  # of a step with many tiles
 _ARRAYS = 9  # numbers per pair that a step holds at the same time
 
 
-class TorchCompositing:
-    """A compositor for every device and dtype, see `kgs.backends.base.Compositor`."""
+class TorchCompositor(Compositor):
+    """Compositing on every device and in every dtype."""
 
-    def __init__(
-        self,
-        projected: ProjectedGaussians,
-        features: Tensor,
-        options: RasterOptions,
-        median_depth: bool,
-        chunk_size: int | None,
-    ) -> None:
+    def __init__(self, call: CompositingCall) -> None:
+        projected = call.projected
+        features = call.features
+        options = call.options
         self._settings = SETTINGS.get(features.device.type, SETTINGS["cuda"])
-        tile_size, number = options.tile_size or 8, features.element_size()
+        tile_size = options.tile_size or 8
+        number = features.element_size()
         arrays = _ARRAYS + 3 * options.absgrad
         step_bytes = min(self._settings.pairs * arrays * number, options.max_bytes // 4)
         budget = options.max_bytes - step_bytes
         # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved T
         width = 8 + 2 * features.shape[1] + 4 * options.absgrad + tile_size**2 // 8
-        per_span, per_entry = 32 + 16 * number, 80 + width * number
-        self._coverage = TileCoverage(
-            projected, tile_size, options.alpha_threshold, max(2**12, budget // (2 * per_span))
-        )
+        per_span = 32 + 16 * number
+        per_entry = 80 + width * number
+        max_spans = max(2**12, budget // (2 * per_span))
+        self._coverage = TileCoverage(projected, tile_size, options.alpha_threshold, max_spans)
         self._row_slices = self._coverage.row_slices(budget, per_span, per_entry)
         self._depth_slices = self._coverage.depth_slices(self._settings.layers)
         lists_bytes = per_entry * self._coverage.num_entries + per_span * self._coverage.num_spans // 4
         self._spare = budget - lists_bytes if len(self._row_slices) == 1 else 0  # to keep alphas
-        self._image_size, self._eps2d = projected.image_size, projected.eps2d
-        self._depths = projected.depths.detach() if median_depth else None
-        self._cut = Cut(step_bytes // (arrays * number), chunk_size)
-        self._thresholds, self._absgrad = Thresholds.of(options, features.dtype), options.absgrad
+        self._image_size = projected.image_size
+        self._eps2d = projected.eps2d
+        self._depths = projected.depths.detach() if call.median_depth else None
+        self._cut = Cut(step_bytes // (arrays * number), call.chunk_size)
+        self._thresholds = Thresholds.of(options, features.dtype)
+        self._absgrad = options.absgrad
 
-    def forward(self, inputs: tuple[Tensor, ...], keep: bool) -> tuple[tuple[Tensor, Tensor, Tensor], Any]:
-        """See `Compositor`: one row slice is kept, several are computed again."""
+    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
+        """See `Compositor`. One row slice is kept, several are computed again."""
         keep = keep and len(self._row_slices) == 1
-        canvases, kept = zip(*(self._draw(inputs, rows, keep) for rows in self._row_slices), strict=True)
-        transmittance, median, features = (torch.cat(x, 2) for x in zip(*canvases, strict=True))
-        grid, size = self._coverage.grid, self._image_size
+        results = [self._composite_rows(inputs, rows, keep) for rows in self._row_slices]
+        canvases = [canvas for canvas, _ in results]
+        transmittance, median, features = (torch.cat(parts, 2) for parts in zip(*canvases, strict=True))
+        grid = self._coverage.grid
+        size = self._image_size
         images = (to_images(features, grid, size), to_images(transmittance, grid, size), to_images(median, grid, size))
-        return images, kept[0] if keep else None
+        return images, results[0][1] if keep else None
 
     def backward(
         self,
-        inputs: tuple[Tensor, ...],
+        inputs: CompositingInputs,
         kept: Any,
         grad_features: Tensor,
         grad_transmittance: Tensor,
         needs: tuple[bool, ...],
-    ) -> tuple[Tensor | None, ...]:
+    ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
         """See `Compositor`."""
         coverage = self._coverage
-        grads, behind = (to_tiles(x, coverage.grid, coverage.tile_size) for x in (grad_features, grad_transmittance))
+        grads = to_tiles(grad_features, coverage.grid, coverage.tile_size)
+        behind = to_tiles(grad_transmittance, coverage.grid, coverage.tile_size)
         wanted = Wanted(any(needs[:3]), self._absgrad and needs[0], needs[3])
         total = grads.new_zeros(coverage.ids.shape[0], wanted.columns(grads.shape[0]))  # of each Gaussian
         for begin, end in self._row_slices:
-            transmittance, slices = self._draw(inputs, (begin, end), keep=True)[1] if kept is None else kept
+            transmittance, slices = self._composite_rows(inputs, (begin, end), keep=True)[1] if kept is None else kept
             kept = None
             tiles = slice(begin * coverage.grid[1], end * coverage.grid[1])
             later = torch.where(transmittance[0] > 0, behind[0, :, tiles], 0.0)
@@ -104,41 +107,51 @@ class TorchCompositing:
                 (low, high), part = slices.pop()
                 total[low:high] += part.differentiate(grads[:, :, tiles], later, wanted)
         moments, absolute, features = total.split(wanted.widths(grads.shape[0]), 1)
-        found: tuple[Tensor | None, ...] = (None, None, None, features, absolute)
+        gradients: tuple[Tensor | None, ...] = (None, None, None, features)
         if wanted.moments:
-            factors, opacities = (x.index_select(0, coverage.ids) for x in inputs[1:3])
-            found = (*moment_gradients(moments, factors, opacities, self._eps2d), features, absolute)
+            factors = inputs.factors.index_select(0, coverage.ids)
+            opacities = inputs.opacities.index_select(0, coverage.ids)
+            gradients = (*moment_gradients(moments, factors, opacities, self._eps2d), features)
 
-        def of_all(value: Tensor) -> Tensor:
-            return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
+        def spread(value: Tensor) -> Tensor:
+            """From the Gaussians that reach a tile to all, 0 for the others."""
+            return value.new_zeros(inputs.means2d.shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
 
-        needs = (*needs, wanted.absolute)
-        return tuple(of_all(x) if needed and x is not None else None for x, needed in zip(found, needs, strict=True))
+        needed = zip(gradients, needs, strict=True)
+        return (
+            tuple(spread(x) if need and x is not None else None for x, need in needed),
+            spread(absolute) if wanted.absolute else None,
+        )
 
-    def _draw(self, inputs: tuple[Tensor, ...], rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
+    def _composite_rows(self, inputs: CompositingInputs, rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
         """A row slice, one depth slice after the other until all pixels are opaque, and what `backward` needs."""
-        coverage, spare, live = self._coverage, self._spare, None
-        tiles, pixels = (rows[1] - rows[0]) * coverage.grid[1], coverage.tile_size**2
-        widths = (0 if self._depths is None else 1, inputs[3].shape[1])
-        median, features = (inputs[0].new_zeros(width, pixels, tiles) for width in widths)
-        canvas = (inputs[0].new_ones(1, pixels, tiles), median, features)
+        coverage = self._coverage
+        tiles = (rows[1] - rows[0]) * coverage.grid[1]
+        pixels = coverage.tile_size**2
+        like = inputs.means2d
+        transmittance = like.new_ones(1, pixels, tiles)
+        median = like.new_zeros(0 if self._depths is None else 1, pixels, tiles)
+        features = like.new_zeros(inputs.features.shape[1], pixels, tiles)
+        canvas = (transmittance, median, features)
         spans = coverage.spans(*rows)
+        spare = self._spare
+        live = None
         slices: list[tuple[tuple[int, int], DepthSlice]] = []
         for ranks in self._depth_slices:
             lists = coverage.lists(spans, *rows, ranks, live)
             part = DepthSlice(lists, self._gaussians(inputs, lists.ids), self._thresholds, self._settings, self._cut)
             keep_alphas = keep and part.alpha_bytes <= spare
             spare -= part.alpha_bytes * keep_alphas
-            part.draw(canvas, keep, keep_alphas)
+            part.composite(canvas, keep, keep_alphas)
             if keep:
                 slices.append((ranks, part))
             if ranks != self._depth_slices[-1]:
-                live = (canvas[0][0] > 0).any(0)
+                live = (transmittance[0] > 0).any(0)
                 if not bool(live.any()):
                     break
-        return canvas, (canvas[0], slices) if keep else None
+        return canvas, (transmittance, slices) if keep else None
 
-    def _gaussians(self, inputs: tuple[Tensor, ...], ids: Tensor) -> "Columns":
+    def _gaussians(self, inputs: CompositingInputs, ids: Tensor) -> "Columns":
         """What steps need of some Gaussians, followed by a dummy that is never seen."""
         means2d, factors, opacities, features = (x.index_select(0, ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self._eps2d), (0, 1))
@@ -187,7 +200,8 @@ class Thresholds:
     @classmethod
     def of(cls, options: RasterOptions, dtype: torch.dtype) -> "Thresholds":
         """Those of `kgs.RasterOptions`."""
-        threshold, stop = options.alpha_threshold, options.transmittance_stop
+        threshold = options.alpha_threshold
+        stop = options.transmittance_stop
         floor = math.log(threshold) - 20 if threshold else math.log(torch.finfo(dtype).tiny) + 8
         alpha = _below(max(threshold, 1.01 * math.exp(floor)), dtype)
         return cls(floor, alpha, _below(stop, dtype) if stop else -1.0)
@@ -217,7 +231,8 @@ class Cut:
         most_tiles = max(1, self.pairs // (pixels * (self.layers or _LEAST_LAYERS)))
         steps = []
         for begin in range(0, len(lengths), most_tiles):
-            end, first = min(begin + most_tiles, len(lengths)), 0
+            end = min(begin + most_tiles, len(lengths))
+            first = 0
             while first < lengths[begin]:
                 while lengths[end - 1] <= first:
                     end -= 1
@@ -236,26 +251,32 @@ class DepthSlice:
     def __init__(
         self, lists: TileLists, gaussians: Columns, thresholds: Thresholds, settings: DeviceSettings, cut: Cut
     ) -> None:
-        self.lists, self._gaussians, self._thresholds, self._settings = lists, gaussians, thresholds, settings
+        self.lists = lists
+        self._gaussians = gaussians
+        self._thresholds = thresholds
+        self._settings = settings
         # Sums along the layers of a GPU are not deterministic for torch
         self._by_layer = settings.by_layer or torch.are_deterministic_algorithms_enabled()
         lengths, order = torch.sort(lists.offsets.diff(), descending=True, stable=True)
         counts = [length for length in lengths.tolist() if length > 0]
         self._tiles = order[: len(counts)]
-        self._starts, self._ends = (x.index_select(0, self._tiles) for x in (lists.offsets[:-1], lists.offsets[1:]))
-        self._steps = cut(counts, lists.tile_size**2)
-        pairs = lists.tile_size**2 * sum(s.layers * (s.tiles.stop - s.tiles.start) for s in self._steps)
+        self._starts = lists.offsets[:-1].index_select(0, self._tiles)
+        self._ends = lists.offsets[1:].index_select(0, self._tiles)
+        pixels = lists.tile_size**2
+        self._steps = cut(counts, pixels)
+        pairs = pixels * sum(step.layers * (step.tiles.stop - step.tiles.start) for step in self._steps)
         self.alpha_bytes = pairs * gaussians.table.element_size()  # to keep all alphas
         self._entries = F.pad(lists.entries, (0, 1), value=lists.ids.shape[0])
         # coordinates of the columns and rows of pixels of each tile, (side, tiles)
-        tile, side = self._tiles + lists.first_tile, torch.arange(lists.tile_size, device=order.device)
+        tile = self._tiles + lists.first_tile
+        side = torch.arange(lists.tile_size, device=order.device)
         row = torch.div(tile, lists.grid[1], rounding_mode="floor")
         corner = torch.stack([tile - row * lists.grid[1], row % lists.grid[0]]) * lists.tile_size
         self._columns, self._rows = (corner[:, None] + side[:, None]).to(gaussians.table.dtype)
         self._clamps = self._may(gaussians.table[0] > math.log(ALPHA_MAX))
 
-    def draw(self, canvas: Canvas, keep: bool, keep_alphas: bool) -> None:
-        """Add the layers to the tiles of a canvas, front to back."""
+    def composite(self, canvas: Canvas, keep: bool, keep_alphas: bool) -> None:
+        """Add the layers to the tiles of a canvas, front to back; with `keep` each step keeps what `backward` needs."""
         state = [x.index_select(2, self._tiles) for x in canvas]
         for step in self._steps:
             transmittance, median, features = (x[:, :, step.tiles] for x in state)
@@ -266,7 +287,9 @@ class DepthSlice:
             if ended:  # T never grows, so cutting afterwards is cutting at each layer
                 F.threshold(layers, self._thresholds.transmittance, 0.0, inplace=True)
             if keep:
-                step.before, step.alpha, step.ended = transmittance[0].clone(), alpha if keep_alphas else None, ended
+                step.before = transmittance[0].clone()
+                step.alpha = alpha if keep_alphas else None
+                step.ended = ended
             if self._gaussians.depths is not None:
                 crossing = (layers[:-1] >= 0.5) & (layers[1:] < 0.5)
                 depths = self._gaussians.depths.index_select(0, ids.view(-1)).view_as(ids)
@@ -282,30 +305,32 @@ class DepthSlice:
         `grads` are dL/d features of the pixels, `(F, P, T)`. `behind` is V behind the last layer, `(P, T)`, and becomes
         V before the first.
         """
-        lists, width = self.lists, wanted.columns(grads.shape[0])
-        own_grads, own_behind = grads.index_select(2, self._tiles), behind.index_select(1, self._tiles)
+        lists = self.lists
+        width = wanted.columns(grads.shape[0])
+        own_grads = grads.index_select(2, self._tiles)
+        own_behind = behind.index_select(1, self._tiles)
         rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
         while self._steps:
             step = self._steps.pop()  # whose memory is free afterwards
             positions, ids = self._entries_of(step)
             pixels = own_grads[:, :, step.tiles]
-            found = self._step_gradients(step, ids, pixels, own_behind[:, step.tiles], wanted)
-            rows.index_copy_(0, positions.view(-1), torch.stack(found, -1).view(-1, width))
+            sums = self._step_sums(step, ids, pixels, own_behind[:, step.tiles], wanted)
+            rows.index_copy_(0, positions.view(-1), torch.stack(sums, -1).view(-1, width))
         behind.index_copy_(1, self._tiles, own_behind)
         # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
         return F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
-    def _step_gradients(self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
+    def _step_sums(self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
         """What is wanted of the entries of a step, each `(K, n)`; `behind` moves before the step."""
         table, dx, dy = self._offsets(step, ids)
         alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
         assert step.before is not None
         transmittance = self._transmittances(alpha, step.before)
-        if step.ended:  # nothing is seen behind the stop
+        if step.ended:  # nothing counts behind the stop
             F.threshold(transmittance, self._thresholds.transmittance, 0.0, inplace=True)
             alpha.mul_(transmittance[:-1].sign())
         weights = alpha * transmittance[:-1]
-        found = []
+        sums = []
         if wanted.moments:
             value = torch.zeros_like(alpha)  # c . g
             for color, grad in zip(self._features(ids), grads, strict=True):
@@ -316,11 +341,11 @@ class DepthSlice:
             if self._clamps:  # no derivative where alpha is held at its maximum
                 value.mul_((ALPHA_MAX - alpha).sign_())
             absolute = _absolute(value, table, dx, dy) if wanted.absolute else []
-            found += _moments(value, dx, dy) + absolute
+            sums += _moments(value, dx, dy) + absolute
         if wanted.features:
             product = torch.empty_like(weights)
-            found += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
-        return found
+            sums += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
+        return sums
 
     def _entries_of(self, step: Step) -> tuple[Tensor, Tensor]:
         """Where the entries of a step are in the lists, and their Gaussians, `(K, n)`; beyond a list the dummy."""
@@ -376,8 +401,9 @@ class DepthSlice:
         """V of each layer and behind the last, `(K + 1, P, n)`."""
         if not self._by_layer:
             # what comes from behind a layer over the transmittance there; both are 0 behind the stop
-            seen = torch.cat([weights * value, (transmittance[-1] * behind)[None]])
-            return seen.flip(0).cumsum_(0).flip(0).div_(transmittance.clamp_(min=torch.finfo(transmittance.dtype).tiny))
+            contributions = torch.cat([weights * value, (transmittance[-1] * behind)[None]])
+            behind_each = contributions.flip(0).cumsum_(0).flip(0)
+            return behind_each.div_(transmittance.clamp_(min=torch.finfo(transmittance.dtype).tiny))
         later = torch.empty_like(transmittance)
         layers = later.unbind(0)
         layers[-1].copy_(behind)
@@ -396,9 +422,11 @@ def _moments(slope: Tensor, dx: Tensor, dy: Tensor) -> list[Tensor]:
     `slope` is overwritten.
     """
     square = slope.unflatten(1, (dy.shape[1], dx.shape[1]))
-    columns, rows = square.sum(1), square.sum(2)
+    columns = square.sum(1)
+    rows = square.sum(2)
     turning = square.mul_(dx[:, None]).sum(2)
-    x, y = columns * dx, rows * dy
+    x = columns * dx
+    y = rows * dy
     return [columns.sum(1), x.sum(1), y.sum(1), (x * dx).sum(1), (turning * dy).sum(1), (y * dy).sum(1)]
 
 
@@ -414,15 +442,19 @@ def _absolute(slope: Tensor, table: Tensor, dx: Tensor, dy: Tensor) -> list[Tens
 
 def to_images(tiles: Tensor, grid: tuple[int, int], image_size: tuple[int, int]) -> Tensor:
     """`(F, P, C * rows * columns)` to `(C, F, H, W)`."""
-    (rows, columns), side, (height, width) = grid, math.isqrt(tiles.shape[1]), image_size
-    channels, cameras = tiles.shape[0], tiles.shape[2] // (rows * columns)
+    rows, columns = grid
+    height, width = image_size
+    side = math.isqrt(tiles.shape[1])
+    channels = tiles.shape[0]
+    cameras = tiles.shape[2] // (rows * columns)
     images = tiles.view(channels, side, side, cameras, rows, columns).permute(3, 0, 4, 1, 5, 2)
     return images.reshape(cameras, channels, rows * side, columns * side)[:, :, :height, :width].clone()
 
 
 def to_tiles(images: Tensor, grid: tuple[int, int], side: int) -> Tensor:
     """The inverse of `to_images`; pixels beyond the image are 0."""
-    (rows, columns), (cameras, channels, height, width) = grid, images.shape
+    rows, columns = grid
+    cameras, channels, height, width = images.shape
     images = F.pad(images, (0, columns * side - width, 0, rows * side - height))
     tiles = images.view(cameras, channels, rows, side, columns, side).permute(1, 3, 5, 0, 2, 4)
     return tiles.reshape(channels, side * side, cameras * rows * columns)
