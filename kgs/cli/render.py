@@ -40,6 +40,7 @@ def render(
 
     from kgs.camera import move_camera
     from kgs.io.outputs import check_folder, png_names, write_png
+    from kgs.io.ownership import claim, record
     from kgs.machine import check_tools
 
     place = check_tools(device, backend)
@@ -49,11 +50,13 @@ def render(
     posed = [(name, scene.train.camera(i)) for i, name in enumerate(scene.train.names)]
     names = png_names(name for name, _ in posed)
     check_folder(out, names.values(), scene.root)
+    claim(out, "renders", names.values())
     outputs, behind = ("image", "alpha") if clear else ("image",), scene.background.to(place)
     for name, camera in each(posed, "pictures", "view"):
         with torch.no_grad():
             seen = renderer(model(), move_camera(camera, place), behind, outputs)
         image = torch.cat([seen.image / seen.alpha.clamp_min(1e-6), seen.alpha], 1) if clear else seen.image
         write_png(out / names[name], image[0])
+    record(out, "renders", names.values())
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))

@@ -21,7 +21,6 @@ from kgs.model import GaussianModel
 from kgs.types import check_kind
 
 from .json_files import write_whole
-from .ownership import MADE_BY
 from .ply import as_vector
 
 _EXTENSION = "KHR_gaussian_splatting"
@@ -69,7 +68,7 @@ def save_glb(
     quaternion = rotation_matrix_to_quaternion(turn)[[1, 2, 3, 0]]
     node: dict[str, Any] = {"name": "splat", "rotation": quaternion.tolist(), "translation": shift.tolist()}
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"{MADE_BY} {kgs.__version__}"},
+        "asset": {"version": "2.0", "generator": f"kgs {kgs.__version__}"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

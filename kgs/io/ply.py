@@ -23,7 +23,6 @@ from kgs.model import GaussianModel
 from kgs.types import SH_SIZES, check_kind
 
 from .json_files import write_whole
-from .ownership import MADE_BY
 
 MAX_HEADER = 1 << 16
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -67,7 +66,7 @@ def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor 
     position = "float"
     if _float32_moves(means, values["log_scales"]):
         position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
-    header = f"ply\nformat binary_little_endian 1.0\ncomment {MADE_BY}\n"
+    header = "ply\nformat binary_little_endian 1.0\n"
     header += f"comment kgs sh_degree {model.sh_degree}\nelement vertex {n}\n"
     header += "".join(f"property {position if name in 'xyz' else 'float'} {name}\n" for name in names) + "end_header\n"
     write_whole(Path(path), header.encode("ascii") + columns.tobytes())
