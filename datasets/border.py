@@ -6,12 +6,13 @@ from torch.nn.functional import avg_pool1d
 
 WIDEST = 0.02  # of the side, at least `FEWEST_LINES` pixels
 FEWEST_LINES = 3
-DARK, CLEAR = 0.8, 0.9  # of the brightness farther inside: an edge below the first is a border, up to the second
-SEEN = 0.05  # brightness next to a border; where it is darker a border cannot be told from the scene
+DARK = 0.8  # share of the brightness farther inside, below which an edge may be a border
+CLEAR = 0.9  # share of the brightness farther inside, from which on a row is no border
+FAINTEST = 0.05  # brightness next to a border; where it is darker a border cannot be told from the scene
 ALONG = 0.1  # of the side: how far the brightness is averaged along it
 
 
-def border_light(images: Tensor) -> Tensor | None:
+def border_transmittance(images: Tensor) -> Tensor | None:
     """The transmittance of each pixel of these photos, `(H, W)`: below 1 in a dark border.
 
     A border lies at the same place in all photos, whatever they show, and ends within 2 % of the width or height; its
@@ -27,23 +28,26 @@ def border_light(images: Tensor) -> Tensor | None:
     if len(images) < 2:
         return None
     bright = images.detach().float().amax(dim=1)
-    light = torch.ones(bright.shape[1:], dtype=torch.float32, device=bright.device)
+    transmittance = torch.ones(bright.shape[1:], dtype=torch.float32, device=bright.device)
     for _ in range(4):  # each side is the top once
-        light, bright = (torch.rot90(each, 1, dims=(-2, -1)) for each in (light, bright))
-        side = _from_top(bright)
-        light[: len(side)] *= side
-    return light if bool((light < 1).any()) else None
+        bright = torch.rot90(bright, 1, dims=(-2, -1))
+        transmittance = torch.rot90(transmittance, 1, dims=(-2, -1))
+        border = _top_border(bright)
+        transmittance[: len(border)] *= border
+    return transmittance if bool((transmittance < 1).any()) else None
 
 
-def _from_top(bright: Tensor) -> Tensor:
+def _top_border(bright: Tensor) -> Tensor:
     """The transmittance `(K, W)` of the first rows of photos `(V, H, W)`; K is 0 without a border there."""
     height, width = bright.shape[1:]
     most = max(FEWEST_LINES, round(WIDEST * height))
     if height <= 2 * most:
         return bright.new_zeros(0, width)
     rows = bright.mean(dim=2)
-    outer, inside, farther = rows[:, 0], rows[:, most], rows[:, 2 * most - 1]
-    if bool(((inside < SEEN) | (outer > DARK * inside) | (inside < DARK * farther)).any()):  # in any photo
+    outer = rows[:, 0]
+    inside = rows[:, most]
+    farther = rows[:, 2 * most - 1]
+    if bool(((inside < FAINTEST) | (outer > DARK * inside) | (inside < DARK * farther)).any()):  # in any photo
         return bright.new_zeros(0, width)
     half = int(ALONG * width) // 2
     sums = avg_pool1d(bright[:, : 2 * most].sum(dim=0), 2 * half + 1, 1, half, count_include_pad=False)

@@ -1,6 +1,6 @@
-"""What a folder holds, as far as the names of its files tell: photos, videos, or a scene and of which layout.
+"""What a folder holds, judged by the names of its files: photos, videos, or a scene and its layout.
 
-Loads neither NumPy nor torch, so that the command can tell at once what is wrong with a folder.
+Loads neither NumPy nor torch, so that the command reports a wrong folder at once.
 """
 
 import os
@@ -13,6 +13,21 @@ HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
 UNREADABLE_SUFFIXES = (*_RAW, *HEIC_SUFFIXES, ".avif", ".gif", ".jxl", ".jp2", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
+# What says where the cameras of a scene are, in the order in which it is looked for; a COLMAP model comes second.
+LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", "nerfstudio": "transforms.json"}
+_NOT_READ = {
+    "reconstruction.json": "OpenSfM",
+    "cameras.sfm": "Meshroom",
+    "cameras.xml": "Metashape",
+    "bundle.out": "Bundler",
+}
+_MISSPELLED = {
+    "transform.json": "transforms.json",
+    "transform_train.json": "transforms_train.json",
+    "transform_test.json": "transforms_test.json",
+}
+_MASK_FOLDERS = ("masks", "mask")
+_MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
 _TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
@@ -20,20 +35,14 @@ _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
 @cache
-def has_pillow() -> bool:
-    """Whether Pillow is installed."""
-    return find_spec("PIL") is not None
-
-
-@cache
 def has_heic() -> bool:
-    """Whether HEIC can be read: Pillow and pi-heif are installed."""
-    return has_pillow() and find_spec("pi_heif") is not None
+    """Whether HEIC can be read: pi-heif is installed."""
+    return find_spec("pi_heif") is not None
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """The photos of a folder, sorted by name; hidden files and other kinds of files are passed over."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    """The photos of a folder, sorted by name; hidden files, masks and other kinds of files are passed over."""
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith((".", _MASK_FILES))]
     return sorted(files, key=lambda p: p.name)
 
 
@@ -45,21 +54,65 @@ def image_folder(root: Path) -> Path | None:
     return min(reduced, key=lambda p: int(p.name.removeprefix("images_")), default=None)
 
 
-def find_model(root: Path) -> Path | None:
-    """The folder of a scene that holds a COLMAP model, `sparse/0` or `sparse`; None where there is none."""
-    files = (root / f"{folder}/images.{suffix}" for folder in ("sparse/0", "sparse") for suffix in ("bin", "txt"))
-    return next((file.parent for file in files if file.is_file()), None)
+def find_models(root: Path) -> list[Path]:
+    """The folders of a scene that hold a COLMAP model: `sparse/0`, `sparse/1` and so on, `sparse`, the scene itself.
+
+    The scene's own folder counts where photos are in it or in `images`.
+    """
+    numbered = [p for p in (root / "sparse").glob("*") if p.name.isdecimal()]
+    numbered.sort(key=lambda p: int(p.name))
+    models = [folder for folder in (*numbered, root / "sparse") if _has_model_file(folder, "images")]
+    return models + ([root] if _is_model_beside_photos(root) else [])
 
 
 def layout_of(root: Path) -> str | None:
     """The layout of a scene's folder: LLFF, COLMAP, Blender or nerfstudio; None where it is not a scene."""
-    if (root / "poses_bounds.npy").is_file():
+    models = find_models(root)
+    if (root / LAYOUT_FILES["LLFF"]).is_file():
         return "LLFF"
-    if find_model(root) is not None:
+    if models and models != [root]:
         return "COLMAP"
-    if (root / "transforms_train.json").is_file():
-        return "Blender"
-    return "nerfstudio" if (root / "transforms.json").is_file() else None
+    for layout in ("Blender", "nerfstudio"):
+        if (root / LAYOUT_FILES[layout]).is_file():
+            return layout
+    return "COLMAP" if models else None
+
+
+def _has_model_file(folder: Path, stem: str) -> bool:
+    return any((folder / f"{stem}.{suffix}").is_file() for suffix in ("bin", "txt"))
+
+
+def _is_model(folder: Path) -> bool:
+    return _has_model_file(folder, "images") and _has_model_file(folder, "cameras")
+
+
+def _is_model_beside_photos(root: Path) -> bool:
+    return _is_model(root) and (image_folder(root) is not None or bool(list_images(root)))
+
+
+def unused_files(root: Path) -> tuple[str, ...]:
+    """What a folder holds besides its layout's files that looks like cameras or masks: one sentence each."""
+    layout = layout_of(root)
+    sentences = []
+    for other, name in LAYOUT_FILES.items():
+        if other != layout and (root / name).is_file():
+            sentences.append(f"{name} is not used: the scene is read as {layout}")
+    if _is_model(root) and layout is None:
+        sentences.append("the COLMAP model is not used: expected its photos beside it or in images/")
+    if _is_model(root) and layout in ("Blender", "nerfstudio"):
+        sentences.append(f"the COLMAP model is not used: the scene is read as {layout}")
+    for name, program in _NOT_READ.items():
+        if (root / name).is_file():
+            sentences.append(f"{name} is not used: export the cameras of {program} as a COLMAP model to use them")
+    for name, right in _MISSPELLED.items():
+        if (root / name).is_file():
+            sentences.append(f"{name} is not used: expected the name {right}")
+    masks = [f"{name}/" for name in _MASK_FOLDERS if (root / name).is_dir()]
+    if any(any(folder.glob(f"{_MASK_FILES}*.png")) for folder in {root, image_folder(root) or root}):
+        masks.append(f"{_MASK_FILES}*.png")
+    if masks:
+        sentences.append(f"masks are not used yet: {', '.join(masks)}")
+    return tuple(sentences)
 
 
 def nearest_scene(root: Path) -> Path | None:
@@ -102,6 +155,10 @@ def _about_file(path: Path) -> str:
 
 
 def _about_folder(root: Path) -> str:
+    return ". ".join([_what_is_there(root), *unused_files(root)])
+
+
+def _what_is_there(root: Path) -> str:
     if folder := nearest_scene(root):
         return f"is not a scene, but {folder} is one: give that folder"
     photos = image_folder(root) or root
@@ -109,8 +166,8 @@ def _about_folder(root: Path) -> str:
         return f"has {count} photos but no camera poses: {_NO_POSES}"
     endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
     for suffixes, advice in ((UNREADABLE_SUFFIXES, _TO_CONVERT), (VIDEO_SUFFIXES, f"videos: {_NO_PHOTOS}")):
-        if found := [ending[1:].upper() for ending in endings if ending in suffixes]:
-            return f"is not a scene: it holds {len(found)} {' and '.join(sorted(set(found)))} {advice}"
+        if kinds := [ending[1:].upper() for ending in endings if ending in suffixes]:
+            return f"is not a scene: it holds {len(kinds)} {' and '.join(sorted(set(kinds)))} {advice}"
     return (
         "is not a scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
         "transforms.json (nerfstudio)"

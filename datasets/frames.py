@@ -1,9 +1,11 @@
 """What the files of a layout say about a scene: photos with lenses and poses, and how they are split."""
 
 import os
+import unicodedata
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -35,7 +37,9 @@ class Frame:
 
     def __post_init__(self) -> None:
         wrong = partial(DataError, self.source, self.name)
-        lens, center, rotation = self.intrinsics, self.pose[:3, 3], self.pose[:3, :3]
+        lens = self.intrinsics
+        center = self.pose[:3, 3]
+        rotation = self.pose[:3, :3]
         numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
         if not np.isfinite(numbers).all():
             raise wrong("expected finite intrinsics, got NaN or infinity")
@@ -91,3 +95,35 @@ def path_inside(source: Path, root: Path, name: str, folder: Path | None = None)
     if not target.is_relative_to(os.path.realpath(root)):
         raise wrong("expected a file inside the scene's folder, got a link that leads out")
     return path
+
+
+def find_file(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:
+    """As `path_inside`, but a name that no file has stands for the one file that differs in case or in Unicode's form.
+
+    Cameras and other systems write `IMG_1.PNG` for `IMG_1.png`, or an é as e and an accent.
+    """
+    path = path_inside(source, root, name, folder)
+    if path.is_file():
+        return path
+    at = folder or root
+    for part in path.relative_to(at).parts:
+        if not (at / part).exists():
+            alike = _names_in(at, at.stat().st_mtime_ns)[_plain(part)] if at.is_dir() else []
+            if len(alike) != 1:
+                return path
+            part = alike[0]
+        at = at / part
+    return path_inside(source, root, str(at.relative_to(folder or root)), folder)
+
+
+@lru_cache(maxsize=8)
+def _names_in(folder: Path, modified_ns: int) -> defaultdict[str, list[str]]:
+    """The names in a folder by their plain form; `modified_ns` makes a folder that changed another one."""
+    names = defaultdict[str, list[str]](list)
+    for path in folder.iterdir():
+        names[_plain(path.name)].append(path.name)
+    return names
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())

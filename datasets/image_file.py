@@ -1,29 +1,36 @@
-"""An image on disk: opened once, decoded once. Pillow reads its header and metadata, OpenCV decodes its pixels.
+"""An image on disk, read by Pillow: opened once, decoded once, its colours converted to sRGB.
 
-libjpeg-turbo (kornia_rs) decodes JPEG, because OpenCV only prints what is wrong with one and gives wrong colours.
-Pillow decodes HEIC (with pi-heif) and 8-bit TIFFs with alpha, whose colours OpenCV would multiply by alpha.
-Without Pillow an image has to be decoded to know its size, so that no bound on the size holds, and TIFF is refused.
+Two kinds of pixels are decoded by others. Those of a JPEG by libjpeg-turbo (kornia_rs): both give the same bits, but
+Pillow is silent about damaged ones, whose colours are wrong. And 16-bit integers by OpenCV, because Pillow cuts them to
+8 bits.
 """
 
 import io
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import cv2
 import numpy as np
 from kornia_rs import io as kornia_io
 from numpy.typing import NDArray
+from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL.Image import Exif
+from PIL.ImageFile import ImageFile as Opened
 
 from kgs.errors import DataError
 
 from . import folders
-
-if TYPE_CHECKING:
-    from PIL.ImageFile import ImageFile as Opened  # what Pillow gives for a file
+from .color_profile import to_srgb
 
 Image = NDArray[np.float32]
+_PLUGINS: dict[str, type[Opened]] = {
+    "PNG": PngImagePlugin.PngImageFile,
+    "JPEG": JpegImagePlugin.JpegImageFile,
+    "WebP": WebPImagePlugin.WebPImageFile,
+    "BMP": BmpImagePlugin.BmpImageFile,
+    "TIFF": TiffImagePlugin.TiffImageFile,
+}
 _KINDS = {
     b"\x89PNG\r\n\x1a\n": "PNG",
     b"\xff\xd8": "JPEG",
@@ -34,10 +41,20 @@ _KINDS = {
 }
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _LONGEST_SIGNATURE = 12  # bytes
+_PNG_BITS = 24  # the byte of a PNG that has the bits of a sample
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-_BITS, _ORIENTATION, _SAMPLES, _TILE_WIDTH, _TILE_HEIGHT, _EXTRA_SAMPLES, _EXIF = 258, 274, 277, 322, 323, 338, 34665
-_MULTIPLIED_ALPHA, _ALPHA = 1, 2  # values of `_EXTRA_SAMPLES`
-_COLORS, _LAB = 262, {8: "CIELab", 9: "ICCLab", 10: "ITULab"}  # a tag, and those of its values that are decoded wrongly
+# Tags of TIFF and Exif
+_BITS = 258
+_COLORS = 262
+_ORIENTATION = 274
+_SAMPLES = 277
+_TILE_WIDTH = 322
+_TILE_HEIGHT = 323
+_EXTRA_SAMPLES = 338
+_EXIF = 34665
+_LAB = {8: "CIELab", 9: "ICCLab", 10: "ITULab"}  # values of `_COLORS` that are decoded wrongly
+_MULTIPLIED_ALPHA = 1  # a value of `_EXTRA_SAMPLES`
+_ALPHA = 2  # likewise
 
 
 class Metadata(NamedTuple):
@@ -45,6 +62,7 @@ class Metadata(NamedTuple):
 
     size: tuple[int, int]  # width and height of the stored pixels
     tags: dict[int, Any]  # of the image and its Exif directory, as Pillow gives them; empty if damaged
+    profile: bytes = b""  # ICC; empty if there is none
 
 
 class ImageFile:
@@ -62,7 +80,6 @@ class ImageFile:
         self.path = path
         self._data: bytes | None = None
         self._metadata: Metadata | None = None
-        self._pixels: Image | None = None
 
     def load(self) -> bytes:
         """The file's bytes. They are kept until `read`, so that the file is not opened again."""
@@ -77,42 +94,31 @@ class ImageFile:
 
     @property
     def metadata(self) -> Metadata:
-        """Size and tags, from the header; without Pillow from the decoded image, with no tags."""
-        if self._metadata is None and folders.has_pillow():
+        """Size, tags and colour profile, from the header."""
+        if self._metadata is None:
             if self._data is None:
                 self._metadata = _read_header_of_file(self.path)
             else:
                 self._metadata = _read_header(self.path, io.BytesIO(self._data), len(self._data))
-        elif self._metadata is None:
-            self._pixels = self._decode()
-            height, width = self._pixels.shape[:2]
-            self._metadata = Metadata((width, height), {})
         return self._metadata
 
     def read(self) -> Image:
         """The pixels as stored: RGB `(H, W, 3)`, or RGBA `(H, W, 4)` where the file has an alpha channel.
 
-        Values are in [0, 1] and not multiplied by alpha. The file's bytes and the pixels are not kept.
+        Values are sRGB in [0, 1], not multiplied by alpha. The file's bytes are not kept.
         """
-        if self._pixels is None:
-            pixels = self._decode()
-        else:
-            pixels, self._pixels = self._pixels, None
-        self._data = None
-        return pixels
-
-    def _decode(self) -> Image:
         data = self.load()
         kind = _kind(self.path, data[:_LONGEST_SIGNATURE])
-        size = self.size if folders.has_pillow() else None  # checked before anything is decoded
+        metadata = self.metadata  # the size is checked before anything is decoded
         try:
             pixels = _decode(kind, data)
         except ValueError as error:
             raise DataError(self.path, "", str(error)) from error
         height, width = pixels.shape[:2]
-        if size is not None and size != (width, height):
-            raise DataError(self.path, "", f"expected {size} pixels as its header says, got {(width, height)}")
-        return pixels
+        if metadata.size != (width, height):
+            raise DataError(self.path, "", f"expected {metadata.size} pixels as its header says, got {(width, height)}")
+        self._data = None
+        return to_srgb(pixels, metadata.profile)
 
 
 def read_image(path: Path) -> Image:
@@ -159,13 +165,15 @@ def _read_header_of_file(path: Path) -> Metadata:
 
 
 def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
-    """Size and tags of an image file of `length` bytes."""
+    """Size, tags and colour profile of an image file of `length` bytes."""
     kind = _kind(path, file.read(_LONGEST_SIGNATURE))
     file.seek(0)
     try:
         with warnings.catch_warnings(action="ignore"):  # Pillow warns of damaged metadata
             image = _open(kind, file)
             tags = _tags(image)
+        if kind == "HEIC":
+            tags[_ORIENTATION] = _left_to_turn(image, file)
         size = (image.width, image.height)
         tile = (1, 1)
         if kind == "TIFF":
@@ -177,35 +185,24 @@ def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
         raise DataError(path, "", f"cannot be decoded: damaged, cut short, or an unusual {kind} ({error})") from error
     check_size(path, *size, length)
     check_size(path, *tile, length)  # tiles are decoded whole
-    return Metadata(size, tags)
+    return Metadata(size, tags, image.info.get("icc_profile") or b"")
 
 
-def _open(kind: str, file: IO[bytes]) -> "Opened":
+def _open(kind: str, file: IO[bytes]) -> Opened:
     """An image whose header Pillow has read.
 
     Not by `PIL.Image.open`, because its bound on pixels does not depend on the number of bytes in the file.
     """
-    from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
-
     if kind == "HEIC":
         import pi_heif
 
         opened: Opened = pi_heif.HeifImageFile(file)
         return opened
-    classes: dict[str, Callable[[IO[bytes]], Opened]] = {
-        "PNG": PngImagePlugin.PngImageFile,
-        "JPEG": JpegImagePlugin.JpegImageFile,
-        "WebP": WebPImagePlugin.WebPImageFile,
-        "BMP": BmpImagePlugin.BmpImageFile,
-        "TIFF": TiffImagePlugin.TiffImageFile,
-    }
-    return classes[kind](file)
+    return _PLUGINS[kind](file)
 
 
-def _tags(image: "Opened") -> dict[int, Any]:
+def _tags(image: Opened) -> dict[int, Any]:
     """The tags of an image and of its Exif directory; none if they are damaged."""
-    from PIL.Image import Exif
-
     try:
         if "exif" in image.info:
             exif = Exif()
@@ -217,6 +214,19 @@ def _tags(image: "Opened") -> dict[int, Any]:
         return dict(exif) | exif.get_ifd(_EXIF)
     except Exception:  # Pillow has no error of its own for damage
         return {}
+
+
+def _left_to_turn(image: Opened, file: IO[bytes]) -> int:
+    """By which orientation of Exif the decoded pixels of a HEIC image are still to be turned.
+
+    Its decoder applies turning and mirroring (irot, imir) of the file, and Exif only repeats them. Some programs
+    write Exif alone.
+    """
+    file.seek(0)
+    data = file.read()
+    if b"irot" in data or b"imir" in data:
+        return 1
+    return image.info.get("original_orientation") or 1
 
 
 def check_size(path: Path, width: int, height: int, size: int) -> None:
@@ -231,21 +241,19 @@ def check_size(path: Path, width: int, height: int, size: int) -> None:
 
 def _decode(kind: str, data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
-    if kind == "TIFF" and not folders.has_pillow():
-        raise ValueError('TIFF is read with Pillow, which is not installed: pip install pillow, or the extra "app"')
     try:
         if kind == "JPEG":
             return _to_float(_decode_jpeg(data))
         if kind == "TIFF":
             return _decode_tiff(data)
-        if kind == "HEIC":
-            return _to_float(np.array(_open(kind, io.BytesIO(data)).convert("RGB")))
-        if kind == "PNG" and folders.has_pillow():
-            _open(kind, io.BytesIO(data)).verify()  # OpenCV takes memory for chunks that are not in the file
-        return _to_float(_decode_with_opencv(data))
+        if kind == "PNG":
+            _open(kind, io.BytesIO(data)).verify()  # the check sums, which decoders pass over
+            if data[_PNG_BITS] == 16:
+                return _to_float(_decode_with_opencv(data))
+        return _to_float(_decode_with_pillow(_open(kind, io.BytesIO(data))))
     except (ValueError, MemoryError):
         raise
-    except Exception as error:  # neither OpenCV, kornia_rs nor Pillow has one class of errors for damage
+    except Exception as error:  # neither Pillow, kornia_rs nor OpenCV has one class of errors for damage
         raise ValueError("the image is damaged, truncated, or has other colours than grey or RGB") from error
 
 
@@ -254,8 +262,14 @@ def _to_float(pixels: NDArray[np.uint8 | np.uint16]) -> Image:
     return np.asarray(pixels / np.float32(255.0 if pixels.dtype == np.uint8 else 65535.0), dtype=np.float32)
 
 
+def _decode_with_pillow(image: Opened) -> NDArray[np.uint8]:
+    """RGB or RGBA of an image of 8 bits or less, upright if it is a TIFF or HEIC."""
+    with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
+        return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+
+
 def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
-    """RGB or RGBA, upright if OpenCV applies the orientation of the file."""
+    """RGB or RGBA, upright if it is a TIFF."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
@@ -267,13 +281,12 @@ def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
 
 def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     """RGB of a JPEG. What lies behind its end, such as a phone's video, is ignored."""
-    if folders.has_pillow():
-        file = io.BytesIO(data)
-        image = _open("JPEG", file)
-        end = file.tell()  # of the header of the first scan
-        # Only progressive images use its last three bytes. In others some phones leave them 0, and decoders warn of it.
-        if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
-            data = data[: end - 3] + b"\0\x3f\0" + data[end:]
+    file = io.BytesIO(data)
+    image = _open("JPEG", file)
+    end = file.tell()  # of the header of the first scan
+    # Only progressive images use its last three bytes. In others some phones leave them 0, and decoders warn of it.
+    if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
+        data = data[: end - 3] + b"\0\x3f\0" + data[end:]
     return np.asarray(kornia_io.decode_image_jpegturbo(data, "rgb"))
 
 
@@ -283,11 +296,12 @@ def _decode_tiff(data: bytes) -> Image:
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
     if lab := _LAB.get(int(tags.get(_COLORS, 2))):
         raise ValueError(f"expected a TIFF of grey or RGB, got {lab}")
-    orientation, samples = int(tags.get(_ORIENTATION, 1)), int(tags.get(_SAMPLES, 1))
+    orientation = int(tags.get(_ORIENTATION, 1))
+    samples = int(tags.get(_SAMPLES, 1))
     alpha = tags.get(_EXTRA_SAMPLES, (0,))[0]
-    if set(tags.get(_BITS, (1,))) == {8} and (samples == 2 or alpha == _ALPHA):
-        with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
-            pixels = _to_float(np.array(image.convert("RGBA")))
+    # Pillow leaves out a fourth sample of unspecified meaning and rounds when it divides colours by alpha.
+    if max(tags.get(_BITS, (1,))) <= 8 and (samples != 4 or alpha == _ALPHA):
+        pixels = _to_float(_decode_with_pillow(image))
     else:
         pixels = _to_float(_decode_with_opencv(data))
     if samples == 4 and alpha == _MULTIPLIED_ALPHA:

@@ -39,7 +39,7 @@ class Intrinsics:
 
     def same_aspect(self, width: int, height: int) -> bool:
         """Whether an image of this size can be a resized one, each side rounded to whole pixels."""
-        return abs(width * self.height - height * self.width) <= max(self.width, self.height)
+        return abs(width * self.height - height * self.width) <= max(self.width, self.height, width, height)
 
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 calibration matrix for integer pixel centres: the one place where half a pixel is subtracted."""
@@ -76,7 +76,8 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
     rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap
-    matrix, distortion = intrinsics.matrix(), np.array(intrinsics.distortion)
+    matrix = intrinsics.matrix()
+    distortion = np.array(intrinsics.distortion)
     x, y = rectify(matrix, distortion, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)
     inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
     if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
@@ -86,7 +87,8 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
 
 def _covering_zoom(intrinsics: Intrinsics) -> float:
     """The smallest factor on the focal length, from 1 to 2, with which the pinhole's border lies inside the image."""
-    width, height, matrix = intrinsics.width, intrinsics.height, intrinsics.matrix()
+    width, height = intrinsics.width, intrinsics.height
+    matrix = intrinsics.matrix()
     project = cv2.fisheye.projectPoints if intrinsics.fisheye else cv2.projectPoints
     rows = [(x, y) for x in range(width) for y in (0, height - 1)]
     border = np.array(rows + [(x, y) for x in (0, width - 1) for y in range(height)], np.float64)

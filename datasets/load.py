@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kgs.errors import DataError
 
-from .border import border_light
+from .border import border_transmittance
 from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .images import rectification, remap, resize
@@ -26,7 +26,7 @@ from .scene import Scene, Views, pinholes
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
 _LISTED = 20
-_BORDER = "the photos have a dark border, left by undistortion: it is taken for part of the lens, not of the scene"
+_BORDER = "the photos have a dark border, left by undistortion: it counts as part of the lens, not of the scene"
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
@@ -42,9 +42,11 @@ def load_scene(
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
-    The layout follows from the files in the folder, in this order: `poses_bounds.npy` (LLFF), `sparse/0` or `sparse`
-    (COLMAP), `transforms_train.json` (Blender), `transforms.json` (nerfstudio, instant-ngp). What the files say is
-    used, refused, or, if it cannot change an image, named in `Scene.notes`.
+    The layout follows from the files in the folder, in this order: `poses_bounds.npy` (LLFF), `sparse/0`, `sparse/1`
+    and so on or `sparse` (COLMAP), `transforms_train.json` (Blender), `transforms.json` (nerfstudio, instant-ngp), a
+    COLMAP model beside its photos or their folder `images`. Of several COLMAP models the one with most images is read.
+    What the files say is used, refused, or, if it cannot change an image, named in `Scene.notes`; so are photos that a
+    COLMAP model has and the folder lacks. Colours are converted to sRGB where a photo has another colour profile.
 
     Convention:
         Kornia's in the result, see `Views`: world-to-camera extrinsics with OpenCV axes, integer pixel centres. The
@@ -79,13 +81,13 @@ def load_scene(
     root = Path(path)
     # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
-        found = find_layout(root)
-        train, test = _split(root, found, train_views, hold_out)
-        cloud = found.points
+        frame_set = find_layout(root)
+        train, test = _split(root, frame_set, train_views, hold_out)
+        cloud = frame_set.points
         if points == "model-points":
-            if found.model_points is None:
-                raise DataError(root, "points", "model-points are not available: there is no COLMAP model in sparse/0")
-            cloud = found.model_points(train)
+            if frame_set.model_points is None:
+                raise DataError(root, "points", "model-points are not available: there is no COLMAP model")
+            cloud = frame_set.model_points(train)
         if not bool((cloud.points.abs() <= LARGEST).all()):
             raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
         if missing := [frame.path for frame in (*train, *test) if not frame.path.is_file()]:
@@ -99,34 +101,50 @@ def load_scene(
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
         if photos and downscale is not None and fine_downscale < downscale:
             scales.append(_Scale.of(train[0], fine_downscale))
-        views = partial(_views, offset=offset, background=color, photos=photos)
-        seen, *finer = [_behind_border(part) for part in views(train, scales)]
-        (held_out,) = views(test, scales[:1])
-        held_out = replace(held_out, light=seen.light)
-        first = (cloud.points - offset).float(), cloud.colors.float(), cloud.kind
-        notes = (*found.notes, *([_BORDER] if seen.light is not None else []))
-        return Scene(seen, held_out, *first, offset, color, root, finer[0] if finer else None, notes)
+        make_views = partial(_views, offset=offset, background=color, photos=photos)
+        train_per_scale = [_with_border(views) for views in make_views(train, scales)]
+        at_size = train_per_scale[0]
+        (test_views,) = make_views(test, scales[:1])
+        notes = frame_set.notes
+        if at_size.light is not None:
+            notes += (_BORDER,)
+        return Scene(
+            train=at_size,
+            test=replace(test_views, light=at_size.light),
+            points=(cloud.points - offset).float(),
+            point_colors=cloud.colors.float(),
+            init_kind=cloud.kind,
+            offset=offset,
+            background=color,
+            root=root,
+            finer=train_per_scale[1] if len(scales) > 1 else None,
+            notes=notes,
+        )
 
 
-def _behind_border(train: Views) -> Views:
+def _with_border(train: Views) -> Views:
     """The training views with the dark border of their photos, if these are opaque and have one."""
-    known = train.images.device.type != "meta" and train.masks is None
-    return replace(train, light=border_light(train.images)) if known else train
+    has_pixels = train.images.device.type != "meta"
+    if not has_pixels or train.masks is not None:
+        return train
+    return replace(train, light=border_transmittance(train.images))
 
 
 def _split(
-    root: Path, found: FrameSet, train_views: int | None, hold_out: int | None
+    root: Path, frame_set: FrameSet, train_views: int | None, hold_out: int | None
 ) -> tuple[list[Frame], list[Frame]]:
     """The frames to train on and those to test on, no photo in both."""
-    frames, test_frames = found.frames, list(found.test or ())
+    frames = frame_set.frames
+    test_frames = list(frame_set.test or ())
     counts = Counter(frame.path for frame in (*frames, *test_frames))
     for frame in (*frames, *test_frames):
         if counts[frame.path] > 1:
-            in_both = all(frame.path in {f.path for f in part} for part in (frames, test_frames))
+            in_both = all(frame.path in {other.path for other in part} for part in (frames, test_frames))
             where = "in the training and in the test views" if in_both else "several times"
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
-    if found.test is None or hold_out is not None:
-        frames, every = [*frames, *test_frames], TEST_EVERY if hold_out is None else hold_out
+    if frame_set.test is None or hold_out is not None:
+        frames = [*frames, *test_frames]
+        every = TEST_EVERY if hold_out is None else hold_out
         if len(frames) < 2 and every:
             raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
         names = [frame.name for frame in frames]
@@ -137,8 +155,8 @@ def _split(
             train, test = split_by_name(names, train_views, every)
         return [frames[i] for i in train], [frames[i] for i in test]
     chosen: Sequence[int] = select_evenly(len(frames), train_views)
-    if train_views == len(found.published) and len(frames) > max(found.published):
-        chosen = found.published
+    if train_views == len(frame_set.published) and len(frames) > max(frame_set.published):
+        chosen = frame_set.published
     return [frames[i] for i in chosen], test_frames
 
 

@@ -12,7 +12,8 @@ def check_options(downscale: Any, hold_out: Any, background: str = "black", poin
     for name, value, known in (("background", background, BACKGROUNDS), ("points", points, ("none", "model-points"))):
         if value not in known:
             raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
-    real, whole = isinstance(downscale, Real), isinstance(hold_out, Integral) and not isinstance(hold_out, bool)
+    real = isinstance(downscale, Real)
+    whole = isinstance(hold_out, Integral) and not isinstance(hold_out, bool)
     if downscale is not None and not (real and 1 <= downscale < math.inf):
         raise ValueError(f"downscale: expected None or a number of at least 1, got {downscale!r}")
     if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):

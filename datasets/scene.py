@@ -102,8 +102,11 @@ class Views:
         rows = torch.as_tensor(index, device=self.cameras.extrinsics.device)
         if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
             raise TypeError(f"index: expected integers, got {rows.dtype}")
-        c, rows = self.cameras, rows.reshape(-1).long()
-        return PinholeCamera(c.intrinsics[rows], c.extrinsics[rows], c.height[rows], c.width[rows])
+        rows = rows.reshape(-1).long()
+        cameras = self.cameras
+        return PinholeCamera(
+            cameras.intrinsics[rows], cameras.extrinsics[rows], cameras.height[rows], cameras.width[rows]
+        )
 
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""

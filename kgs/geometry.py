@@ -115,10 +115,16 @@ def inside_images(pixels: Tensor, depths: Tensor, cameras: PinholeCamera, near: 
     return within & (depths >= near) & (depths <= far)
 
 
+def points_in_images(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
+    """Depths of P points in V cameras, and whether they lie in the image, in front of the camera; both `(P, V)`."""
+    pixels, depths = project_points(points, cameras)
+    return depths, inside_images(pixels, depths, cameras, 0.0, torch.inf) & (depths > 0)
+
+
 def depths_in_images(points: Tensor, cameras: PinholeCamera) -> Tensor:
     """Depths of points in the cameras whose image they lie in, `(D,)`."""
-    pixels, depths = project_points(points, cameras)
-    return depths[inside_images(pixels, depths, cameras, 0.0, torch.inf) & (depths > 0)]
+    depths, inside = points_in_images(points, cameras)
+    return depths[inside]
 
 
 def typical_depths(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:

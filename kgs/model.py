@@ -1,4 +1,4 @@
-"""The parameters of a splat, as the optimiser sees them, and the activations that turn them into Gaussians.
+"""The model: the parameters of a splat, which an optimiser changes, and their activations, which make Gaussians.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023, section 5:
 exponential for scales, sigmoid for opacities, isotropic start with the mean distance to the three nearest points.
@@ -19,24 +19,27 @@ from .types import SH_SIZES, Gaussians, check_tensor
 
 INITIAL_OPACITY = 0.1
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
+MAX_SH_DEGREE = len(SH_SIZES) - 1
 
 
 class GaussianModel(nn.Module):
-    """N Gaussians as unbounded parameters; the harmonics are split in two, for two learning rates.
+    """N Gaussians as unbounded parameters. Harmonics are two of them, so that each can have its own learning rate.
 
-    `state_dict()` holds the six parameters and the active degree: `GaussianModel(**state_dict)` builds the same model,
-    and `load_state_dict` adopts the number of Gaussians and both degrees. It keeps the parameter objects, so an
+    `state_dict()` holds the six parameters and the active degree: `GaussianModel(**state_dict)` builds the same model.
+    `load_state_dict` takes over the number of Gaussians and both degrees. The parameters stay the same objects, so an
     optimiser still holds them; load its state afterwards.
 
     Args:
         means: centres in world units, `(N, 3)`, float32 or float64.
-        quats: rotations as quaternions w, x, y, z of any norm from 1e-38 on, `(N, 4)`.
-        log_scales: natural logarithm of the standard deviations in world units, `(N, 3)`.
-        opacity_logits: `(N,)`.
+        quats: rotations as quaternions w, x, y, z of any norm of at least 1e-38, `(N, 4)`.
+        log_scales: natural logarithm of the standard deviations in world units, `(N, 3)`; -inf for a flat disc.
+        opacity_logits: the opacities before the sigmoid, `(N,)`.
         sh_dc: harmonics of degree 0, `(N, 1, 3)`.
         sh_rest: harmonics of degree 1 and above, `(N, K - 1, 3)` with K = 1, 4, 9 or 16.
         sh_degree: the active degree, 0 to that of `sh_rest`; None takes that of `_extra_state`, else that of `sh_rest`.
         _extra_state: the active degree as `state_dict()` holds it.
+        antialiased: whether the Gaussians were fitted with `RasterOptions(antialiased=True)`, and so must be rendered
+            with it: `GaussianRenderer(antialiased=model.antialiased)`. No part of `state_dict()`.
 
     Raises:
         TypeError: a tensor is not float32 or float64, or differs in dtype or device from `means`.
@@ -59,31 +62,38 @@ class GaussianModel(nn.Module):
         sh_rest: Tensor,
         sh_degree: int | None = None,
         _extra_state: Tensor | None = None,
+        antialiased: bool = False,
     ) -> None:
         super().__init__()
-        values = (means, quats, log_scales, opacity_logits, sh_dc, sh_rest)
-        for name, value in zip(PARAMETERS, values, strict=True):
+        self.antialiased = antialiased
+        values = dict(zip(PARAMETERS, (means, quats, log_scales, opacity_logits, sh_dc, sh_rest), strict=True))
+        for name, value in values.items():
             check_tensor(name, value)
             if value.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
             check_tensor(name, value, means, " as means")
-        most = _check_shapes(values)
-        parameters = [nn.Parameter(value.detach().clone()) for value in values]
-        self.means, self.quats, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest = parameters
-        known = most if _extra_state is None else int(_extra_state)
-        self.sh_degree = known if sh_degree is None else sh_degree
+        highest = _check_shapes(list(values.values()))
+        self.means = nn.Parameter(means.detach().clone())
+        self.quats = nn.Parameter(quats.detach().clone())
+        self.log_scales = nn.Parameter(log_scales.detach().clone())
+        self.opacity_logits = nn.Parameter(opacity_logits.detach().clone())
+        self.sh_dc = nn.Parameter(sh_dc.detach().clone())
+        self.sh_rest = nn.Parameter(sh_rest.detach().clone())
+        if sh_degree is None:
+            sh_degree = highest if _extra_state is None else int(_extra_state)
+        self.sh_degree = sh_degree
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Self:
-        """Start from a coloured point cloud: per point one isotropic Gaussian of its colour, with opacity 0.1.
+        """Start from a coloured point cloud: each point becomes an isotropic Gaussian of its colour, with opacity 0.1.
 
-        The standard deviation is the root of the mean squared distance to the three nearest points, at least a
-        thousandth of the cloud's median one (points may coincide).
+        The standard deviation is the root mean squared distance to the three nearest points, but at least a thousandth
+        of the median over the cloud, because points may coincide.
 
         Args:
             points: `(N, 3)` in world units, N >= 4, float32 or float64; the model takes their dtype and device.
             colors: RGB in [0, 1], `(N, 3)`, floating point.
-            sh_degree: the degree of the harmonics, 0 to 3; the active degree starts there too.
+            sh_degree: the degree of the harmonics, 0 to 3; it is also the active degree.
 
         Raises:
             TypeError: `points` is not a tensor of float32 or float64, or `colors` is not floating point.
@@ -102,20 +112,27 @@ class GaussianModel(nn.Module):
         for name, value in (("points", points), ("colors", colors)):
             if not bool(value.isfinite().all()):
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
-        _check_degree(sh_degree, len(SH_SIZES) - 1)
-        points, n = points.detach(), len(points)
-        quats = points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-        log_scales = log_spacing(points).to(points)[:, None].repeat(1, 3)
-        logits = points.new_full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)))
-        sh_dc = ((colors.detach().to(points) - 0.5) / SH_C0)[:, None]
-        return cls(points, quats, log_scales, logits, sh_dc, points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3))
+        _check_degree(sh_degree, MAX_SH_DEGREE)
+        points = points.detach()
+        n = len(points)
+        return cls(
+            means=points,
+            quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            log_scales=log_spacing(points).to(points)[:, None].repeat(1, 3),
+            opacity_logits=points.new_full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
+            sh_dc=((colors.detach().to(points) - 0.5) / SH_C0)[:, None],
+            sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),
+        )
 
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
-        """A model of the Gaussians at `rows`, bool `(N,)` or integers; `sh_degree` None keeps all harmonics."""
+        """A new model of the Gaussians at `rows`: a mask `(N,)` or indices `(M,)`.
+
+        `sh_degree` is the highest degree of the harmonics that are kept; None keeps all.
+        """
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
         values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
-        return GaussianModel(**values, sh_degree=min(degree, self.sh_degree))
+        return GaussianModel(**values, sh_degree=min(degree, self.sh_degree), antialiased=self.antialiased)
 
     @property
     def max_sh_degree(self) -> int:
@@ -132,11 +149,11 @@ class GaussianModel(nn.Module):
         self._sh_degree = _check_degree(value, self.max_sh_degree)
 
     def forward(self) -> Gaussians:
-        """The Gaussians with activated values and the active bands only."""
+        """The Gaussians: scales and opacities after their activations, and harmonics up to the active degree."""
         colors: Tensor = self.sh_dc
-        if self.sh_degree > 0:  # else sh_rest gets no gradient, and an optimiser skips it
+        if self.sh_degree > 0:  # at degree 0 sh_rest gets no gradient, and an optimiser skips it
             colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
-        # where exp overflows the Gaussian is not drawn, and its gradient would be 0 times infinity
+        # A Gaussian whose scale overflows is not drawn. The gradient of exp would be 0 times infinity there.
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
         return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)
@@ -145,61 +162,70 @@ class GaussianModel(nn.Module):
         return self.means.shape[0]
 
     def __bool__(self) -> bool:
-        return True  # also without Gaussians, as every module
+        return True  # like every module, also without Gaussians
 
     def get_extra_state(self) -> Tensor:
         """The active degree, for `state_dict()`."""
         return torch.tensor(self.sh_degree, device="cpu")
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Set the active degree."""
+        """Set the active degree to that of a `state_dict()`."""
         self.sh_degree = int(state)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Resize the parameters to the values that will be loaded."""
         values = [state_dict[prefix + name] for name in PARAMETERS if prefix + name in state_dict]
         if len(values) == len(PARAMETERS):
-            most = _check_shapes(values)
-            _check_degree(int(state_dict.setdefault(prefix + "_extra_state", torch.tensor(most, device="cpu"))), most)
+            highest = _check_shapes(values)
+            active = state_dict.setdefault(prefix + "_extra_state", torch.tensor(highest, device="cpu"))
+            _check_degree(int(active), highest)
             for name, value in zip(PARAMETERS, values, strict=True):
                 parameter = self.get_parameter(name)
                 if parameter.shape != value.shape:
-                    parameter.data, parameter.grad = parameter.new_empty(value.shape), None
+                    parameter.data = parameter.new_empty(value.shape)
+                    parameter.grad = None
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def extra_repr(self) -> str:
         """What `print(model)` shows."""
-        return f"{len(self)} Gaussians, sh_degree={self.sh_degree} of {self.max_sh_degree}, {self.means.dtype}"
+        antialiased = ", antialiased" if self.antialiased else ""
+        degrees = f"sh_degree={self.sh_degree} of {self.max_sh_degree}"
+        return f"{len(self)} Gaussians, {degrees}, {self.means.dtype}{antialiased}"
 
 
 class _JoinedBands(torch.autograd.Function):
-    """The first bands of all harmonics: `torch.cat`, in memory of `kgs.memory`, the gradients too."""
+    """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers of `kgs.memory`."""
 
     @staticmethod
     def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:
-        ctx.rest, ctx.bands = sh_rest.shape, bands
+        ctx.rest_shape = sh_rest.shape
+        ctx.bands = bands
         joined = empty((len(sh_dc), bands, 3), sh_dc)
-        joined[:, :1], joined[:, 1:] = sh_dc, sh_rest[:, : bands - 1]
+        joined[:, :1] = sh_dc
+        joined[:, 1:] = sh_rest[:, : bands - 1]
         return joined
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        first, rest = grad[:, :1], None
+        grad_rest = None
         if ctx.needs_input_grad[1]:
-            rest = empty(ctx.rest, grad)
-            rest[:, : ctx.bands - 1], rest[:, ctx.bands - 1 :] = grad[:, 1:], 0.0
-        return first, rest, None
+            grad_rest = empty(ctx.rest_shape, grad)
+            grad_rest[:, : ctx.bands - 1] = grad[:, 1:]
+            grad_rest[:, ctx.bands - 1 :] = 0.0
+        return grad[:, :1], grad_rest, None
 
 
-def _check_degree(value: int, most: int) -> int:
-    if not isinstance(value, int | np.integer) or not 0 <= value <= most:
-        raise ValueError(f"sh_degree: expected an integer from 0 to {most}, got {value!r}")
+def _check_degree(value: int, highest: int) -> int:
+    """The degree as an int; a ValueError if it is not one from 0 to the highest."""
+    if not isinstance(value, int | np.integer) or not 0 <= value <= highest:
+        raise ValueError(f"sh_degree: expected an integer from 0 to {highest}, got {value!r}")
     return int(value)
 
 
 def _check_shapes(values: Sequence[Tensor]) -> int:
-    """The degree of the harmonics; ValueError if the shapes do not match."""
-    n, sh_rest = values[0].shape[0] if values[0].ndim else 0, values[-1]
+    """The highest degree that the harmonics hold; a ValueError if the shapes of the `PARAMETERS` do not match."""
+    means, sh_rest = values[0], values[-1]
+    n = means.shape[0] if means.ndim else 0
     k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
     if k not in SH_SIZES:
         raise ValueError(f"sh_rest: expected shape ({n}, K - 1, 3) with K in {SH_SIZES}, got {tuple(sh_rest.shape)}")

@@ -10,8 +10,8 @@ from kgs import DataError, backends
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.run import fit_scene
 from kgs.fit.saved import load_fit
-from kgs.io.json_files import read_json
 from kgs.io.results_folder import CHECKPOINT
+from kgs.json_files import read_json
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
 

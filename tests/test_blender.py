@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -214,11 +215,29 @@ def test_an_infinity_by_overflow_is_noticed(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_a_missing_test_file_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("poses", [True, False])
+def test_without_test_pictures_the_training_file_is_split(tmp_path: Path, poses: bool) -> None:
+    """BlenderNeRF writes test poses without pictures, or no test file."""
+    write(tmp_path, train=9)
+    shutil.rmtree(tmp_path / "test")
+    if not poses:
+        (tmp_path / "transforms_test.json").unlink()
+    scene = load_scene(tmp_path, hold_out=4)
+    assert scene.test.names == tuple(f"train/r_{i}.png" for i in (0, 4, 8))
+    assert scene.train.names == tuple(f"train/r_{i}.png" for i in (1, 2, 3, 5, 6, 7))
+    (note,) = scene.notes
+    assert "transforms_test.json" in note
+    assert load_scene(tmp_path).test.names == ("train/r_0.png", "train/r_8.png")
+    assert len(load_scene(tmp_path, hold_out=0).train) == 9
+
+
+def test_test_poses_without_a_picture_are_left_out(tmp_path: Path) -> None:
     write(tmp_path)
-    (tmp_path / "transforms_test.json").unlink()
-    with pytest.raises(DataError, match=r"transforms_test\.json.*cannot be read"):
-        load_scene(tmp_path)
+    (tmp_path / "test" / "r_1.png").unlink()
+    scene = load_scene(tmp_path)
+    assert scene.test.names == ("test/r_0.png", "test/r_2.png")
+    (note,) = scene.notes
+    assert "1 of 3 poses" in note
 
 
 def test_real_scene(kgs_data: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from init_point_scenes import as_views, garden_from_above
 
 from kgs.datasets import load_scene, synthetic_scene
-from kgs.datasets.border import border_light
+from kgs.datasets.border import border_transmittance
 from kgs.fit.config import FitConfig
 from kgs.fit.run import choose_points
 from kgs.fit.targets import targets
@@ -32,41 +32,41 @@ def behind(left=1.0, top=2.0, right=0.5, bottom=0.0):
 @pytest.mark.slow
 def test_a_border_is_found_as_it_is(scene):
     light = behind()
-    found = border_light(scene.train.images * light)
+    found = border_transmittance(scene.train.images * light)
     assert bool((found[4:-4, 4:-4] == 1).all())
     torch.testing.assert_close(found, light, atol=0.4, rtol=0)  # at corners of a textured scene
     assert float((found - light).abs()[light < 1].mean()) < 0.05
 
-    assert border_light(scene.train.images[:2] * light) is not None
+    assert border_transmittance(scene.train.images[:2] * light) is not None
 
 
 def test_a_border_of_changing_thickness_is_followed(scene):
     thickness = torch.linspace(2.0, 0.6, 192)  # of the upper side, as distortion leaves it
     light = (torch.arange(1, 145)[:, None] - thickness).clamp(0, 1)
-    found = border_light(scene.train.images * light)
+    found = border_transmittance(scene.train.images * light)
     torch.testing.assert_close(found, light, atol=0.4, rtol=0)
     assert float((found - light).abs()[light < 1].mean()) < 0.1
 
 
 def test_photos_without_a_border_have_none(scene):
-    assert border_light(scene.train.images) is None
+    assert border_transmittance(scene.train.images) is None
 
 
 def test_the_scene_is_not_taken_for_a_border(scene):
     photos = scene.train.images.clone()
-    assert border_light(photos * behind() * 0.02) is None  # too dark to tell
+    assert border_transmittance(photos * behind() * 0.02) is None  # too dark to tell
     photos[0, :, :2] = 0.0  # in one photo alone
-    assert border_light(photos) is None
-    assert border_light(scene.train.images[:1] * behind()) is None  # one photo tells nothing
-    assert border_light(torch.zeros(3, 3, 144, 192)) is None
+    assert border_transmittance(photos) is None
+    assert border_transmittance(scene.train.images[:1] * behind()) is None  # one photo tells nothing
+    assert border_transmittance(torch.zeros(3, 3, 144, 192)) is None
 
 
 def test_a_dark_edge_that_is_too_wide_is_the_scene(scene):
-    assert border_light(scene.train.images * behind(left=0, top=8.0, right=0)) is None
+    assert border_transmittance(scene.train.images * behind(left=0, top=8.0, right=0)) is None
 
 
 def test_small_pictures_have_none():
-    assert border_light(torch.rand(2, 3, 5, 5)) is None
+    assert border_transmittance(torch.rand(2, 3, 5, 5)) is None
 
 
 def with_border(scene, light):

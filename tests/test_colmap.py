@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -182,10 +183,110 @@ def test_names_with_backslashes_and_further_models(tmp_path: Path) -> None:
     assert before.notes == ()
     images = tmp_path / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("cam/", "cam\\"))
-    (tmp_path / "sparse" / "1").mkdir()
     after = load_scene(tmp_path)
     assert torch.equal(after.train.images, before.train.images)
-    assert after.notes == ("sparse/: only model 0 is read, not 1",)
+    assert after.notes == ()
+
+
+@pytest.mark.parametrize("small", ["0", "1"])
+def test_of_several_models_the_one_with_most_images_is_read(tmp_path: Path, small: str) -> None:
+    write_model(tmp_path, text=True)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / str(1 - int(small)))
+    shutil.copytree(tmp_path / "sparse" / str(1 - int(small)), tmp_path / "sparse" / small)
+    images = tmp_path / "sparse" / small / "images.txt"
+    lines = images.read_text().split("\n")
+    begin = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    images.write_text("\n".join(lines[: begin + 4]) + "\n")  # two lines an image
+    scene = load_scene(tmp_path, points="model-points")
+    assert len(scene.train) + len(scene.test) == COUNT
+    assert len(scene.points) == 1
+    (note,) = scene.notes
+    assert f"sparse/{1 - int(small)} " in note
+    assert f"sparse/{small} has 2" in note
+
+
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("text", [False, True])
+def test_a_model_beside_its_photos_or_their_folder(tmp_path: Path, text: bool, beside: bool) -> None:
+    """As RealityScan exports it."""
+    write_model(tmp_path, text=text)
+    before = load_scene(tmp_path, points="model-points")
+    for path in [*(tmp_path / "sparse" / "0").iterdir(), *((tmp_path / "images").iterdir() if beside else [])]:
+        path.rename(tmp_path / path.name)
+    shutil.rmtree(tmp_path / "sparse")
+    if beside:
+        (tmp_path / "images").rmdir()
+    after = load_scene(tmp_path, points="model-points")
+    assert after.notes == ()
+    for part, other in ((before.train, after.train), (before.test, after.test)):
+        assert part.names == other.names
+        assert torch.equal(part.images, other.images)
+        assert torch.equal(part.cameras.extrinsics, other.cameras.extrinsics)
+    assert torch.equal(before.points, after.points)
+
+
+def test_a_model_without_photos_is_no_scene(tmp_path: Path) -> None:
+    write_model(tmp_path, text=True)
+    for path in (tmp_path / "sparse" / "0").iterdir():
+        path.rename(tmp_path / path.name)
+    (tmp_path / "images").rename(tmp_path / "photos")
+    with pytest.raises(DataError, match="the COLMAP model is not used: expected its photos beside it or in images/"):
+        load_scene(tmp_path)
+
+
+def test_photos_that_are_gone_are_left_out_and_named(tmp_path: Path) -> None:
+    write_model(tmp_path)
+    before = load_scene(tmp_path)
+    for i in (2, 5):
+        (tmp_path / "images" / f"img{i}.png").unlink()
+    scene = load_scene(tmp_path, points="model-points")
+    assert {*scene.train.names, *scene.test.names} == {*before.train.names, *before.test.names} - {
+        "img2.png",
+        "img5.png",
+    }
+    (note,) = scene.notes
+    assert "2 of 10" in note
+    assert "img2.png" in note
+    assert "img5.png" in note
+
+
+@pytest.mark.parametrize("written", ["img3.PNG", "IMG3.png"])
+def test_photos_whose_names_differ_in_case(tmp_path: Path, written: str) -> None:
+    write_model(tmp_path)
+    before = load_scene(tmp_path)
+    (tmp_path / "images" / "img3.png").rename(tmp_path / "images" / written)
+    after = load_scene(tmp_path)
+    assert after.notes == ()
+    assert after.train.names == before.train.names
+    assert torch.equal(after.train.images, before.train.images)
+
+
+def test_a_size_that_is_rounded_in_the_model(tmp_path: Path) -> None:
+    """A lens of 2400x1799 for photos of 2592x1944, at a twelfth of their pixels."""
+    write_model(tmp_path, text=True)
+    cameras = tmp_path / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text().replace(f" {WIDTH} {HEIGHT} ", " 200 149 "))
+    for path in (tmp_path / "images").iterdir():
+        cv2.imwrite(str(path), np.zeros((162, 216, 3), np.uint8))
+    scene = load_scene(tmp_path)
+    assert float(scene.train.cameras.fx[0]) == pytest.approx(40 * 216 / 200)
+    assert float(scene.train.cameras.fy[0]) == pytest.approx(40 * 162 / 149)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_points_without_tracks_are_told_from_no_points(tmp_path: Path, text: bool) -> None:
+    """LiDAR's: nothing says which photos see them."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_model(tmp_path, text=text)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    assert len(load_scene(tmp_path).points) == 0
+    for i in range(5):
+        model.add_point3D(np.full(3, float(i)), pycolmap.Track(), np.zeros(3, np.uint8))
+    (model.write_text if text else model.write_binary)(str(tmp_path / "sparse" / "0"))
+    with pytest.raises(DataError, match="points with a track.*got 5 without"):
+        load_scene(tmp_path, points="model-points")
 
 
 def test_all_missing_images_are_named_at_once_and_extra_ones_do_no_harm(tmp_path: Path) -> None:
@@ -193,9 +294,9 @@ def test_all_missing_images_are_named_at_once_and_extra_ones_do_no_harm(tmp_path
     before = load_scene(tmp_path)
     cv2.imwrite(str(tmp_path / "images" / "aaa.png"), np.zeros((5, 5, 3), np.uint8))
     assert load_scene(tmp_path).train.names == before.train.names
-    for i in (2, 5, 8):
+    for i in range(2, 9):
         (tmp_path / "images" / f"img{i}.png").unlink()
-    with pytest.raises(DataError, match=r"3 of 10 images.*img2\.png.*img5\.png.*img8\.png"):
+    with pytest.raises(DataError, match=r"7 of 10 images.*img2\.png.*img5\.png.*img8\.png"):
         load_scene(tmp_path)
 
 

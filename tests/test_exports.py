@@ -20,9 +20,9 @@ from kgs.cli.render import render
 from kgs.fit import exports
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
-from kgs.io.json_files import write_json
 from kgs.io.outputs import EXPORTS, film_in
 from kgs.io.ownership import is_own
+from kgs.json_files import write_json
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from kgs.datasets.frames import Frame, path_inside
+from kgs.datasets.frames import Frame, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
@@ -46,6 +47,40 @@ def test_the_scene_itself_may_be_a_link(tmp_path: Path) -> None:
     (tmp_path / "real" / "a.png").write_bytes(b"x")
     (tmp_path / "link").symlink_to(tmp_path / "real")
     assert path_inside(SOURCE, tmp_path / "link", "a.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("stored", "name"),
+    [
+        ("images/a.PNG", "images/a.png"),
+        ("Images/A.png", "images/a.png"),
+        ("images/caf\u00e9.png", "images/cafe\u0301.png"),  # macOS writes an accent by itself
+        ("images/cafe\u0301.JPG", "images/caf\u00e9.jpg"),
+    ],
+)
+def test_names_in_another_case_or_form(tmp_path: Path, stored: str, name: str) -> None:
+    (tmp_path / stored).parent.mkdir()
+    assert not find_file(SOURCE, tmp_path, name).is_file()
+    (tmp_path / stored).write_bytes(b"x")
+    assert find_file(SOURCE, tmp_path, name) == tmp_path / stored
+    assert find_file(SOURCE, tmp_path, stored) == tmp_path / stored
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="file systems that do not tell cases apart")
+def test_a_name_that_fits_two_files_is_none_of_them(tmp_path: Path) -> None:
+    (tmp_path / "A.png").write_bytes(b"x")
+    (tmp_path / "a.PNG").write_bytes(b"x")
+    assert find_file(SOURCE, tmp_path, "a.png") == tmp_path / "a.png"
+    assert find_file(SOURCE, tmp_path, "a.PNG") == tmp_path / "a.PNG"
+
+
+def test_a_link_in_another_case_that_leads_out_is_refused(tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    root.mkdir()
+    (tmp_path / "secret.png").write_bytes(b"x")
+    (root / "A.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(DataError, match="link that leads out"):
+        find_file(SOURCE, root, "a.png")
 
 
 @pytest.mark.parametrize("name", ["fx", "fy"])

@@ -7,16 +7,22 @@ import json
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from factories import random_model, with_camera
 from init_point_scenes import flat
 
 import kgs
+from kgs.datasets import Scene
 from kgs.errors import DataError
+from kgs.fit import FitConfig, fit_scene
+from kgs.fit.run import choose_points
 from kgs.init_points import initial_points
 
 
@@ -99,6 +105,40 @@ def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
     found = initial_points(flat(), "file", file=tmp_path / "splat.ply")
     assert torch.equal(found.points, points)
     assert torch.allclose(found.colors, colors, atol=1e-6)
+
+
+def write_cloud(path: Path, shift: tuple[float, float, float]) -> FitConfig:
+    """A cloud about a place, and the configuration of a fit that starts from it."""
+    points = np.random.default_rng(0).normal(size=(40, 3)) + np.array(shift)
+    trimesh.PointCloud(points).export(path)
+    return FitConfig(steps=2, init="file", init_file=path)
+
+
+@pytest.mark.parametrize(("shift", "in_front"), [((0.0, 0.0, -50.0), 0), ((500.0, 0.0, 5.0), 40)])
+def test_points_in_another_frame_end_a_fit_before_it_begins(
+    scene: Scene, tmp_path: Path, shift: tuple[float, float, float], in_front: int
+) -> None:
+    config = write_cloud(tmp_path / "cloud.ply", shift)
+    former = tmp_path / "out" / "splat.ply"
+    former.parent.mkdir()
+    kgs.save_ply(former, random_model())
+    content = former.read_bytes()
+    message = f"cloud.ply: initial points: .* got none of 40, of which {in_front} lie before a camera"
+    with pytest.raises(DataError, match=message):
+        fit_scene(scene, config, tmp_path / "out")
+    assert former.read_bytes() == content
+    assert [path.name for path in former.parent.iterdir() if path.suffix] == ["splat.ply"]
+
+
+def test_views_that_show_no_initial_point_are_named(scene: Scene, tmp_path: Path, recwarn: Any) -> None:
+    config = write_cloud(tmp_path / "cloud.ply", (0.0, 0.0, 5.0))
+    choose_points(scene, config)
+    assert not recwarn.list
+    extrinsics = scene.train.cameras.extrinsics.clone()
+    extrinsics[1, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ extrinsics[1, :3]  # turned about
+    turned = replace(scene.train, cameras=with_camera(scene.train.cameras, extrinsics))
+    with pytest.warns(UserWarning, match=f"none lies in the image of {scene.train.names[1]}$"):
+        choose_points(replace(scene, train=turned, finer=None), config)
 
 
 def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:

@@ -116,6 +116,34 @@ def test_the_layout_is_told_in_a_fixed_order(tmp_path: Path, files: list[str], r
 
 
 @pytest.mark.parametrize(
+    ("file", "part"),
+    [
+        ("reconstruction.json", "OpenSfM"),
+        ("transform_train.json", "transforms_train.json"),
+        ("transforms.json", "COLMAP"),
+        ("masks/0.png", "masks/"),
+        ("images/dynamic_mask_0.png", "dynamic_mask_*.png"),
+    ],
+)
+def test_what_is_there_and_not_used_is_named(tmp_path: Path, file: str, part: str) -> None:
+    write_colmap(tmp_path / "scene")
+    path = tmp_path / "scene" / file
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"{}")
+    (note,) = load_scene(tmp_path / "scene").notes
+    assert (path.name if "dynamic" not in file and "masks" not in file else "masks") in note
+    assert part in note
+
+
+@pytest.mark.parametrize("file", ["reconstruction.json", "transform_train.json"])
+def test_cameras_that_are_not_read_are_named_beside_bare_photos(tmp_path: Path, file: str) -> None:
+    photos(tmp_path)
+    (tmp_path / file).write_bytes(b"{}")
+    with pytest.raises(DataError, match=f"no camera poses.*{file} is not used"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("arguments", "name"),
     [
         ({"background": "green"}, "background"),

@@ -193,6 +193,16 @@ def test_repr_says_how_many_and_which_degree():
     assert repr(made) == "GaussianModel(7 Gaussians, sh_degree=1 of 3, torch.float32)"
 
 
+def test_antialiased_is_kept_by_what_makes_another_model():
+    assert not GaussianModel.from_points(*cloud()).antialiased
+    state = model().state_dict()
+    made = GaussianModel(**state, antialiased=True)
+    assert made.state_dict().keys() == state.keys()
+    for again in (made.select(torch.arange(3)), made.to(torch.float64), copy.deepcopy(made)):
+        assert again.antialiased
+    assert repr(made).endswith("torch.float64, antialiased)")
+
+
 @pytest.mark.parametrize("degree", [-1, 4, 1.0, "2"])
 def test_a_degree_out_of_range_is_refused(degree):
     made = model()

@@ -13,7 +13,7 @@ import pytest
 from photo_folders import planes, write_photos
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
-from kgs.datasets import folders, image_file, load_scene
+from kgs.datasets import image_file, load_scene
 from kgs.errors import DataError
 from kgs.sfm import pose, pose_photos
 
@@ -82,40 +82,6 @@ def test_a_scene_without_its_photos(
     load_scene(tmp_path, photos=False)
     assert set(images(opened).values()) == {1}
     assert decoded == []
-
-
-@WRITERS
-def test_a_scene_without_pillow(
-    tmp_path: Path,
-    write: Callable[[Path], None],
-    opened: Counter[str],
-    decoded: list[int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Sizes are those of the decoded images."""
-    write(tmp_path)
-    expected = load_scene(tmp_path, downscale=1.5)
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    monkeypatch.setattr(folders, "has_pillow", lambda: False)
-    opened.clear()
-    decoded.clear()
-    scene = load_scene(tmp_path, downscale=1.5)
-    for part, other in ((scene.train, expected.train), (scene.test, expected.test), (scene.finer, expected.finer)):
-        assert part is not None
-        assert other is not None
-        assert bool((part.images == other.images).all())
-        assert bool((part.cameras.intrinsics == other.cameras.intrinsics).all())
-    assert len(decoded) == len(scene.train) + len(scene.test)
-    assert set(images(opened).values()) == {1}
-    bare = load_scene(tmp_path, downscale=1.5, photos=False)
-    assert bare.train.images.shape == scene.train.images.shape
-
-
-def test_a_tiff_without_pillow_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(8))
-    monkeypatch.setattr(folders, "has_pillow", lambda: False)
-    with pytest.raises(DataError, match=r"a\.tif: TIFF is read with Pillow, which is not installed"):
-        image_file.read_image(tmp_path / "a.tif")
 
 
 def test_unposed_photos(

@@ -12,9 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from kgs import GaussianRenderer
+from kgs import Densifier, GaussianRenderer
+from kgs.datasets import Views
+from kgs.fit.prune import contributions
+from kgs.io.glb import save_glb
 from kgs.io.ply import load_ply, save_ply
 from kgs.model import GaussianModel
+from kgs.page.data import pack
 
 
 def same(one, two):
@@ -80,13 +84,49 @@ def test_trimesh_reads_all_columns(tmp_path):
 def test_header_is_that_of_3d_gaussian_splatting(tmp_path):
     save_ply(tmp_path / "a.ply", random_model(n=4, sh_degree=1))
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    expected = ["ply", "format binary_little_endian 1.0", "element vertex 4"]  # their viewer counts the lines
+    expected += [f"property float {name}" for name in splat_columns(1)]
     lines = head.decode().splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    assert [line for line in lines[2:] if not line.startswith("comment")] == [
-        "element vertex 4",
-        *(f"property float {name}" for name in splat_columns(1)),
-    ]
+    assert lines[: len(expected)] == expected
+    assert all(line.startswith("comment ") for line in lines[len(expected) :])
     assert len(body) == 4 * 26 * 4
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_of_a_higher_degree_are_zeros_in_the_file(tmp_path, degree):
+    model = random_model(4, degree)
+    model.sh_degree = degree // 2
+    save_ply(tmp_path / "a.ply", model, sh_degree=3)
+    again = load_ply(tmp_path / "a.ply")
+    assert again.sh_degree == degree // 2
+    assert torch.equal(again.sh_rest[:, : model.sh_rest.shape[1]], model.sh_rest)
+    assert not again.sh_rest[:, model.sh_rest.shape[1] :].any()
+    # as the viewer of 3D Gaussian Splatting reads it: the count from the third line, then 62 floats a Gaussian
+    with open(tmp_path / "a.ply", "rb") as file:
+        count = int([file.readline() for _ in range(3)][2].split()[2])
+        while file.readline() != b"end_header\n":
+            pass
+        rows = np.fromfile(file, "<f4").reshape(count, 62)
+    np.testing.assert_array_equal(rows[:, :3], model.means.detach())
+    np.testing.assert_array_equal(rows[:, 54], model.opacity_logits.detach())
+    np.testing.assert_array_equal(rows[:, 58:], model.quats.detach())
+
+
+@pytest.mark.parametrize("degree", [0, 4, -1, 3.0])
+def test_a_degree_below_that_of_the_model_or_above_3_is_refused(tmp_path, degree):
+    with pytest.raises(ValueError, match="sh_degree: expected"):
+        save_ply(tmp_path / "a.ply", random_model(sh_degree=1), sh_degree=degree)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_an_antialiased_model_is_tagged_as_other_programs_do(tmp_path, antialiased):
+    model = random_model()
+    model.antialiased = antialiased
+    save_ply(tmp_path / "a.ply", model)
+    head = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0]
+    assert (b"\ncomment SplatRenderMode: mip\n" in head) == antialiased  # the spelling of Brush and splat-transform
+    assert load_ply(tmp_path / "a.ply").antialiased == antialiased
 
 
 UTM = torch.tensor([448262.127, 5411932.678, 118.5], dtype=torch.float64)  # metres, in zone 31
@@ -185,6 +225,60 @@ def test_values_that_float32_cannot_hold_are_not_written(tmp_path):
         with pytest.raises(ValueError, match="finite in float32, got others in f_rest_2"):
             save_ply(tmp_path / "a.ply", model)
     assert not list(tmp_path.iterdir())
+
+
+DISC = torch.tensor([-1.0, -2.0, -math.inf])  # scales of a flat disc: its third axis has no extent
+
+
+def test_flat_discs_come_back(tmp_path):
+    model = random_model()
+    with torch.no_grad():
+        model.log_scales[2] = DISC
+        model.log_scales[4] = -math.inf
+    save_ply(tmp_path / "a.ply", model)
+    assert same(model, load_ply(tmp_path / "a.ply"))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degrees", [0.0, 50.0, 90.0])
+def test_a_flat_disc_has_the_footprint_of_an_ellipse(tmp_path, each_backend, degrees, antialiased):
+    model = random_model(1, 0)
+    angle = math.radians(degrees)
+    with torch.no_grad():
+        model.means.copy_(torch.tensor([[0.0, 0.0, 2.0]]))
+        model.quats.copy_(torch.tensor([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]]))  # about x
+        model.log_scales.copy_(DISC)
+    save_ply(tmp_path / "a.ply", model)
+    model = load_ply(tmp_path / "a.ply")
+    renderer = GaussianRenderer(antialiased=antialiased)
+    render = renderer(model(), pinhole(40, 48, 50.0, dtype=torch.float32))
+    widths = [25.0 * math.exp(-1.0), 25.0 * math.exp(-2.0) * math.cos(angle)]  # pixels: a metre is 25 at 2 metres
+    conics = torch.tensor([[1.0 / (widths[0] ** 2 + 0.3), 0.0, 1.0 / (widths[1] ** 2 + 0.3)]])
+    torch.testing.assert_close(render.projected.conics, conics, rtol=1e-4, atol=1e-6)
+    render.image.sum().backward()
+    assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters() if parameter.grad is not None)
+
+
+def test_what_takes_a_splat_takes_flat_discs(tmp_path):
+    model = small_model()
+    with torch.no_grad():
+        model.log_scales[::2] = DISC
+        model.log_scales[1] = -math.inf
+    camera = pinhole(40, 48, 50.0, dtype=torch.float32)
+    views = Views(camera, torch.rand(1, 3, 40, 48), ("0.png",))
+    save_glb(tmp_path / "a.glb", model, torch.eye(3))
+    assert pack(model(), camera, most_bytes=10**6).layout["count"] == len(model)
+    weights = contributions(model, views, near_plane=0.01)
+    assert weights.isfinite().all()
+    assert weights[2] > 0
+    densifier = Densifier(model, torch.optim.Adam(model.parameters()), extent=10.0, grad_threshold=0.0)
+    render = GaussianRenderer()(model(), camera)
+    render.image.sum().backward()
+    densifier.observe(render.projected)
+    report = densifier.step()
+    assert report.cloned > 0
+    assert report.split > 0
+    assert all(not bool(parameter.isnan().any()) for parameter in model.parameters())
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):

@@ -82,11 +82,40 @@ def test_other_elements_are_skipped(tmp_path, order):
     assert load_ply(tmp_path / "a.ply").means.tolist() == [[0, 1, 2], [0, 1, 2]]
 
 
+@pytest.mark.parametrize("place", ["element vertex", "property float x", "end_header"])
+def test_comments_may_stand_anywhere(tmp_path, place):
+    data = handmade(FLOATS, [ROW]).replace(place.encode(), f"comment kgs sh_degree 0\n{place}".encode(), 1)
+    (tmp_path / "a.ply").write_bytes(data)
+    assert load_ply(tmp_path / "a.ply").means.tolist() == [[0, 1, 2]]
+
+
 def test_a_comment_cannot_raise_the_degree(tmp_path):
     save_ply(tmp_path / "a.ply", random_model(sh_degree=1))
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "b.ply").write_bytes(data.replace(b"sh_degree 1", b"sh_degree 3"))
     assert load_ply(tmp_path / "b.ply").sh_degree == 1
+
+
+@pytest.mark.parametrize(
+    ("tags", "antialiased"),
+    [
+        ([], False),
+        (["SplatRenderMode: mip"], True),  # Brush, splat-transform
+        (["SplatRenderMode: default"], False),
+        (["SplatRenderMode: 2dgs"], False),
+        (["antialiased 1"], True),  # Postshot
+        (["antialiased 0"], False),
+        (["splatrendermode mip"], True),
+        (["antialiased 1", "SplatRenderMode: default"], False),  # the last one counts, as in splat-transform
+        (["SplatRenderMode: default", "antialiased 1"], True),
+        (["was not trained with SplatRenderMode: mip"], False),
+    ],
+)
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_tags_of_antialiased_splats(tmp_path, tags, antialiased, newline):
+    lines = [f"comment {tag}" for tag in tags]
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, [ROW], newline=newline, before=[(lines, b"")]))
+    assert load_ply(tmp_path / "a.ply").antialiased is antialiased
 
 
 def without(name):
@@ -132,6 +161,9 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "nothing but numbers"),
         (handmade(FLOATS, [[*ROW[:9], math.inf, *ROW[10:]]]), "opacity", "got inf in row 0"),
         (handmade(FLOATS, [ROW, [*ROW[:16], math.nan]]), "rot_3", "got nan in row 1"),
+        (handmade(FLOATS, [[*ROW[:9], -math.inf, *ROW[10:]]]), "opacity", "got -inf in row 0"),
+        (handmade(FLOATS, [[*ROW[:11], math.inf, *ROW[12:]]]), "scale_1", "got inf in row 0"),
+        (handmade(FLOATS, [[*ROW[:11], math.nan, *ROW[12:]]]), "scale_1", "got nan in row 0"),
         (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "nothing but numbers"),
@@ -219,5 +251,7 @@ def test_mutated_and_truncated_files_load_or_raise_data_errors(tmp_path, order):
         except DataError:
             refused += 1
         else:
-            assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
+            finite = {name: value.isfinite() for name, value in model.named_parameters()}
+            finite["log_scales"] |= model.log_scales == -math.inf
+            assert all(bool(values.all()) for values in finite.values())
     assert refused > 200

@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from factories import random_model
 
 import kgs
+from kgs import GaussianRenderer, save_ply
 from kgs.cli.checks import check_page
 from kgs.cli.page import page
 from kgs.cli.render import render
-from kgs.datasets import synthetic_scene
+from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.image_file import ImageFile
 from kgs.errors import DataError
 
@@ -21,7 +23,7 @@ def splat(tmp_path_factory):
     path = tmp_path_factory.mktemp("splat") / "splat.ply"
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(50, 3, generator=generator) + torch.tensor([-0.5, -0.5, 4.0])
-    kgs.save_ply(path, kgs.GaussianModel.from_points(points, torch.rand(50, 3, generator=generator), 0))
+    save_ply(path, kgs.GaussianModel.from_points(points, torch.rand(50, 3, generator=generator), 0))
     return path
 
 
@@ -82,6 +84,61 @@ def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_pa
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "10 photos of 20 × 15 pixels" in text
     assert '"background":[1.0,1.0,1.0]' in text
+
+
+@pytest.mark.parametrize("tag", [None, "SplatRenderMode: mip", "antialiased 1"])
+def test_a_splat_is_rendered_as_its_tag_says(llff, tmp_path, tag):
+    generator = torch.Generator().manual_seed(0)
+    model = random_model(300, 0)  # small Gaussians: the low-pass filter makes most of the footprint
+    with torch.no_grad():
+        model.means.copy_(2.0 * torch.rand(300, 3, generator=generator) + torch.tensor([-1.0, -1.0, 3.0]))
+        model.log_scales.fill_(-4.0)
+    save_ply(tmp_path / "splat.ply", model)
+    content = (tmp_path / "splat.ply").read_bytes()
+    if tag:
+        content = content.replace(b"element vertex", f"comment {tag}\nelement vertex".encode())
+    (tmp_path / "splat.ply").write_bytes(content)
+    render(tmp_path / "splat.ply", cameras=llff, out=tmp_path / "out")
+    scene = load_scene(llff, train_views=None, hold_out=0)
+    images, camera = {}, scene.train.camera(0)
+    with torch.no_grad():
+        model.means.sub_(scene.offset)
+    for antialiased in (False, True):
+        with torch.no_grad():
+            image = GaussianRenderer(antialiased=antialiased)(model(), camera).image[0]
+        images[antialiased] = 255.0 * image.clamp(0.0, 1.0).permute(1, 2, 0).flip(2).numpy()
+    picture = cv2.imread(str(tmp_path / "out" / "0.png"))
+    assert np.abs(images[True] - images[False]).max() > 50
+    np.testing.assert_allclose(picture, images[tag is not None], rtol=0, atol=1.0)
+
+
+def moved(splat, path, shift):
+    model = kgs.load_ply(splat)
+    with torch.no_grad():
+        model.means.add_(torch.tensor(shift))
+    save_ply(path, model)
+    return path
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, -100.0), (1000.0, 0.0, 0.0)])
+def test_a_splat_that_no_camera_sees_is_refused_before_anything_is_written(splat, llff, tmp_path, shift):
+    path = moved(splat, tmp_path / "moved.ply", shift)
+    for call, out in ((render, "renders"), (page, "page.html")):
+        with pytest.raises(DataError, match=r"moved\.ply: Gaussians: expected some that a camera of .* got none of 50"):
+            call(path, cameras=llff, out=tmp_path / out)
+        assert not (tmp_path / out).exists()
+
+
+def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
+    render(splat, cameras=llff, out=tmp_path / "all")
+    assert "see no Gaussian" not in capsys.readouterr().out
+    poses = np.load(llff / "poses_bounds.npy")
+    for row in (poses[3], poses[7]):
+        row[:15].reshape(3, 5)[:, 1:3] *= -1.0  # turned about
+    np.save(llff / "poses_bounds.npy", poses)
+    render(splat, cameras=llff, out=tmp_path / "some")
+    assert f"these cameras see no Gaussian of {splat}: 3.png, 7.png" in capsys.readouterr().out
+    assert not cv2.imread(str(tmp_path / "some" / "3.png")).any()
 
 
 def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):

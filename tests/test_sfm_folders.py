@@ -17,10 +17,11 @@ from kgs.cli import main
 from kgs.cli.unposed import settle
 from kgs.errors import DataError
 from kgs.io.console import silent
-from kgs.io.json_files import write_json
 from kgs.io.outputs import write_png
 from kgs.io.ownership import MARK
+from kgs.json_files import write_json
 from kgs.sfm import pose, pose_photos
+from kgs.sfm.find import find_photos, notes_on
 from kgs.sfm.place import photo_staging
 from kgs.sfm.read import blurred, open_photos, read_photos
 
@@ -95,6 +96,24 @@ def test_photos_of_a_kind_that_is_not_read(folder, refused):
     save(folder, planes())
     (folder / "raw.dng").write_bytes(b"II*\0")
     refused(folder, "1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible")
+
+
+@pytest.mark.parametrize("heic", [True, False])
+def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
+    monkeypatch.setattr("kgs.datasets.folders.has_heic", lambda: heic)
+    save(folder, planes())
+    for name in ("0.DNG", "1.dng", "2.HEIC", "dynamic_mask_0.png"):
+        (folder / name).write_bytes(b"II*\0")
+    assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
+    said = " ".join(notes_on(folder))
+    for name in ("0.DNG", "1.dng", "2.HEIC", "dynamic_mask"):
+        assert name in said
+
+
+def test_what_names_the_cameras_of_a_folder_too_deep_is_told(folder, refused):
+    save(folder / "images", planes())
+    (folder / "transform_train.json").write_text("{}")
+    refused(folder, "these folders in it do: images", "transform_train.json is not used")
 
 
 def test_a_video_that_is_called_jpeg(folder, refused):

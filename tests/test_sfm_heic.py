@@ -11,7 +11,7 @@ from kgs.datasets import folders
 from kgs.datasets.image_file import is_heic
 from kgs.errors import DataError
 from kgs.io.console import silent
-from kgs.sfm.find import find_photos, list_photos
+from kgs.sfm.find import find_photos, list_photos, notes_on
 from kgs.sfm.read import open_photos, read_photos
 
 pi_heif = pytest.importorskip("pi_heif")
@@ -51,6 +51,15 @@ def test_pixels_are_upright_and_the_lens_is_known(folder):
         assert photo.focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(48, 64))
 
 
+def test_one_that_exif_alone_turns_is_turned(folder):
+    alone = PHOTO.replace(b"irot", b"free")  # a box that says nothing
+    (folder / "IMG_2.HEIC").write_bytes(alone)
+    upright, turned, _ = read_photos(open_photos(find_photos(folder)), silent)
+    assert turned.exif.orientation == 6
+    assert turned.size == (48, 64)
+    np.testing.assert_array_equal(turned.pixels, upright.pixels)
+
+
 @pytest.mark.parametrize("end", [40, 300, 640])
 def test_a_damaged_one_is_named(folder, end):
     (folder / "IMG_2.HEIC").write_bytes(PHOTO[:end])
@@ -79,5 +88,12 @@ def test_without_the_extra_it_is_said_what_to_do(folder, monkeypatch):
 def test_what_a_raw_photo_is_told_does_not_change(folder):
     write_planes(folder)
     (folder / "raw.dng").write_bytes(b"II*\0")
-    with pytest.raises(DataError, match=r"1 of 7 photos cannot be read \(raw\.dng\)"):
+    with pytest.raises(DataError, match=r"1 of \d photos cannot be read \(raw\.dng\)"):
         find_photos(folder)
+
+
+def test_of_a_photo_and_its_conversion_the_jpeg_is_taken(folder):
+    (folder / "img_2.jpg").write_bytes(PHOTO)  # what `magick mogrify` leaves beside IMG_2.HEIC
+    assert [path.name for path in find_photos(folder)] == ["IMG_1.heic", "IMG_3.jpg", "img_2.jpg"]
+    (note,) = notes_on(folder)
+    assert "IMG_2.HEIC" in note

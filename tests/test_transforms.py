@@ -167,6 +167,46 @@ def test_what_tools_write_beside_lenses_and_poses_is_no_error(tmp_path: Path, la
     assert load_scene(tmp_path).notes == ()
 
 
+DESCRIPTIONS: list[dict[str, Any]] = [
+    {"camera_make": "Apple", "camera_model": "iPhone 15 Pro", "lens_model": "iPhone 15 Pro back camera 6.86mm f/1.78"},
+    {"shutter_speed": 0.008, "max_resolution": 3200, "center_depth": 2.5, "pose_confidence": 0.9},
+    {"camera_type": "perspective", "sensor_width": 36.0, "sensor_height": 24.0},
+    {"image_width": WIDTH, "image_height": HEIGHT, "width": WIDTH, "height": float(HEIGHT)},
+]
+
+
+@BOTH
+@pytest.mark.parametrize("where", ["top", "frame"])
+@pytest.mark.parametrize("said", DESCRIPTIONS)
+def test_what_describes_a_camera_is_passed_over(tmp_path: Path, layout: str, where: str, said: dict[str, Any]) -> None:
+    write(tmp_path, layout, LENS)
+    before = load_scene(tmp_path).train.cameras
+    write(tmp_path, layout, {**LENS, **(said if where == "top" else {})}, {}, said if where == "frame" else {})
+    scene = load_scene(tmp_path)
+    assert scene.notes == ()
+    assert scene.train.cameras.intrinsics.equal(before.intrinsics)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"camera_type": "EQUIRECTANGULAR"},
+        {"camera_type": "orthographic"},
+        {"camera_type": 3},
+        {"lens_model": "fisheye"},
+        {"image_width": WIDTH + 1},
+        {"height": 2 * HEIGHT},
+        {"image_height": None, "width": True},
+        {"camera_make": "Insta360", "camera_model": "EQUIRECTANGULAR"},
+    ],
+)
+def test_descriptions_of_another_camera_are_refused(tmp_path: Path, layout: str, said: dict[str, Any]) -> None:
+    write(tmp_path, layout, {**LENS, **said})
+    with pytest.raises(DataError, match=list(said)[-1]):
+        load_scene(tmp_path)
+
+
 @BOTH
 def test_other_things_that_are_not_used_are_noted(tmp_path: Path, layout: str) -> None:
     path = write(tmp_path, layout, {**LENS, "ply_file_path": "sparse.ply"}, {}, {"depth_file_path": "d/1.png"})

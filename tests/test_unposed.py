@@ -12,7 +12,7 @@ from kgs import cli, sfm
 from kgs.cli.unposed import is_unposed
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
-from kgs.io.json_files import write_json
+from kgs.json_files import write_json
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
@@ -50,7 +50,7 @@ def asked(truth, monkeypatch):
     calls = []
 
     def true_cameras(folder, out, **_):
-        calls.append(sorted(path.name for path in folder.iterdir() if path.is_file()))
+        calls.append(sorted(path.name for path in folder.glob("*.png")))
         model = out / "sparse" / "0"
         model.mkdir(parents=True, exist_ok=True)
         (out / "images").mkdir(exist_ok=True)
@@ -81,8 +81,11 @@ def asked(truth, monkeypatch):
 
 def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     out = tmp_path / "out"
-    assert run("fit", folder(4), "-o", out, *FIT) == 0
+    photos = folder(4)
+    (photos / "reconstruction.json").write_text("{}")
+    assert run("fit", photos, "-o", out, *FIT) == 0
     said = capsys.readouterr().out
+    assert said.index("reconstruction.json is not used") < said.index("this takes about")
     assert "this takes about" in said
     assert "4 training and 0 test views of 96x72" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")

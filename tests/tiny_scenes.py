@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from kgs.fit.config import FitConfig
-from kgs.io.json_files import write_json
 from kgs.io.ply import save_ply
+from kgs.json_files import write_json
 from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel
 
@@ -127,9 +127,12 @@ def write_ply(folder: Path, text: bool = False) -> None:
     save_ply(path, GaussianModel.from_points(points, colors, sh_degree=1))
     if text:
         head, body = path.read_bytes().split(b"end_header\n")
-        rows = np.frombuffer(body, "<f4").reshape(5, -1).tolist()
-        lines = "\n".join(" ".join(map(repr, row)) for row in rows)
-        path.write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode() + b"\n")
+        header = head.decode().splitlines()
+        comments = [line for line in header if line.startswith("comment")]  # most programs write them first
+        elements = [line for line in header[2:] if line not in comments]
+        rows = [" ".join(map(repr, row)) for row in np.frombuffer(body, "<f4").reshape(5, -1).tolist()]
+        lines = ["ply", "format ascii 1.0", *comments, *elements, "end_header", *rows]
+        path.write_text("".join(f"{line}\n" for line in lines))
 
 
 def write_config(folder: Path) -> None:

@@ -1,8 +1,9 @@
 """The file layouts that `load_scene` reads, one file each: from a folder to a `FrameSet`."""
 
+from dataclasses import replace
 from pathlib import Path
 
-from kgs.datasets.folders import layout_of, why_no_scene
+from kgs.datasets.folders import layout_of, unused_files, why_no_scene
 from kgs.datasets.frames import FrameSet
 from kgs.errors import DataError
 
@@ -19,4 +20,5 @@ def find_layout(root: Path) -> FrameSet:
     layout = layout_of(root)
     if layout is None:
         raise DataError(root, "", why_no_scene(root))
-    return _READERS[layout](root)
+    frames = _READERS[layout](root)
+    return replace(frames, notes=(*frames.notes, *unused_files(root)))

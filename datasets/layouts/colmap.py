@@ -1,4 +1,7 @@
-"""Scenes with a COLMAP model: `sparse/0` beside `images/` (https://colmap.github.io/cameras.html)."""
+"""Scenes with a COLMAP model: `sparse/0` beside `images/`, or its files beside the photos.
+
+Source: https://colmap.github.io/cameras.html.
+"""
 
 from pathlib import Path
 
@@ -6,37 +9,68 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
-from kgs.datasets.folders import find_model, image_folder
-from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
+from kgs.datasets.folders import find_models, image_folder
+from kgs.datasets.frames import Frame, FrameSet, PointCloud, find_file
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
 from .colmap_model import ColmapCamera, ColmapImage, model_file, read_cameras, read_images, read_points
 
+_LISTED = 20
+
 
 def load_colmap(root: Path) -> FrameSet:
-    """Read the COLMAP model in `sparse/0` or `sparse`.
+    """Read the COLMAP model of a scene, of several the largest one.
+
+    Photos that are gone are left out with a note, unless more than half of them are.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes already; its first pixel's centre is at (0.5, 0.5).
     """
-    folder = find_model(root) or root / "sparse"
-    cameras_file, images_file = model_file(folder, "cameras"), model_file(folder, "images")
-    cameras, images = read_cameras(cameras_file), read_images(images_file)
-    photos, frames, ids = image_folder(root), [], {}
-    for image_id, image in images.items():
+    folder, notes = largest_model(root)
+    cameras_file = model_file(folder, "cameras")
+    images_file = model_file(folder, "images")
+    cameras = read_cameras(cameras_file)
+    photos = image_folder(root)
+    frames = []
+    ids = {}
+    for image_id, image in read_images(images_file).items():
         if image.camera_id not in cameras:
             raise DataError(images_file, image.name, f"has camera {image.camera_id}, which {cameras_file.name} lacks")
-        path = path_inside(images_file, root, image.name, photos)
-        if not path.is_file() and (root / image.name).is_file():
-            path = path_inside(images_file, root, image.name)
+        path = find_file(images_file, root, image.name, photos)
+        if not path.is_file():
+            beside = find_file(images_file, root, image.name)
+            path = beside if beside.is_file() else path
         lens = _intrinsics(cameras[image.camera_id])
         frames.append(Frame(images_file, image.name, ImageFile(path), lens, camera_to_world(image)))
         ids[path] = image_id
-    others = [p.name for p in sorted(folder.parent.iterdir()) if p.name.isdecimal() and p != folder and p.is_dir()]
-    notes = (f"sparse/: only model 0 is read, not {', '.join(others[:20])}",) if folder.name == "0" and others else ()
+    gone = [frame.name for frame in frames if not frame.path.is_file()]
+    if 0 < len(gone) <= len(frames) / 2:
+        notes += (f"{len(gone)} of {len(frames)} photos are gone and left out: {', '.join(gone[:_LISTED])}",)
+        frames = [frame for frame in frames if frame.path.is_file()]
     return FrameSet(frames, model_points=lambda t: track_points(folder, {ids[f.path] for f in t}), notes=notes)
+
+
+def largest_model(root: Path) -> tuple[Path, tuple[str, ...]]:
+    """The folder of the COLMAP model with most images, of a scene that has one, and a note about the others."""
+    folders = find_models(root)
+    if len(folders) == 1:
+        return folders[0], ()
+    counts = {folder: _image_count(folder) for folder in folders}
+    largest = max(folders, key=counts.__getitem__)
+    listed = [f"{folder.relative_to(root)} has {counts[folder]}" for folder in folders if folder != largest]
+    name = largest.relative_to(root)
+    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {', '.join(listed[:_LISTED])}"
+    return largest, (note,)
+
+
+def _image_count(folder: Path) -> int:
+    """How many images a model has; 0 if it is damaged."""
+    try:
+        return len(read_images(model_file(folder, "images")))
+    except DataError:
+        return 0
 
 
 def camera_to_world(image: ColmapImage) -> Tensor:
@@ -54,7 +88,8 @@ def track_points(folder: Path, image_ids: set[int]) -> PointCloud:
 
 
 def _intrinsics(camera: ColmapCamera) -> Intrinsics:
-    numbers, model = camera.params, camera.model
+    numbers = camera.params
+    model = camera.model
     if model.startswith(("SIMPLE_", "RADIAL")):
         numbers = (numbers[0], *numbers)
     fx, fy, cx, cy, *distortion = numbers

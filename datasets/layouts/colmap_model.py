@@ -92,8 +92,21 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
 
 
 def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe."""
-    rows = [row for row, track in _tracks(path) if len(image_ids.intersection(track[::2])) >= 2]
+    """Positions `(P, 3)` and RGB `(P, 3)` of the points in points3D.* that at least two of the given images observe.
+
+    Damage, and points none of which has a track, are a DataError.
+    """
+    rows = []
+    count = 0
+    without_track = 0
+    for row, track in _tracks(path):
+        count += 1
+        without_track += not track
+        if len(image_ids.intersection(track[::2])) >= 2:
+            rows.append(row)
+    if 0 < count == without_track:
+        wanted = "expected points with a track (the photos that observe them)"
+        raise DataError(path, "", f"{wanted}, got {count} without, as LiDAR gives them: use --init file with them")
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")
@@ -119,10 +132,13 @@ class _Binary:
     """A file's bytes, read in order; reading beyond their end is a DataError."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._data, self._at = path, read_bytes(path), 0
+        self._path = path
+        self._data = read_bytes(path)
+        self._at = 0
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
-        at, size = self._at, struct.calcsize(form)
+        at = self._at
+        size = struct.calcsize(form)
         self._need(size, what)
         self._at += size
         return struct.unpack_from(form, self._data, at)
@@ -142,7 +158,8 @@ class _Binary:
     def string(self, what: str) -> str:
         if (end := self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)) < 0:
             raise DataError(self._path, what, "expected a name that ends with a zero byte")
-        text, self._at = self._data[self._at : end], end + 1
+        text = self._data[self._at : end]
+        self._at = end + 1
         try:
             return text.decode("utf-8")
         except UnicodeDecodeError as error:

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kgs.datasets.folders import find_model, image_folder, list_images
+from kgs.datasets.folders import find_models, image_folder, list_images
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
-from .colmap import camera_to_world, track_points
+from .colmap import camera_to_world, largest_model, track_points
 from .colmap_model import model_file, read_images
 
 
@@ -26,7 +26,8 @@ def load_llff(root: Path) -> FrameSet:
         backward axes and its centre in the world, then height, width and focal length in pixels; the principal point
         is the image's centre. The focal length is scaled to the images that are read.
     """
-    source, folder = root / "poses_bounds.npy", image_folder(root)
+    source = root / "poses_bounds.npy"
+    folder = image_folder(root)
     rows = _read_rows(source)
     if folder is None:
         raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")
@@ -34,8 +35,10 @@ def load_llff(root: Path) -> FrameSet:
     if len(paths) != len(rows):
         raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")
     frames = [_frame(source, path, row) for path, row in zip(paths, rows, strict=True)]
-    model = find_model(root)
-    return FrameSet(frames, model_points=None if model is None else partial(_model_points, model, frames))
+    if not find_models(root):
+        return FrameSet(frames)
+    model, notes = largest_model(root)
+    return FrameSet(frames, model_points=partial(_model_points, model, frames), notes=notes)
 
 
 def _read_rows(path: Path) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ import math
 import re
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
-from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,18 +15,19 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.folders import IMAGE_SUFFIXES
-from kgs.datasets.frames import Frame, FrameSet, path_inside
+from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
-from kgs.io.json_files import is_number, read_json
+from kgs.json_files import is_number, read_json
 
 Object = dict[str, Any]
 Values = ChainMap[str, Any]  # what holds for a frame: its own entries, then those of the whole file
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 # The distortion coefficients of Brown-Conrady and of Kannala-Brandt lenses, in OpenCV's order.
-_BROWN, _KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+_BROWN = ("k1", "k2", "p1", "p2", "k3")
+_KANNALA = ("k1", "k2", "k3", "k4")
 _COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
 # Keys that are used; then keys for sorting, framing and normalising a scene, and for what a tool did to the world.
 # The latter change nothing: the world stays that of the file.
@@ -36,7 +36,14 @@ _KNOWN = """
     camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
     aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
     applied_transform applied_scale orientation_override auto_scale_poses_override
+    camera_make camera_serial camera_index lens_make shutter_speed sensor_width sensor_height
+    max_resolution center_depth pose_confidence pose_quality
 """
+# Keys that describe a camera in words, passed over unless they name a lens that is not perspective.
+_DESCRIPTIONS = ("camera_type", "lens_model")
+_OTHER_LENS = re.compile(r"(?i)fish|ftheta|latlong|equirect|panoram|spheric|ortho|omni|360|\bvr")
+# Other names of the image size, passed over where they say the same.
+_SIZES = {"image_width": "w", "image_height": "h", "width": "w", "height": "h"}
 # Other keys that may bear on lenses or poses; they are refused, since ignoring them could give wrong cameras.
 _GEOMETRY = re.compile(
     r"(?i)angle|fov|focal|^f[lxy](_|$)|^[cdfkps][a-z]?_?\d+$|^[ck][xy]?$|principal|center|distort|radial|tangential|lens|"
@@ -67,14 +74,15 @@ def load_nerfstudio(root: Path) -> FrameSet:
 
 def _listed(root: Path, data: Object, key: str, frames: list[Frame]) -> list[Frame]:
     """The frames in the file's list `key` of file names, sorted by name."""
-    source, names = root / "transforms.json", data.get(key) or []
+    source = root / "transforms.json"
+    names = data.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise DataError(source, key, "expected a list of file names")
     by_name = {frame.name: frame for frame in frames}
-    found = sorted({_find_photo(source, root, name) for name in names})
-    if missing := [name for name in found if name not in by_name]:
-        raise DataError(source, key, f"expected names of frames, got {missing[0][:200]!r}")
-    return [by_name[name] for name in found]
+    listed = sorted({_find_photo(source, root, name) for name in names})
+    if unknown := [name for name in listed if name not in by_name]:
+        raise DataError(source, key, f"expected names of frames, got {unknown[0][:200]!r}")
+    return [by_name[name] for name in listed]
 
 
 def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[str, ...]]:
@@ -92,9 +100,10 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(source, "frames", "expected a list of objects, not empty")
     split = {f"{part}_filenames" for part in ("train", "val", "test")} if name == "transforms.json" else set[str]()
-    notes = _check_keys(source, [{key: data[key] for key in data.keys() - split}, *entries])
+    top = {key: data[key] for key in data.keys() - split}
+    notes = _check_keys(source, [ChainMap(top), *(ChainMap(entry, data) for entry in entries)])
     names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
-    images = [ImageFile(path_inside(source, root, name)) for name in names]
+    images = [ImageFile(find_file(source, root, name)) for name in names]
     size = (1, 1)
     if not all("w" in values and "h" in values for values in (ChainMap(entry, data) for entry in entries)):
         size = _first_size(images)
@@ -122,16 +131,25 @@ def _find_photo(source: Path, root: Path, name: str) -> str:
     return next((candidate for candidate in candidates if path_inside(source, root, candidate).is_file()), otherwise)
 
 
-def _check_keys(source: Path, objects: Iterable[Object]) -> tuple[str, ...]:
+def _check_keys(source: Path, objects: Iterable[Values]) -> tuple[str, ...]:
     """Refuse unknown keys that bear on lenses or poses; returns a note about the other unknown keys."""
-    known, unused = set(_KNOWN.split()), set()
-    for key, value in chain.from_iterable(item.items() for item in objects):
-        if key in known or _is_empty(value):
-            continue
-        if _GEOMETRY.search(key) or key.endswith("_filenames"):
-            raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
-        unused.add(key[:60])
+    known = set(_KNOWN.split())
+    unused = set()
+    for values in objects:
+        for key, value in values.maps[0].items():
+            if key in known or _is_empty(value) or _is_harmless(key, value, values):
+                continue
+            if _GEOMETRY.search(key) or key.endswith("_filenames"):
+                raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
+            unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
+
+
+def _is_harmless(key: str, value: Any, values: Values) -> bool:
+    """Whether a key only repeats or describes what other keys say of the camera."""
+    if key in _DESCRIPTIONS:
+        return isinstance(value, str) and not _OTHER_LENS.search(value)
+    return key in _SIZES and is_number(value) and value == values.get(_SIZES[key])
 
 
 def _is_empty(value: Any) -> bool:
@@ -141,27 +159,36 @@ def _is_empty(value: Any) -> bool:
 def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
     """A frame's lens; `size` is the image size if the file does not give it."""
     fisheye = _is_fisheye(source, values)
-    width, height = _number(source, "w", values, size[0]), _number(source, "h", values, size[1])
+    width = _number(source, "w", values, size[0])
+    height = _number(source, "h", values, size[1])
     if not (width.is_integer() and height.is_integer()):
         raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
-    fx, fy = _focal(source, "x", values, width), _focal(source, "y", values, height)
-    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    fx = _focal(source, "x", values, width)
+    fy = _focal(source, "y", values, height)
+    fx = fy if fx is None else fx
+    fy = fx if fy is None else fy
     if fx is None or fy is None:
         raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
-    used, frame = _KANNALA if fisheye else _BROWN, values.maps[0]
+    used = _KANNALA if fisheye else _BROWN
+    frame = values.maps[0]
     of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else values
     for key in _COEFFICIENTS:
         if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
             raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
     distortion = tuple(_number(source, key, values, 0.0) for key in used)
-    cx, cy = _number(source, "cx", values, width / 2), _number(source, "cy", values, height / 2)
+    cx = _number(source, "cx", values, width / 2)
+    cy = _number(source, "cy", values, height / 2)
     return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
 
 
 def _is_fisheye(source: Path, values: Values) -> bool:
     """Whether the lens is a fisheye: nerfstudio names the model in `camera_model`, instant-ngp has `is_fisheye`."""
-    model, flag, known = _text(source, "camera_model", values, ""), values.get("is_fisheye"), (*_PERSPECTIVE, _FISHEYE)
+    model = _text(source, "camera_model", values, "")
+    flag = values.get("is_fisheye")
+    known = (*_PERSPECTIVE, _FISHEYE)
+    if "camera_make" in values and model not in known and not _OTHER_LENS.search(model):
+        model = ""  # of the device, as in Exif
     if model not in ("", *known):
         raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {', '.join(known)}")
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
@@ -202,7 +229,8 @@ def _shown(value: Any) -> str:
 
 def _opencv_pose(path: Path, frame: Object) -> Tensor:
     """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64."""
-    rows, name = frame.get("transform_matrix"), f"transform_matrix of {str(frame.get('file_path'))[:200]}"
+    rows = frame.get("transform_matrix")
+    name = f"transform_matrix of {str(frame.get('file_path'))[:200]}"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
     if len(rows) != 4 or not all(is_number(x) for row in rows for x in row):

@@ -26,7 +26,8 @@ from .world import World
 KINDS = ("room", "orbit", "arc")
 SUPERSAMPLING = 2  # rays along each side of a pixel
 ARC_RADIUS = 2.6  # m from the middle of the arc's cameras to what they look at
-ARC_SPAN, ARC_HEIGHT = np.radians(25.0), 0.12  # half the extent of the arc's cameras: an angle, and m up and down
+ARC_SPAN = np.radians(25.0)  # half the angle over which the arc's cameras extend
+ARC_HEIGHT = 0.12  # m: half their extent up and down
 ARC_CENTER = garden.CENTER + np.array([0.0, -0.2, 0.0])  # what they look at: the horizon is in the middle of the image
 
 
@@ -72,9 +73,11 @@ def synthetic_scene(
     setup = _setup(kind, seed)
     train_eyes, test_eyes = setup.place(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
-        train, test = (_views(setup, eyes, size, name) for eyes, name in ((train_eyes, "train"), (test_eyes, "test")))
-        none, black = (torch.zeros(*shape, dtype=torch.float32) for shape in ((0, 3), (3,)))
-        return Scene(train, test, none, none, "none", black.double(), black, Path("synthetic"))
+        train = _views(setup, train_eyes, size, "train")
+        test = _views(setup, test_eyes, size, "test")
+        no_points = torch.zeros(0, 3, dtype=torch.float32)
+        black = torch.zeros(3, dtype=torch.float32)
+        return Scene(train, test, no_points, no_points, "none", black.double(), black, Path("synthetic"))
 
 
 def synthetic_views(
@@ -135,7 +138,8 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) 
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
-    size, triangles = sizes.pop(), _setup(kind, seed).world.triangles
+    size = sizes.pop()
+    triangles = _setup(kind, seed).world.triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
     return torch.from_numpy(np.stack(depths)[:, None])
@@ -158,10 +162,12 @@ def _make_setup(kind: str, seed: int) -> _Setup:
 
 
 def _views(setup: _Setup, eyes: Array, size: tuple[int, int], split: str) -> Views:
-    (height, width), count = size, len(eyes)
+    (height, width) = size
+    count = len(eyes)
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
     intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = setup.focal * max(size)
-    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
+    intrinsics[:, 0, 2] = (width - 1) / 2
+    intrinsics[:, 1, 2] = (height - 1) / 2
     extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
     images = np.zeros((count, 3, height, width), dtype=np.float32)
     for i, eye in enumerate(eyes):
@@ -174,7 +180,8 @@ def _views(setup: _Setup, eyes: Array, size: tuple[int, int], split: str) -> Vie
 
 def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
-    s, fine = SUPERSAMPLING, intrinsics[:3, :3].copy()
+    s = SUPERSAMPLING
+    fine = intrinsics[:3, :3].copy()
     fine[:2] *= s
     fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
     depths, faces = raycast(setup.world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
@@ -209,7 +216,8 @@ def _eyes_beyond_arc(count: int, out: float) -> Array:
 
 def _on_arc(flat: Array) -> Array:
     """Places `(n, 3)` of coordinates `(n, 2)` along the arc and up, in halves of its extent."""
-    angles, heights = ARC_SPAN * flat[:, 0], ARC_HEIGHT * flat[:, 1]
+    angles = ARC_SPAN * flat[:, 0]
+    heights = ARC_HEIGHT * flat[:, 1]
     return np.asarray(ARC_CENTER + ARC_RADIUS * np.stack([np.sin(angles), heights / ARC_RADIUS, -np.cos(angles)], -1))
 
 

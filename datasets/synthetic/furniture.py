@@ -35,7 +35,9 @@ def plain(color: Color) -> Texture:
 
 def wood(rng: np.random.Generator, color: Color, along: int = 0, plank: float = np.inf) -> Texture:
     """Wood with its grain along one axis; in planks `plank` metres wide, each of its own shade, if a width is given."""
-    grain, cloud, shades = field(rng, 0.02, 0.09), field(rng, 0.2, 0.6), rng.normal(size=64)
+    grain = field(rng, 0.02, 0.09)
+    cloud = field(rng, 0.2, 0.6)
+    shades = rng.normal(size=64)
     stretch = np.where(np.arange(3) == along, 0.08, 1.0).astype(np.float32)
 
     def texture(points: Array) -> Array:
@@ -118,7 +120,9 @@ def mug(color: Color) -> list[Part]:
     cup = lathe([(0.0, 0.0), (0.046, 0.0), (0.052, 0.008), (0.052, 0.108), (0.047, 0.11), (0.046, 0.09), (0.0, 0.09)])
     handle = trimesh.creation.torus(0.033, 0.009, major_sections=24, minor_sections=10)
     handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    white, tea, glaze = albedo((245, 240, 230)), albedo((107, 51, 18)), albedo(color)
+    white = albedo((245, 240, 230))
+    tea = albedo((107, 51, 18))
+    glaze = albedo(color)
 
     def texture(points: Array) -> Array:
         inside = np.hypot(points[:, 0], points[:, 1]) < 0.0475
@@ -131,13 +135,17 @@ def mug(color: Color) -> list[Part]:
 
 def plant(rng: np.random.Generator) -> list[Part]:
     """Leaves that rise from a pot of clay and bend outwards."""
-    clay, soil = plain((194, 102, 66)), plain((51, 33, 23))
+    clay = plain((194, 102, 66))
+    soil = plain((51, 33, 23))
     pot = [(0.0, 0.0), (0.07, 0.0), (0.1, 0.13), (0.113, 0.13), (0.113, 0.165), (0.098, 0.165), (0.095, 0.14)]
     parts = [Part(lathe(pot), clay), Part(lathe([(0.1, 0.145), (0.0, 0.15)]), soil)]
     for k in range(20):
-        length, width = rng.uniform(0.3, 0.42), rng.uniform(0.034, 0.046)
-        lean, bend = 0.12 + 0.75 * (k / 19) + rng.uniform(-0.05, 0.05), rng.uniform(0.4, 0.9)
-        turn, hue = 2.4 * k + rng.uniform(-0.3, 0.3), rng.uniform(-0.04, 0.04)
+        length = rng.uniform(0.3, 0.42)
+        width = rng.uniform(0.034, 0.046)
+        lean = 0.12 + 0.75 * (k / 19) + rng.uniform(-0.05, 0.05)
+        bend = rng.uniform(0.4, 0.9)
+        turn = 2.4 * k + rng.uniform(-0.3, 0.3)
+        hue = rng.uniform(-0.04, 0.04)
         parts.append(Part(_leaf(length, width, lean, bend, turn), _leaf_green(turn, hue)))
     return parts
 

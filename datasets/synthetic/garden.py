@@ -16,17 +16,24 @@ from .textures import Texture, field
 from .world import Placed, World, make_world, put
 
 CENTER = np.array([0.0, -0.55, 1.75])  # what the cameras look at
-RADIUS, HEIGHT = 2.3, 0.55  # m: of the circle of the cameras, and of its middle above `CENTER`
+RADIUS = 2.3  # m: of the circle of the cameras
+HEIGHT = 0.55  # m: of the middle of that circle above `CENTER`
 FOCAL = 0.9  # focal length over the longer side of the image
-SUN, SKY = np.array([-0.5, -0.75, -0.45]), np.array([0.0, -1.0, 0.0])  # towards the sun and the middle of the sky
+SUN = np.array([-0.5, -0.75, -0.45])  # towards the sun
+SKY = np.array([0.0, -1.0, 0.0])  # towards the middle of the sky
 DOME = 9.0  # m: radius of the sky
 HORIZON_DISTANCE = 900.0  # m: radius of a sky that is as good as infinitely far away
 # Metres from the middle at which the grass has lost half its contrast, under a far sky: less for pixels to alias.
 PLAIN = 8.0
-TERRACE, SLAB, JOINT = 1.55, 0.42, 0.012  # radius of the terrace, side of a slab, half of the gap between two
+TERRACE = 1.55  # m: radius of the terrace
+SLAB = 0.42  # m: side of a slab
+JOINT = 0.012  # m: half of the gap between two slabs
 GRASS, MOSS = (96, 142, 62), (74, 96, 52)
-HORIZON, ZENITH, CLOUD = (222, 234, 242), (86, 146, 214), (255, 255, 255)
-FAR_HILLS, NEAR_HILLS = (132, 162, 150), (84, 128, 78)
+HORIZON = (222, 234, 242)
+ZENITH = (86, 146, 214)
+CLOUD = (255, 255, 255)
+FAR_HILLS = (132, 162, 150)
+NEAR_HILLS = (84, 128, 78)
 
 
 def make_garden(seed: int, far_sky: bool = False) -> World:
@@ -67,7 +74,9 @@ def _dome(radius: float) -> trimesh.Trimesh:
 
 def _sky(rng: np.random.Generator) -> Texture:
     """Two ranges of hills at the horizon, paler sky above them, clouds; by the direction from the dome's middle."""
-    cloud, detail, wood = field(rng, 0.5, 1.6), field(rng, 0.15, 0.5), field(rng, 0.06, 0.2)
+    cloud = field(rng, 0.5, 1.6)
+    detail = field(rng, 0.15, 0.5)
+    wood = field(rng, 0.06, 0.2)
     phases = rng.uniform(0.0, 2 * np.pi, size=(2, 3))
     horizon, zenith, white, far, near = (
         make.albedo(color) for color in (HORIZON, ZENITH, CLOUD, FAR_HILLS, NEAR_HILLS)
@@ -97,10 +106,15 @@ def _sky(rng: np.random.Generator) -> Texture:
 
 def _ground(rng: np.random.Generator, fade: float) -> Texture:
     """Slabs of stone, each of its own shade, with moss between them; grass beyond the terrace, even beyond `fade` m."""
-    patch, blades, grain = field(rng, 0.5, 2.0), field(rng, 0.05, 0.2), field(rng, 0.03, 0.15)
-    shades, tints = rng.normal(size=(64, 64)), rng.normal(size=(64, 64))
-    grass, moss = make.albedo(GRASS), make.albedo(MOSS)
-    stone, warm = make.albedo((178, 170, 158)), make.albedo((192, 158, 128))
+    patch = field(rng, 0.5, 2.0)
+    blades = field(rng, 0.05, 0.2)
+    grain = field(rng, 0.03, 0.15)
+    shades = rng.normal(size=(64, 64))
+    tints = rng.normal(size=(64, 64))
+    grass = make.albedo(GRASS)
+    moss = make.albedo(MOSS)
+    stone = make.albedo((178, 170, 158))
+    warm = make.albedo((192, 158, 128))
 
     def texture(points: Numbers) -> Numbers:
         cells = points[:, :2] / SLAB

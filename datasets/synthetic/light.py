@@ -15,8 +15,10 @@ MAP_SIZE = 288  # pixels along each side of a depth map
 DISTANCE = 30.0  # m from the middle of the casters to each lamp
 LIFT = 0.012  # m above its surface at which a point looks for lamps: higher than the steps of the depth maps
 AMBIENT = np.float32(0.16)  # what reaches every point
-NUM_SUN, NUM_SKY = 6, 18  # lamps
-SUN_COLOR, SKY_COLOR = (0.74, 0.68, 0.58), (0.5, 0.54, 0.6)
+NUM_SUN = 6  # lamps of the sun
+NUM_SKY = 18  # lamps of the sky
+SUN_COLOR = (0.74, 0.68, 0.58)
+SKY_COLOR = (0.5, 0.54, 0.6)
 CHUNK = 4096  # points at a time, so that all arrays stay in the cache
 
 
@@ -35,13 +37,16 @@ def daylight(casters: Array, sun: Array, sky: Array) -> Lights:
     `sun` and `sky` `(3,)` are unit vectors from the scene towards the sun and towards the middle of the sky.
     """
     low, high = casters.min(axis=(0, 1)), casters.max(axis=(0, 1))
-    middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
+    middle = (low + high) / 2
+    radius = np.linalg.norm(high - low) / 2
     directions = np.concatenate([_cap(sun, NUM_SUN, 0.9985), _cap(sky, NUM_SKY, 0.0)])
     colors = np.repeat([SUN_COLOR, SKY_COLOR], [NUM_SUN, NUM_SKY], axis=0)
     colors /= np.repeat([NUM_SUN, 0.5 * NUM_SKY], [NUM_SUN, NUM_SKY])[:, None]  # 0.5: the mean cosine
-    focal, center = 0.5 * (MAP_SIZE - 2) * np.sqrt(DISTANCE**2 - radius**2) / radius, (MAP_SIZE - 1) / 2
+    focal = 0.5 * (MAP_SIZE - 2) * np.sqrt(DISTANCE**2 - radius**2) / radius
+    center = (MAP_SIZE - 1) / 2
     intrinsics = np.array([[focal, 0, center], [0, focal, center], [0, 0, 1.0]])
-    rows, depths = [], []
+    rows = []
+    depths = []
     for direction in directions:
         extrinsics = np.eye(4)
         extrinsics[:3, :3] = _frame(-direction).T
@@ -55,8 +60,10 @@ def daylight(casters: Array, sun: Array, sky: Array) -> Lights:
 def received(lights: Lights, points: Array, normals: Array) -> NDArray[np.float32]:
     """The light `(n, 3)` on points `(n, 3)` with unit normals `(n, 3)`: Lambert's cosine, over all lamps in sight."""
     lifted = np.concatenate([points + LIFT * normals, np.ones((len(points), 1))], axis=1).astype(np.float32)
-    normals, light = normals.astype(np.float32), np.empty(points.shape, np.float32)
-    size, first = lights.depths.shape[1], np.arange(len(lights.depths)) * lights.depths[0].size
+    normals = normals.astype(np.float32)
+    light = np.empty(points.shape, np.float32)
+    size = lights.depths.shape[1]
+    first = np.arange(len(lights.depths)) * lights.depths[0].size
     for start in range(0, len(points), CHUNK):
         rows = slice(start, start + CHUNK)
         u, v, z = (lifted[rows] @ matrix for matrix in lights.rows)
@@ -71,7 +78,8 @@ def _cap(axis: Array, count: int, least: float) -> Array:
     """Directions `(count, 3)` spread evenly over the cap whose angle to the axis has at least that cosine."""
     k = np.arange(count) + 0.5
     cosine = 1 - (1 - least) * k / count
-    turn, sine = k * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - cosine**2)
+    turn = k * np.pi * (3 - np.sqrt(5))
+    sine = np.sqrt(1 - cosine**2)
     return np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1) @ _frame(axis).T
 
 

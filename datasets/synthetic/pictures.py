@@ -72,7 +72,9 @@ def outlook(rng: np.random.Generator, width: float, height: float) -> Picture:
 def rug(rng: np.random.Generator, width: float, height: float) -> Picture:
     """A woven rug: borders around rows of diamonds."""
     hue = rng.choice([0.0, 0.56, 0.95])
-    ground, light, dark = tone(hue, 0.7, 0.6), (237, 219, 184), tone(hue + 0.55, 0.5, 0.35)
+    ground = tone(hue, 0.7, 0.6)
+    light = (237, 219, 184)
+    dark = tone(hue + 0.55, 0.5, 0.35)
     picture = blank(width, height, ground)
     rows, columns = picture.shape[:2]
     for inset, color in ((0.02, light), (0.04, dark), (0.09, light), (0.11, ground)):

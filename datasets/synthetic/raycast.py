@@ -26,7 +26,8 @@ def raycast(triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[
     """
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
         raise ValueError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")
-    (height, width), intrinsics = size, intrinsics[:3, :3]
+    (height, width) = size
+    intrinsics = intrinsics[:3, :3]
     a, b, c = corners = triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
     normals = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
     det = np.einsum("fi,fi->f", a, normals[0])
@@ -36,7 +37,8 @@ def raycast(triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[
     w0, w1, w2 = (x[face] * u + y[face] * v + z[face] for x, y, z in edges)
     total = w0 + w1 + w2
     hit = np.flatnonzero((w0 >= 0) & (w1 >= 0) & (w2 >= 0) & (total > 0))
-    face, pixel = face[hit], v[hit] * width + u[hit]
+    face = face[hit]
+    pixel = v[hit] * width + u[hit]
     distance = np.abs(det[face]) / total[hit]
     depths = np.full(height * width, np.inf)
     np.minimum.at(depths, pixel, distance)

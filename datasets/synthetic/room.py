@@ -18,7 +18,8 @@ CENTER = np.array([0.0, -0.6, 1.75])  # what they look at
 FOCAL = 0.9  # focal length over the longer side of the image
 SUN = np.array([-0.42, -0.62, -0.66])  # unit vectors towards the sun and the middle of the sky
 SKY = np.array([0.1, -0.75, -0.65])
-WALL, TABLE = 2.5, 0.42  # z of the wall, and the height of the table's top
+WALL = 2.5  # z of the wall
+TABLE = 0.42  # height of the table's top
 TITLES = ("ATLAS", "BIRDS", "MOON", "TREES", "STARS", "RIVERS", "BREAD", "MUSIC", "CHESS", "SNOW", "OCEAN", "HORSES")
 HUES = (0.0, 0.58, 0.11, 0.36, 0.07, 0.76, 0.48, 0.95, 0.63, 0.27, 0.03, 0.54)  # of the books
 INKS = ((247, 235, 204), (250, 209, 102))
@@ -34,7 +35,8 @@ def make_room(seed: int) -> World:
 
 def _shell(rng: np.random.Generator) -> list[Placed]:
     """Floor, wall, rug, window and picture: nothing stands behind or under them."""
-    boards, oak = make.wood(rng, (158, 107, 66), plank=0.14), make.wood(rng, (102, 61, 33))
+    boards = make.wood(rng, (158, 107, 66), plank=0.14)
+    oak = make.wood(rng, (102, 61, 33))
     skirting = make.Part(make.box((9.0, 0.02, 0.09), (0, -0.01, 0.045)), make.plain(WHITE))
     carpet = make.printed(rug(rng, 1.9, 1.1), 1.9, 1.1, axes=(0, 1))
     window = make.framed(outlook(rng, 0.7, 0.8), 0.7, 0.8, make.plain(WHITE), 0.05) + make.bars(0.7, 0.8, WHITE)
@@ -55,7 +57,8 @@ def things(rng: np.random.Generator) -> list[Placed]:
     covers = [tone(hue, rng.uniform(0.65, 0.8), rng.uniform(0.5, 0.75)) for hue in rng.permutation(HUES)]
     x, z = -0.47, TABLE
     for k in range(9):  # six that stand in a row, and a pile of three
-        length, thickness = rng.uniform(0.3, 0.36), rng.uniform(0.062, 0.078)
+        length = rng.uniform(0.3, 0.36)
+        thickness = rng.uniform(0.062, 0.078)
         book = make.book(titles[k], length, 0.22, thickness, covers[k], INKS[k % 2])
         if k < 6:
             placed += put(book, x, 1.78, TABLE + length / 2, upright=True)
@@ -79,8 +82,10 @@ def things(rng: np.random.Generator) -> list[Placed]:
 
 def _wallpaper(rng: np.random.Generator) -> Texture:
     """Small diamonds in rows that are shifted by half, on a warm ground."""
-    cloud, hue = field(rng, 0.15, 0.8), rng.choice([0.09, 0.11, 0.13])
-    ground, motif = make.albedo(tone(hue, 0.24, 0.93)), make.albedo(tone(hue, 0.36, 0.86))
+    cloud = field(rng, 0.15, 0.8)
+    hue = rng.choice([0.09, 0.11, 0.13])
+    ground = make.albedo(tone(hue, 0.24, 0.93))
+    motif = make.albedo(tone(hue, 0.36, 0.86))
 
     def texture(points: Numbers) -> Numbers:
         x, z = points[:, 0] / 0.16, points[:, 2] / 0.16

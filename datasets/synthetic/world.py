@@ -53,9 +53,11 @@ class World:
 
     def shade(self, points: Array, faces: Index) -> Array:
         """Colours `(n, 3)` of points `(n, 3)` on triangles `(n,)`: daylight on the parts' textures."""
-        owners, colors = self.owners[faces], np.empty((len(points), 3))
+        owners = self.owners[faces]
+        colors = np.empty((len(points), 3))
         for owner in np.unique(owners):
-            rows, frame = np.flatnonzero(owners == owner), self.frames[owner]
+            rows = np.flatnonzero(owners == owner)
+            frame = self.frames[owner]
             colors[rows] = self.textures[owner](((points[rows] - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32))
         light = received(self.lights, points, _between(self.triangles[faces], self.normals[faces], points))
         light[faces < self.unlit] = 1.0

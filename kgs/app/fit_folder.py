@@ -24,12 +24,12 @@ from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
 from kgs.io.console import each, progress, say
 from kgs.io.figures import write_curve
-from kgs.io.json_files import write_json
 from kgs.io.outputs import check_folder, png_names, write_png
 from kgs.io.ownership import is_own
 from kgs.io.ply import save_ply
 from kgs.io.results_folder import CHECKPOINT, is_finished, locked, replaced_files
 from kgs.io.staging import Staging
+from kgs.json_files import write_json
 from kgs.machine import check_packages
 from kgs.metrics.lpips import Lpips
 from kgs.page.fit_page import write_own_page

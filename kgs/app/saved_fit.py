@@ -14,8 +14,8 @@ from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.poses import place_cameras
 from kgs.fit.state import check_plain
-from kgs.io.json_files import read_json
 from kgs.io.results_folder import CHECKPOINT, complete_stopped_move
+from kgs.json_files import read_json
 from kgs.model import GaussianModel
 from kgs.types import RasterOptions
 

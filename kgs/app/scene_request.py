@@ -8,7 +8,7 @@ from typing import Any, Self
 from kgs.datasets.load import load_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.io.json_files import is_number
+from kgs.json_files import is_number
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from kgs.io.json_files import write_json
+from kgs.json_files import write_json
 from kgs.machine import versions
 
 Row = dict[str, Any]

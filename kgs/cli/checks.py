@@ -16,17 +16,17 @@ from kgs.datasets import folders
 from kgs.datasets.options import check_options
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
-from kgs.io.json_files import read_json
 from kgs.io.outputs import EXPORTS, check_folder
 from kgs.io.ownership import is_own
 from kgs.io.results_folder import replaced_files
 from kgs.io.staging import Staging
+from kgs.json_files import read_json
 from kgs.metrics.weights import weight_files
 
 from .unposed import is_unposed
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
-_ALWAYS = ("torch", "kornia", "numpy", "cv2")
+_ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
 # Kinds of devices of torch; a plugin (entry point "torch.backends") may bring others.
 _DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "maia", "lazy", "vulkan", "meta")
 
@@ -53,7 +53,7 @@ def check_fit(
         raise ValueError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
     unposed = is_unposed(scene)
-    of_photos = ("pycolmap", "PIL") if unposed else ()
+    of_photos = ["pycolmap"] if unposed else []
     _check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2", *of_photos)
     if lpips_weights is not None:
         weight_files(lpips_weights)
@@ -165,20 +165,20 @@ def _why_no_device(kind: str) -> str:
 
 
 def _check_layout(scene: Path) -> None:
-    """A DataError where this is no scene."""
+    """Raise a DataError unless this is a scene."""
     if folders.layout_of(scene) is None:
         raise DataError(scene, "", folders.why_no_scene(scene))
 
 
 def _check_scene(scene: Path) -> None:
-    """A DataError where this is no scene, or one without a single photo."""
+    """Raise a DataError unless this is a scene with at least one photo."""
     _check_layout(scene)
     if not folders.has_photos(scene):
         raise DataError(scene, "", "has camera poses but no photos: expected them in images/, or where its files say")
 
 
 def _check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
-    """What can be said of unposed photos; their headers are read where a factor shrinks them."""
+    """Check a folder of unposed photos and what is asked of it; reads their headers only where `downscale` is given."""
     from kgs.sfm.find import find_photos
     from kgs.sfm.place import check_place
 

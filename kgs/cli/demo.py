@@ -79,10 +79,10 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
     from kgs.io.figures import write_curve, write_sheet
-    from kgs.io.json_files import write_json
     from kgs.io.outputs import film_in
     from kgs.io.ply import save_ply
     from kgs.io.staging import Staging
+    from kgs.json_files import write_json
     from kgs.page.fit_page import PAGE, write_fit_page
 
     points = choose_points(scene, config, each)

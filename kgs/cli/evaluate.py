@@ -25,8 +25,8 @@ def evaluate(
         backend: auto: that of the fit.
     """
     from kgs.app.saved_fit import load_fit
-    from kgs.io.json_files import write_json
     from kgs.io.ownership import is_own, record
+    from kgs.json_files import write_json
     from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips

@@ -23,6 +23,8 @@ def render(
 ) -> None:
     """Render a splat from every camera of a scene into PNGs.
 
+    A splat that its file calls antialiased is rendered so. If no camera sees the splat, nothing is written.
+
     For example:
       kgs render fern-3/splat.ply --cameras fern -o renders
       kgs render fern-3/splat.ply --cameras fern -o small --downscale 8 --background white
@@ -44,18 +46,20 @@ def render(
     from kgs.machine import check_tools
 
     place = check_tools(device, backend)
-    clear = background == "transparent"
-    scene = load_cameras(cameras, downscale, background="black" if clear else background)
+    is_transparent = background == "transparent"
+    scene = load_cameras(cameras, downscale, background="black" if is_transparent else background)
     model, renderer = load_splat(ply, scene, place, backend)
-    posed = [(name, scene.train.camera(i)) for i, name in enumerate(scene.train.names)]
-    names = png_names(name for name, _ in posed)
+    names = png_names(scene.train.names)
     check_folder(out, names.values(), scene.root)
     claim(out, "renders", names.values())
-    outputs, behind = ("image", "alpha") if clear else ("image",), scene.background.to(place)
-    for name, camera in each(posed, "pictures", "view"):
+    color = scene.background.to(place)
+    outputs = ("image", "alpha") if is_transparent else ("image",)
+    for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
         with torch.no_grad():
-            seen = renderer(model(), move_camera(camera, place), behind, outputs)
-        image = torch.cat([seen.image / seen.alpha.clamp_min(1e-6), seen.alpha], 1) if clear else seen.image
+            rendering = renderer(model(), move_camera(scene.train.camera(i), place), color, outputs)
+        image = rendering.image
+        if is_transparent:  # PNG's colours are not multiplied by alpha
+            image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
         write_png(out / names[name], image[0])
     record(out, "renders", names.values())
     say(f"{len(names)} pictures in {printable(out)}")

@@ -40,7 +40,10 @@ def find_scene(
         DataError: as of `pose_photos`.
     """
     from kgs.sfm import pose_photos
+    from kgs.sfm.find import notes_on
 
+    for note in notes_on(photos):
+        say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
     kept = max(report["size"])

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from kgs.errors import DataError
-from kgs.io.json_files import parse_json
+from kgs.json_files import parse_json
 
 from .state import digest
 

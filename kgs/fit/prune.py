@@ -93,7 +93,7 @@ def contributions(model: GaussianModel, views: Views, near_plane: float, **optio
 
     It is the gradient of the sum of all images with respect to the Gaussian's colour. `options` go to the renderer.
     """
-    renderer = GaussianRenderer(near_plane=near_plane, **options).eval()
+    renderer = GaussianRenderer(near_plane=near_plane, antialiased=model.antialiased, **options).eval()
     with torch.no_grad():
         gaussians = model()
     colors = torch.zeros_like(gaussians.means).requires_grad_()

@@ -5,6 +5,7 @@ from typing import Any
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.init_points import InitialPoints, initial_points
+from kgs.init_points.in_view import check_in_view
 from kgs.progress import Stage, silent
 
 from .config import FitConfig
@@ -43,13 +44,14 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Ini
         stage: shows the progress.
 
     Raises:
-        DataError: the scene, or the file, has none.
+        DataError: the scene, or the file, has none, or no training image shows one.
     """
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
             reason = f"expected points of the layout itself for the init {kind!r}, got none"
             raise DataError(scene.root, "points", reason)
+        check_in_view(scene.points, scene.train, scene.root)
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer
     options: dict[str, Any] = {
@@ -60,4 +62,6 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Ini
         "file": config.init_file,
         "origin": scene.offset,  # files that kgs writes are in the world's coordinates
     }
-    return initial_points(views, kind, stage=stage, backend=config.backend, **options)
+    points = initial_points(views, kind, stage=stage, backend=config.backend, **options)
+    check_in_view(points.points, scene.train, config.init_file or scene.root)
+    return points

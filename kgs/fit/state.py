@@ -16,7 +16,7 @@ from kgs.densify import Densifier
 from kgs.drop import DropGaussian
 from kgs.geometry import camera_extent, typical_depths
 from kgs.init_points import InitialPoints
-from kgs.io.json_files import is_number
+from kgs.json_files import is_number
 from kgs.model import PARAMETERS, GaussianModel
 
 from .config import FitConfig

@@ -8,8 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-
-from .json_files import write_whole
+from kgs.json_files import write_whole
 
 # One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The
 # study has more of them (kgs/bench/study/plots.py); pages show black as the colour of their text.

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from kgs.datasets.folders import CAMERAS_REPORT, list_images
 from kgs.errors import DataError
+from kgs.json_files import write_whole
 
-from .json_files import write_whole
 from .ownership import is_own
 
 if TYPE_CHECKING:

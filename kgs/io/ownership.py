@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.errors import DataError
-
-from .json_files import read_json, write_json
+from kgs.json_files import read_json, write_json
 
 LIST = ".kgs.json"
 _DEPTH = 3  # levels of folders between a file and the list that names it

@@ -9,7 +9,6 @@ import os
 import re
 import warnings
 from dataclasses import dataclass, field
-from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,64 +18,91 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.errors import DataError
-from kgs.model import GaussianModel
+from kgs.json_files import write_whole
+from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
 
-from .json_files import write_whole
-
-MAX_HEADER = 1 << 16
+MAX_HEADER = 1 << 16  # bytes
+# NumPy's codes for the formats and types of PLY files.
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 SCALARS = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+_REST_COUNTS = [3 * (size - 1) for size in SH_SIZES]  # properties f_rest, by degree
 
 
-def save_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None) -> None:
-    """Write a model as a 3DGS PLY file, all harmonics included; the file appears whole or not at all.
+def save_ply(
+    path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None, sh_degree: int | None = None
+) -> None:
+    """Write a model as a 3DGS PLY file with all its harmonics. The write is atomic.
 
     Values are float32, as viewers expect: a float32 model without offset comes back from :func:`load_ply` bit for bit.
-    Where float32 would move more than a tenth of the Gaussians by more than a thousandth of their largest axis (a scene
-    in map coordinates, millions of metres from its origin) x, y and z are doubles. A viewer that reads floats alone
-    cannot show such a scene: write it without the offset. The active degree is a comment.
+    Positions are doubles where float32 would move more than a tenth of the Gaussians by more than a thousandth of their
+    largest axis, as in map coordinates, millions of metres from the origin. Viewers that read floats only cannot show
+    such a file: write it without the offset. Comments hold the active degree, and the tag of an antialiased model.
 
     Args:
         path: the file to write, or a link to it; its folder exists.
         model: the Gaussians.
         offset: added in float64 to the means on the way out, `(3,)`; the `offset` of a Scene.
+        sh_degree: the degree of the harmonics in the file, from the model's to 3. Those that the model lacks are
+            written as zeros, for programs that read files of degree 3 only. None: the model's.
 
     Raises:
         TypeError: `model` is not a GaussianModel.
-        ValueError: `offset` has another shape, or a value is not finite in float32.
+        ValueError: `offset` has another shape, `sh_degree` is out of range, or a value is not finite in float32.
     """
     check_kind("model", model, GaussianModel)
+    bands = SH_SIZES[_degree_of_file(sh_degree, model)] - 1
     values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
-    n, means = len(model), values["means"].astype(np.float64)
-    if offset is not None:  # not + 0: that would lose the sign of zero
+    means = values["means"].astype(np.float64)
+    if offset is not None:  # adding zeros instead would lose the sign of -0.0
         means += as_vector("offset", offset)
-    rest = values["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * model.sh_rest.shape[1])
-    parts = [means, np.zeros((n, 3)), values["sh_dc"][:, 0], rest, values["opacity_logits"][:, None]]
+    sh_rest = np.zeros((len(model), 3, bands), values["sh_rest"].dtype)
+    sh_rest[:, :, : model.sh_rest.shape[1]] = values["sh_rest"].transpose(0, 2, 1)
+    parts = [
+        means,
+        np.zeros((len(model), 3)),  # normals
+        values["sh_dc"][:, 0],
+        sh_rest.reshape(len(model), 3 * bands),
+        values["opacity_logits"][:, None],
+        values["log_scales"],
+        values["quats"],
+    ]
     with np.errstate(over="ignore"):
-        columns = np.hstack([*parts, values["log_scales"], values["quats"]], dtype="<f4", casting="unsafe")
-    names = [*"xyz", "nx", "ny", "nz", *_splat_names(rest.shape[1])]
-    bad = np.flatnonzero(~np.isfinite(columns).all(axis=0))
-    if len(bad):
-        raise ValueError(f"model: expected values that are finite in float32, got others in {names[bad[0]]}")
+        table = np.hstack(parts, dtype="<f4", casting="unsafe")
+    names = [*"xyz", "nx", "ny", "nz", *_properties_after_normals(3 * bands)]
+    invalid = _invalid(table, names).any(axis=0)
+    if invalid.any():
+        raise ValueError(f"model: expected values that are finite in float32, got others in {names[invalid.argmax()]}")
     position = "float"
     if _float32_moves(means, values["log_scales"]):
-        position, columns = "double", np.hstack([means.astype("<f8").view("<f4"), columns[:, 3:]])
-    header = "ply\nformat binary_little_endian 1.0\n"
-    header += f"comment kgs sh_degree {model.sh_degree}\nelement vertex {n}\n"
-    header += "".join(f"property {position if name in 'xyz' else 'float'} {name}\n" for name in names) + "end_header\n"
-    write_whole(Path(path), header.encode("ascii") + columns.tobytes())
+        position = "double"
+        table = np.hstack([means.astype("<f8").view("<f4"), table[:, 3:]])
+    comments = [f"kgs sh_degree {model.sh_degree}"]
+    if model.antialiased:
+        comments.append("SplatRenderMode: mip")
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(model)}",  # the viewer of 3D Gaussian Splatting expects it in the third line
+        *(f"property {position if name in 'xyz' else 'float'} {name}" for name in names),
+        *(f"comment {comment}" for comment in comments),
+        "end_header",
+    ]
+    header = "".join(f"{line}\n" for line in lines)
+    write_whole(Path(path), header.encode("ascii") + table.tobytes())
 
 
 def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> GaussianModel:
     """Read a 3DGS PLY file: ascii or binary, properties in any order and of any scalar type, harmonics of degree 0-3.
 
-    Other properties and elements are skipped. The active degree is the one that kgs wrote down, else that of the
-    harmonics in the file. Warns where float32 cannot hold the positions and `origin` would help.
+    Other properties and elements are skipped. The active degree is that of a comment of kgs, else that of the harmonics
+    in the file. The model is antialiased if a comment says so: `SplatRenderMode: mip` (Brush, splat-transform, kgs) or
+    `antialiased 1` (Postshot). Scales of -inf, those of flat discs, are read as they are. Warns where float32 cannot
+    hold the positions and an `origin` would help.
 
     Args:
         path: the file to read.
@@ -90,46 +116,49 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
             the header says, or a value is not finite.
         ValueError: `origin` has another shape or is not finite.
     """
-    path, start = Path(path), np.zeros(3) if origin is None else as_vector("origin", origin)
+    path = Path(path)
+    shift = np.zeros(3) if origin is None else as_vector("origin", origin)
     try:
         with open(path, "rb") as file:
-            order, elements, degree = _read_header(path, file)
-            places = [place for place, element in enumerate(elements) if element.name == "vertex"]
-            if len(places) != 1:
-                raise DataError(path, "vertex", f"expected one element of that name, got {len(places)}")
-            vertex = elements[places[0]]
-            if "packed_position" in vertex.codes:
-                raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
-            rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
-            sizes = [3 * (k - 1) for k in SH_SIZES]
-            if rest not in sizes:
-                raise DataError(path, "f_rest", f"expected {sizes} properties of that name, got {rest}")
-            names = [*"xyz", *_splat_names(rest)]
+            header = _read_header(path, file)
+            vertex = header.elements[_find_vertex(path, header)]
+            rest = _count_harmonics(path, vertex)
+            names = [*"xyz", *_properties_after_normals(rest)]
             for name in names:
                 if name not in vertex.codes:
                     raise DataError(path, name, "expected this property of a splat, got none")
-            columns = _read_columns(path, order, elements, places[0], file)
+            columns = _read_columns(path, header, file)
     except OSError as error:
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
-    means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - start
+    means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - shift
     with np.errstate(over="ignore"):
-        table = np.stack([*means.astype(np.float32).T, *(columns[name].astype(np.float32) for name in names[3:])], 1)
-    bad = np.argwhere(~np.isfinite(table))
-    if len(bad):
-        row, column = bad[0]
+        others = (columns[name].astype(np.float32) for name in names[3:])
+        table = np.stack([*means.astype(np.float32).T, *others], axis=1)
+    invalid = np.argwhere(_invalid(table, names))
+    if len(invalid):
+        row, column = invalid[0]
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
-    means32, dc, sh_rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
-    if _float32_moves(means, scales.numpy()):
+    parts = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
+    means32, sh_dc, sh_rest, opacity_logits, log_scales, quats = parts
+    if _float32_moves(means, log_scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
-    sh_rest, degree = sh_rest.unflatten(1, (3, rest // 3)).mT, min(degree, sizes.index(rest))
-    return GaussianModel(means32, quats, scales, opacity[:, 0], dc[:, None], sh_rest, degree)
+    return GaussianModel(
+        means32,
+        quats,
+        log_scales,
+        opacity_logits[:, 0],
+        sh_dc[:, None],
+        sh_rest.unflatten(1, (3, rest // 3)).mT,
+        sh_degree=min(header.sh_degree, _REST_COUNTS.index(rest)),
+        antialiased=header.antialiased,
+    )
 
 
 def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
-    """Three finite numbers in float64; a ValueError with the argument's name if they are not."""
+    """A vector of three finite numbers as float64; a ValueError that names the argument if it is none."""
     vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
     if vector.shape != (3,):
         raise ValueError(f"{name}: expected shape (3,), got {vector.shape}")
@@ -138,31 +167,95 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
     return vector
 
 
+def _invalid(table: NDArray[np.float32], names: list[str]) -> NDArray[np.bool_]:
+    """The entries that no splat can have: NaN and infinity, but for the scale of a flat disc, whose logarithm is -inf.
+
+    `names` are the properties in the columns of the table.
+    """
+    invalid = ~np.isfinite(table)
+    scales = [i for i, name in enumerate(names) if name.startswith("scale_")]
+    invalid[:, scales] &= table[:, scales] != -np.inf
+    return invalid
+
+
+def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
+    """The degree of the harmonics that `save_ply` writes; a ValueError if they cannot hold the model's."""
+    least = model.max_sh_degree
+    if sh_degree is None:
+        return least
+    if not isinstance(sh_degree, int | np.integer) or not least <= sh_degree <= MAX_SH_DEGREE:
+        expected = f"an integer from {least}, the model's, to {MAX_SH_DEGREE}"
+        raise ValueError(f"sh_degree: expected {expected}, got {sh_degree!r}")
+    return int(sh_degree)
+
+
 def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[Any]]) -> bool:
     """Whether float32 would move more than a tenth of the Gaussians by over a thousandth of their largest axis."""
     with np.errstate(over="ignore"):
-        moved = np.abs(means.astype(np.float32) - means).max(axis=1)
-        return bool((moved > 1e-3 * np.exp(log_scales.max(axis=1))).sum() > 0.1 * len(means))
+        shifts = np.abs(means.astype(np.float32) - means).max(axis=1)
+        largest = np.exp(log_scales.max(axis=1))
+    return int((shifts > 1e-3 * largest).sum()) > 0.1 * len(means)
 
 
 @dataclass
 class _Element:
+    """An element of a PLY file, such as "vertex": so many rows of the same properties."""
+
     name: str
     count: int
     codes: dict[str, str] = field(default_factory=dict)  # NumPy's type code of each property, O for a list
 
 
-def _splat_names(rest: int) -> list[str]:
-    """The names of the properties after position and normal, with `rest` of them f_rest."""
+@dataclass
+class _Header:
+    """What the header of a PLY file says."""
+
+    format: str = ""  # a key of BYTE_ORDERS
+    elements: list[_Element] = field(default_factory=list)
+    sh_degree: int = 3  # the active degree
+    antialiased: bool = False
+
+    def read_comment(self, comment: str) -> None:
+        """Set what the comment says of the splat; of several comments the last one counts."""
+        match re.split(r"[\s:]+", comment.lower()):
+            case ["kgs", "sh_degree", digit] if re.fullmatch("[0-9]", digit):
+                self.sh_degree = int(digit)
+            case ["splatrendermode", mode]:  # default, mip or 2dgs
+                self.antialiased = mode == "mip"
+            case ["antialiased", flag]:  # 0 or 1
+                self.antialiased = flag == "1"
+
+
+def _properties_after_normals(rest: int) -> list[str]:
+    """The names of a splat's properties behind positions and normals, with `rest` properties f_rest."""
     colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
-    """The byte order, the elements in order, and the active degree (3 if the header has none)."""
+def _find_vertex(path: Path, header: _Header) -> int:
+    """The index of the element "vertex"."""
+    indices = [i for i, element in enumerate(header.elements) if element.name == "vertex"]
+    if len(indices) != 1:
+        raise DataError(path, "vertex", f"expected one element of that name, got {len(indices)}")
+    return indices[0]
+
+
+def _count_harmonics(path: Path, vertex: _Element) -> int:
+    """The number of properties f_rest."""
+    if "packed_position" in vertex.codes:
+        raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
+    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
+    if count not in _REST_COUNTS:
+        raise DataError(path, "f_rest", f"expected {_REST_COUNTS} properties of that name, got {count}")
+    return count
+
+
+def _read_header(path: Path, file: BinaryIO) -> _Header:
+    """Read the header; the file is then at the first byte of the data."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
         raise DataError(path, "", "not a PLY file: expected 'ply' in the first line")
-    order, elements, degree = None, list[_Element](), 3
+    header = _Header()
+    elements = header.elements
     while True:
         line = file.readline(MAX_HEADER)
         if not line.endswith(b"\n") or file.tell() > MAX_HEADER:
@@ -170,50 +263,69 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element], int]:
         match line.decode("ascii", "replace").split():
             case ["end_header"]:
                 break
-            case ["format", name, "1.0"] if name in BYTE_ORDERS and order is None:
-                order = name
+            case ["format", name, "1.0"] if name in BYTE_ORDERS and not header.format:
+                header.format = name
             case ["element", name, digits] if re.fullmatch("[0-9]{1,18}", digits):
                 elements.append(_Element(name, int(digits)))
             case ["property", "list", _, _, name] if elements:
                 elements[-1].codes[name] = "O"
             case ["property", kind, name] if elements and kind in SCALARS and name not in elements[-1].codes:
                 elements[-1].codes[name] = SCALARS[kind]
-            case ["comment", "kgs", "sh_degree", digits] if re.fullmatch("[0-9]", digits):
-                degree = int(digits)
-            case ["comment" | "obj_info", *_] | []:
+            case ["comment", *words]:
+                header.read_comment(" ".join(words))
+            case ["obj_info", *_] | []:
                 pass
             case _:
                 text = line[:80].decode("ascii", "backslashreplace").rstrip()
                 raise DataError(path, "header", f"expected a line of a PLY header, got {text!r}")
-    if order is None:
+    if not header.format:
         raise DataError(path, "format", f"expected one of {sorted(BYTE_ORDERS)}, got none")
-    return order, elements, degree
+    return header
 
 
-def _read_columns(
-    path: Path, order: str, elements: list[_Element], place: int, file: BinaryIO
-) -> dict[str, NDArray[np.generic]]:
-    """The properties of the element at `place`; binary data are read only if the file is long enough."""
-    vertex, is_text, begin = elements[place], order == "ascii", file.tell()
-    dtypes = [np.dtype([(name, BYTE_ORDERS[order] + code) for name, code in e.codes.items()]) for e in elements]
-    if any(dtype.hasobject for dtype in dtypes[: place + 1]):
+def _read_columns(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
+    """The properties of the vertices by name, `(N,)` each.
+
+    Binary data are read only if the file has as many bytes as the header says, so a wrong count takes no memory.
+    """
+    index = _find_vertex(path, header)
+    vertex = header.elements[index]
+    dtypes = [_row_dtype(element, BYTE_ORDERS[header.format]) for element in header.elements]
+    if any(dtype.hasobject for dtype in dtypes[: index + 1]):
         raise DataError(path, "vertex", "expected no list property in it or before it, got one")
+    is_text = header.format == "ascii"
+    data_start = file.tell()
     widths = [len(dtype.names or ()) if is_text else dtype.itemsize for dtype in dtypes]
-    ends = [0, *accumulate(element.count * width for element, width in zip(elements, widths, strict=True))]
-    start, end, total = ends[place], ends[place + 1], ends[-1]
-    available = os.fstat(file.fileno()).st_size - begin
+    sizes = [element.count * width for element, width in zip(header.elements, widths, strict=True)]
+    start = sum(sizes[:index])
+    end = start + sizes[index]
+    total = sum(sizes)
     if is_text:
-        with warnings.catch_warnings(action="error"):
-            try:
-                numbers = np.fromfile(file, np.float64, sep=" ") if total else np.empty(0)
-            except (DeprecationWarning, ValueError) as error:
-                raise DataError(path, "vertex", "expected nothing but numbers after the header") from error
+        numbers = _read_numbers(path, file) if total else np.empty(0)
         available = len(numbers)
-    if available < end or (available != total and not any(dtype.hasobject for dtype in dtypes)):
+    else:
+        available = os.fstat(file.fileno()).st_size - data_start
+    has_lists = any(dtype.hasobject for dtype in dtypes)  # behind the vertices: then the total is not known
+    if available < end or (available != total and not has_lists):
         unit = "numbers" if is_text else "bytes"
         raise DataError(path, "vertex", f"expected {total} {unit} after the header, got {available}")
     if is_text:
-        return dict(zip(vertex.codes, numbers[start:end].reshape(vertex.count, widths[place]).T, strict=True))
-    file.seek(begin + start)
-    rows = np.fromfile(file, dtypes[place], vertex.count)
+        table = numbers[start:end].reshape(vertex.count, widths[index])
+        return dict(zip(vertex.codes, table.T, strict=True))
+    file.seek(data_start + start)
+    rows = np.fromfile(file, dtypes[index], vertex.count)
     return {name: rows[name] for name in vertex.codes}
+
+
+def _row_dtype(element: _Element, byte_order: str) -> np.dtype[Any]:
+    """The type of one row of an element in a binary file."""
+    return np.dtype([(name, byte_order + code) for name, code in element.codes.items()])
+
+
+def _read_numbers(path: Path, file: BinaryIO) -> NDArray[np.float64]:
+    """All numbers in the rest of a text file."""
+    with warnings.catch_warnings(action="error"):
+        try:
+            return np.fromfile(file, np.float64, sep=" ")
+        except (DeprecationWarning, ValueError) as error:
+            raise DataError(path, "vertex", "expected nothing but numbers after the header") from error

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from kgs.errors import DataError
+from kgs.json_files import read_json
 
-from .json_files import read_json
 from .outputs import EXPORTS
 from .staging import Staging
 

@@ -19,8 +19,8 @@ from kgs.fit.prune import contributions, left_out
 from kgs.io.cameras import rolled
 from kgs.io.console import each
 from kgs.io.film import film_within
-from kgs.io.json_files import read_json
 from kgs.io.outputs import film_in
+from kgs.json_files import read_json
 from kgs.model import GaussianModel
 
 from . import Picture, write_page

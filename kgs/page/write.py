@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kgs import __version__
 from kgs.camera import MARGIN
-from kgs.io.json_files import write_whole
+from kgs.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 
 from .cameras import are_training, viewer_scene

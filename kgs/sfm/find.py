@@ -19,6 +19,8 @@ ADVICE = "Take 3 to 12 photos of one scene that does not move, a small step betw
 def find_photos(folder: Path) -> list[Path]:
     """The photos of a folder, sorted by name.
 
+    Of a photo that is there as a JPEG and as a raw or HEIC file of the same stem, the JPEG is taken.
+
     Raises:
         DataError: the folder does not exist, it holds fewer than 3 photos, or photos of a kind that cannot be read.
     """
@@ -31,7 +33,9 @@ def find_photos(folder: Path) -> list[Path]:
         raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed(lost)}")
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
-    if others := [path for path in files if path.suffix.lower() in set(UNREADABLE_SUFFIXES).difference(_readable())]:
+    unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
+    converted = _converted(folder)
+    if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
         wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed(others)}). "
         raise DataError(folder, "", wrong + CONVERT)
     if not paths and videos:
@@ -42,7 +46,7 @@ def find_photos(folder: Path) -> list[Path]:
             reason = f"holds no photos itself, but these folders in it do: {listed(deeper)}. Name one of them"
         else:
             reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
-        raise DataError(folder, "", reason)
+        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder)]))
     if len(paths) < FEWEST:
         reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed(paths)}). {ADVICE}"
         raise DataError(folder, "", reason)
@@ -51,7 +55,22 @@ def find_photos(folder: Path) -> list[Path]:
 
 def list_photos(folder: Path) -> list[Path]:
     """The photos of a folder that can be read, sorted by name; with HEIC if pi-heif is installed."""
-    return [path for path in list_images(folder, _readable()) if path.is_file()]
+    converted = _converted(folder)
+    return [path for path in list_images(folder, _readable()) if path.is_file() and path not in converted]
+
+
+def notes_on(folder: Path) -> list[str]:
+    """What is in a folder of photos and not used, one sentence each."""
+    notes = list(folders.unused_files(folder))
+    if converted := sorted(_converted(folder)):
+        notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed(converted)}")
+    return notes
+
+
+def _converted(folder: Path) -> set[Path]:
+    """The raw and HEIC files beside which the same photo lies in a format that is always read, as cameras save it."""
+    stems = {path.stem.lower() for path in list_images(folder)}
+    return {path for path in list_images(folder, UNREADABLE_SUFFIXES) if path.stem.lower() in stems}
 
 
 def _readable() -> tuple[str, ...]:

@@ -10,9 +10,9 @@ from typing import Any
 
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.errors import DataError
-from kgs.io.json_files import read_json
 from kgs.io.ownership import holds_only_own, is_own
 from kgs.io.staging import Staging
+from kgs.json_files import read_json
 
 REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
 

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from importlib import import_module
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -16,9 +15,9 @@ import torch
 
 from kgs.errors import DataError
 from kgs.io.console import say
-from kgs.io.json_files import read_json, write_json
 from kgs.io.outputs import png_names
 from kgs.io.results_folder import locked
+from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 from kgs.progress import Stage, silent
 
@@ -43,7 +42,7 @@ from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_ph
 from .write import level_and_scale, write_images, write_model
 
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
-SETTINGS = 4  # increased by every change after which the same photos give other files
+SETTINGS = 5  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
@@ -83,13 +82,11 @@ def pose_photos(
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be trusted; the message says
             what to do, with the number of matches of each pair.
-        ModuleNotFoundError: pycolmap or Pillow is not installed (extra `sfm`).
+        ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    # a missing package is an error before any work
-    import_module("PIL")
-    with quiet_pycolmap():
+    with quiet_pycolmap():  # a missing package is an error before any work
         pass
     paths = find_photos(folder)
     check_place(out, folder)

@@ -1,4 +1,4 @@
-"""Reads photos as a phone wrote them: decodes them, turns them upright, gives them one size; reads Exif of the lens."""
+"""Reads photos as a phone wrote them: decoded, turned upright, reduced to one size, with what Exif says of the lens."""
 
 import hashlib
 import math
@@ -22,8 +22,12 @@ from .find import CONVERT, listed
 
 LONGEST = 1600  # pixels of the longer side, for matching and for what is written
 FILM_DIAGONAL = math.hypot(36, 24)  # mm
-_ORIENTATION, _FOCAL, _FOCAL_35 = 0x0112, 0x920A, 0xA405
-_PIXELS_X, _DENSITY, _DENSITY_UNIT = 0xA002, 0xA20E, 0xA210
+_ORIENTATION = 0x0112
+_FOCAL = 0x920A
+_FOCAL_35 = 0xA405
+_PIXELS_X = 0xA002
+_DENSITY = 0xA20E
+_DENSITY_UNIT = 0xA210
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
 _SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
 _BLURRED = 0.5  # a photo below this share of the median sharpness is blurred
@@ -43,8 +47,11 @@ class Exif(NamedTuple):
     def of(cls, tags: Mapping[int, Any]) -> Self:
         """Read it from an image's tags; a damaged tag counts as missing."""
         orientation = int(_number(tags, _ORIENTATION))
-        film, focal, density = (_number(tags, tag) for tag in (_FOCAL_35, _FOCAL, _DENSITY))
-        width, unit = _number(tags, _PIXELS_X), _UNITS.get(int(_number(tags, _DENSITY_UNIT) or 2), 0.0)
+        film = _number(tags, _FOCAL_35)
+        focal = _number(tags, _FOCAL)
+        density = _number(tags, _DENSITY)
+        width = _number(tags, _PIXELS_X)
+        unit = _UNITS.get(int(_number(tags, _DENSITY_UNIT) or 2), 0.0)
         ratio = focal * density / (unit * width) if unit and width else 0.0
         return cls(orientation if 1 <= orientation <= 8 else 1, film or None, ratio or None)
 

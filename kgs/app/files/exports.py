@@ -9,7 +9,7 @@ from kgs.io.console import each
 from kgs.io.encoders import film_suffix
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
-from kgs.io.json_files import write_json
+from kgs.json_files import write_json
 
 
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:

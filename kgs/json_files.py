@@ -7,7 +7,7 @@ import uuid
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from kgs.errors import DataError
+from .errors import DataError
 
 _MOST_BYTES = 64 * 2**20
 
