@@ -28,7 +28,7 @@ from kornia.sensors.camera.projection_model import OrthographicProjection
 from numpy.polynomial import Polynomial
 from torch import Tensor
 
-from .types import check_tensor
+from .types import check_intrinsics, check_tensor
 
 MARGIN = 0.15
 Pixels = Callable[[Tensor], Tensor]
@@ -96,7 +96,8 @@ def pinhole_cameras(
 
     Args:
         viewmats: world-to-camera matrices, OpenCV axes, `(C, 4, 4)`, or `(4, 4)` for one.
-        Ks: intrinsics in pixels, `(C, 3, 3)` or `(C, 4, 4)`, or one matrix for all cameras.
+        Ks: intrinsics in pixels, `(C, 3, 3)` or `(C, 4, 4)`, or one matrix for all cameras. The third row is (0, 0, 1):
+            a constant, without gradient.
         width: of the images in pixels, an integer >= 1.
         height: likewise.
         pixel_centers: where the first pixel's centre lies in the coordinates of `Ks`: "integer" at (0, 0) as in Kornia
@@ -104,7 +105,7 @@ def pinhole_cameras(
 
     Raises:
         TypeError: an argument is not a tensor, or dtypes or devices differ.
-        ValueError: shapes or sizes do not match.
+        ValueError: shapes or sizes do not match, or the third row of a matrix in `Ks` is not (0, 0, 1).
 
     Examples:
         >>> import torch, kgs
@@ -125,11 +126,17 @@ def pinhole_cameras(
     for name, size in (("width", width), ("height", height)):
         if not (isinstance(size, int | np.integer) and size >= 1):
             raise ValueError(f"{name}: expected an integer >= 1, got {size!r}")
+    traced = torch.compiler.is_compiling()  # then `project` checks
+    if not traced:
+        check_intrinsics("Ks", Ks)
     full = torch.eye(4, dtype=Ks.dtype, device=Ks.device).repeat(count, 1, 1)
-    full[:, :3, :3] = Ks[..., :3, :3]
+    full[:, :2, :3] = Ks[..., :2, :3]
     full[:, :2, 2] -= 0.5 if pixel_centers == "half" else 0.0
     sizes = (torch.full((count,), int(size), device=poses.device) for size in (height, width))
-    return PinholeCamera(full, poses, *sizes)
+    cameras = PinholeCamera(full, poses, *sizes)
+    if not traced:
+        _remember(cameras, (int(height), int(width)))
+    return cameras
 
 
 def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
@@ -137,46 +144,78 @@ def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
 
 
-class _Size(NamedTuple):
-    """The size that was read from two tensors of a camera, and their versions then."""
+class _Known(NamedTuple):
+    """The size of a pinhole camera whose tensors have been read and checked."""
 
-    height: Tensor
-    width: Tensor
-    versions: tuple[int, int]
+    tensors: tuple[Tensor, ...]  # kept alive, so that no other tensor gets their ids
+    state: list[tuple[int, int]]
     size: tuple[int, int]
 
 
-_sizes: WeakKeyDictionary[PinholeCamera, _Size] = WeakKeyDictionary()
+_known: WeakKeyDictionary[PinholeCamera, _Known] = WeakKeyDictionary()
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
-    """Height and width in pixels, the same for all cameras; checks what `cameras` is.
+    """Height and width in pixels, the same for all cameras; checks what `cameras` is, and the intrinsics' last rows.
 
-    Reading the tensors of a camera on a GPU waits until all work is done, so the size is remembered until they change.
+    Reading the tensors of a camera on a GPU waits until all work is done, so it is done again only when they change.
     """
-    if not isinstance(cameras, PinholeCamera) or cameras.height.is_inference() or cameras.width.is_inference():
-        return _read_size(cameras)
-    height, width = cameras.height, cameras.width
-    versions, known = (height._version, width._version), _sizes.get(cameras)
-    if known is None or known.height is not height or known.width is not width or known.versions != versions:
-        known = _sizes[cameras] = _Size(height, width, versions, _read_size(cameras))
-    return known.size
+    if not isinstance(cameras, PinholeCamera):
+        return _model_size(cameras)
+    known = _known.get(cameras)
+    if known is not None and known.state == _state(cameras):
+        return known.size
+    size = _pinhole_size(cameras)
+    _remember(cameras, size)
+    return size
 
 
-def _read_size(cameras: Cameras) -> tuple[int, int]:
-    if isinstance(cameras, PosedCamera):
-        sizes = {(int(cameras.model.height), int(cameras.model.width))}
-    elif isinstance(cameras, PinholeCamera):
-        pairs = torch.stack([cameras.height, cameras.width], 1).tolist()
-        sizes = {(int(height), int(width)) for height, width in pairs}
-    else:
+def _remember(cameras: PinholeCamera, size: tuple[int, int]) -> None:
+    """Keep the size of cameras whose tensors have been checked."""
+    state = _state(cameras)
+    if state is not None:
+        _known[cameras] = _Known(_read_tensors(cameras), state, size)
+
+
+def _read_tensors(cameras: PinholeCamera) -> tuple[Tensor, ...]:
+    return cameras.height, cameras.width, cameras.intrinsics
+
+
+def _state(cameras: PinholeCamera) -> list[tuple[int, int]] | None:
+    """Which tensors these are, and their versions; None for tensors of inference mode, which have no version."""
+    tensors = _read_tensors(cameras)
+    if any(x.is_inference() for x in tensors):
+        return None
+    return [(id(x), x._version) for x in tensors]
+
+
+def _pinhole_size(cameras: PinholeCamera) -> tuple[int, int]:
+    check_intrinsics("cameras", cameras.intrinsics)
+    pairs = torch.stack([cameras.height, cameras.width], 1).tolist()
+    return _one_size({(int(height), int(width)) for height, width in pairs})
+
+
+def _model_size(cameras: PosedCamera) -> tuple[int, int]:
+    if not isinstance(cameras, PosedCamera):
         raise TypeError(f"cameras: expected a kornia PinholeCamera or a kgs.PosedCamera, got {type(cameras).__name__}")
+    return _one_size({(int(cameras.model.height), int(cameras.model.width))})
+
+
+def _one_size(sizes: set[tuple[int, int]]) -> tuple[int, int]:
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size (height, width), got {sorted(sizes)}")
     ((height, width),) = sizes
     if height < 1 or width < 1:
         raise ValueError(f"cameras: expected a positive image size, got {height}x{width}")
     return height, width
+
+
+def with_constant_last_rows(cameras: Cameras) -> Cameras:
+    """The same cameras, whose intrinsics get no gradient in their last rows: these are constants, see `image_size`."""
+    if not isinstance(cameras, PinholeCamera) or not cameras.intrinsics.requires_grad:
+        return cameras
+    matrices = torch.cat([cameras.intrinsics[:, :2], cameras.intrinsics[:, 2:].detach()], 1)
+    return PinholeCamera(matrices, cameras.extrinsics, cameras.height, cameras.width)
 
 
 def intrinsics(cameras: Cameras) -> Tensor:

@@ -85,7 +85,7 @@ def half_axes(covariances: Tensor) -> Tensor:
 
     A Cholesky factorisation in float64: of needles it adds no error to that which Sigma was rounded with. What is left
     of a variance counts as at least the rounding of its entry, and a negative one as 0. The upper and the lower
-    triangle are averaged.
+    triangle are averaged. A covariance with an entry that is not finite gives NaN.
 
     The gradient is (G A^-1 + (G A^-1)^T) / 4 of a gradient G by A: right for every function of A A^T, once. In float32
     its error is about 1e-7 times the ratio of the longest to the shortest axis; of an axis of length 0 it is 0.
@@ -108,6 +108,8 @@ class _HalfAxes(torch.autograd.Function):
         f = torch.maximum(zz - c * c - e * e, rounding * zz).clamp_min(0.0).sqrt()
         zero = torch.zeros_like(a)
         factors = torch.stack([a, zero, zero, b, d, zero, c, e, f], 1).unflatten(1, (3, 3))
+        finite = covariances.isfinite().flatten(1).all(1)
+        factors = factors.masked_fill(~finite[:, None, None], torch.nan)
         ctx.save_for_backward(factors)
         rounded: Tensor = factors.to(covariances.dtype)
         return rounded

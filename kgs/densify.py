@@ -118,8 +118,24 @@ class Densifier:
     def observe(self, projected: ProjectedGaussians) -> None:
         """Add the gradients of one render to the statistics; each listed pair (camera, Gaussian) counts as seen.
 
+        Call `projected.means2d.retain_grad()` between the render and `backward`, and this after `backward`. With
+        `absgrad` there is nothing to retain.
+
         Raises:
-            ValueError: `projected.means2d` has no gradient yet, or the number of Gaussians differs from the model's.
+            ValueError: `projected.means2d` has no gradient, or the number of Gaussians differs from the model's.
+
+        Examples:
+            >>> import kgs
+            >>> model = GaussianModel.from_points(torch.rand(20, 3) + 1, torch.rand(20, 3))
+            >>> optimizer = torch.optim.Adam(model.parameters(), lr=1e-3)
+            >>> densifier = Densifier(model, optimizer, extent=1.0)
+            >>> k = torch.tensor([[20.0, 0.0, 15.5], [0.0, 20.0, 11.5], [0.0, 0.0, 1.0]])
+            >>> camera = kgs.pinhole_cameras(torch.eye(4), k, width=32, height=24)
+            >>> out = kgs.GaussianRenderer()(model(), camera)
+            >>> out.projected.means2d.retain_grad()
+            >>> out.image.square().mean().backward()
+            >>> densifier.observe(out.projected)
+            >>> optimizer.step()
         """
         self._check()
         count, expected = projected.num_gaussians, len(self.model)
@@ -127,11 +143,7 @@ class Densifier:
             raise ValueError(f"projected: expected a render of the model's {expected} Gaussians, got one of {count}")
         if len(projected) == 0:
             return
-        name = "absgrad" if self.absgrad else "grad"
-        gradient = getattr(projected.means2d, name, None)
-        if gradient is None:
-            why = "the render needs absgrad=True" if self.absgrad else "observe comes after backward (and retain_grad)"
-            raise ValueError(f"projected: expected means2d.{name}, got None: {why}")
+        gradient = self._gradient_of(projected.means2d)
         height, width = projected.image_size
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         ids = projected.gaussian_ids
@@ -200,6 +212,19 @@ class Densifier:
         for name, value in self._statistics.items():
             value.copy_(state[name])
         self.generator.set_state(state["generator"].cpu())
+
+    def _gradient_of(self, means2d: Tensor) -> Tensor:
+        """What the last backward pass left in projected centres, `(M, 2)`."""
+        if not means2d.requires_grad:
+            why = "the means need requires_grad=True, and the render has to be made with gradients on"
+            raise ValueError(f"projected: expected means2d that need a gradient, got others: {why}")
+        name = "absgrad" if self.absgrad else "grad"
+        gradient: Tensor | None = getattr(means2d, name, None)
+        if gradient is None:
+            order = "and observe comes after backward"
+            why = "the render needs absgrad=True" if self.absgrad else "means2d.retain_grad() comes after the render"
+            raise ValueError(f"projected: expected means2d.{name}, got None: {why}, {order}")
+        return gradient
 
     def _check(self) -> None:
         """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""

@@ -3,20 +3,18 @@
 Source: H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting",
 CVPR 2025: o_i <- M_i o_i with M_i = 1/(1 - r) for kept and 0 for dropped Gaussians, r_t = gamma t / T.
 
-The layer needs only torch and fits any splatting pipeline: put it between the activated opacities and the
-rasteriser. While no alpha is clamped the render of a random subset is an unbiased estimate of the full render.
+This file needs only torch and can be copied into any splatting pipeline. The layer belongs between the activated
+opacities and the rasteriser. While no alpha is clamped, the mean render over all masks is the full render.
 """
 
 import contextlib
 import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-
-SCHEDULES = ("constant", "linear")
 
 
 def drop_gaussian(
@@ -52,7 +50,8 @@ def drop_gaussian(
         raise TypeError(f"opacities: expected a floating point tensor, got {getattr(opacities, 'dtype', opacities)!r}")
     if generator is None:
         return nn.functional.dropout(opacities, p, training=True)
-    mask = torch.empty_like(opacities, device=generator.device).bernoulli_(1.0 - p, generator=generator).div_(1.0 - p)
+    mask = torch.empty_like(opacities, device=generator.device)
+    mask.bernoulli_(1.0 - p, generator=generator).div_(1.0 - p)
     return opacities * mask.to(opacities.device)
 
 
@@ -60,15 +59,16 @@ class DropGaussian(nn.Module):
     """`drop_gaussian` as a layer: active in `train()`, the identity in `eval()`, as `nn.Dropout` is.
 
     The rate of a call is `p * schedule(progress)`. The training loop sets `progress`, in [0, 1]; a layer whose progress
-    is never set is plain dropout at p, and warns once. It also warns once if it gets opacities outside [0, 1] on the
-    CPU, which are probably logits. The `state_dict` is empty, whatever is assigned to the layer.
+    is never set is plain dropout at p. The first call in `train()` warns about that, and about opacities outside
+    [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer as it is, outside its
+    graphs: a rate that rises would otherwise be compiled anew in each step.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
         seed: None draws from torch's default generator of the tensor's device, as `nn.Dropout` does. An integer gives
-            the layer a stream of its own, kept through `.to`, deepcopy and pickle. Replicas of `nn.DataParallel` draw
-            from it; with `DistributedDataParallel` give each rank its own seed. Such a layer must not run inside
+            the layer a stream of its own, which pickle and deepcopy continue in the copy. With
+            `DistributedDataParallel` give each rank its own seed. Such a layer must not run inside
             `torch.utils.checkpoint`, which restores only the default generators.
         device: where that stream draws. On the CPU it draws the same wherever the opacities are, and masks are copied
             to them; on their own device nothing is copied.
@@ -92,18 +92,17 @@ class DropGaussian(nn.Module):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__()
-        if not (schedule in SCHEDULES if isinstance(schedule, str) else callable(schedule)):
-            raise ValueError(f"schedule: expected one of {list(SCHEDULES)} or a callable, got {schedule!r}")
-        is_integer = isinstance(seed, (int, Integral)) and not isinstance(seed, bool)
+        if schedule not in ("linear", "constant") and not callable(schedule):
+            raise ValueError(f"schedule: expected 'linear', 'constant' or a callable, got {schedule!r}")
+        is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
         if seed is not None and not (is_integer and -(2**63) <= seed < 2**64):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
         self.schedule = schedule
         self.seed = seed
+        self._generator = None if seed is None else torch.Generator(device).manual_seed(int(seed))
         self._progress: float | None = None
-        # mutable objects, which shallow copies such as the replicas of nn.DataParallel share and advance
-        self._warned: set[str] = set()
-        self._stream = None if seed is None else torch.Generator(device).manual_seed(int(seed))
+        self._was_called = False
 
     @property
     def progress(self) -> float:
@@ -117,33 +116,62 @@ class DropGaussian(nn.Module):
     @property
     def rate(self) -> float:
         """The drop rate of the next call in `train()`."""
-        factors = {"linear": self.progress, "constant": 1.0}
-        factor = factors[self.schedule] if isinstance(self.schedule, str) else self.schedule(self.progress)
+        if callable(self.schedule):
+            factor = self.schedule(self.progress)
+        else:
+            factor = self.progress if self.schedule == "linear" else 1.0
         return _fraction("p * schedule(progress)", self.p * factor)
 
     def forward(self, opacities: Tensor) -> Tensor:
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
         if not self.training:
             return opacities
-        if self._progress is None and self.schedule != "constant":
-            wanted = "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
-            self._warn_once("progress", f"progress was never set, so the rate is {self.rate:g} throughout; {wanted}")
-        dropped = drop_gaussian(opacities, self.rate, True, self._stream)
-        if opacities.device.type == "cpu" and not torch.compiler.is_compiling():
-            with contextlib.suppress(RuntimeError, IndexError):  # an empty tensor, or inside vmap
-                low, high = opacities.detach().aminmax()
-                if low < 0 or high > 1:
-                    wanted = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits"
-                    self._warn_once("values", f"{wanted}, got {low:.3g} to {high:.3g}")
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(self._drop)(opacities)
+        return self._drop(opacities)
+
+    def _drop(self, opacities: Tensor) -> Tensor:
+        dropped = drop_gaussian(opacities, self.rate, generator=self._generator)
+        if not self._was_called:
+            self._was_called = True
+            self._warn_of_mistakes(opacities)
         return dropped
+
+    def _warn_of_mistakes(self, opacities: Tensor) -> None:
+        if self._progress is None and self.schedule != "constant":
+            advice = "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
+            message = f"progress was never set, so the rate stays at {self.rate:g}; {advice}"
+            warnings.warn(f"DropGaussian: {message}", stacklevel=4)
+        with contextlib.suppress(RuntimeError):  # in vmap and on the meta device there are no values to read
+            if bool(((opacities < 0) | (opacities > 1)).any()):
+                message = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits"
+                warnings.warn(f"DropGaussian: {message}", stacklevel=4)
 
     def get_rng_state(self) -> Tensor:
         """The state of the layer's own stream, a tensor on the CPU; a ValueError where it has none (seed is None)."""
-        return self._own_stream().get_state()
+        return self._own_generator().get_state()
 
     def set_rng_state(self, state: Tensor) -> None:
         """Restore a state that `get_rng_state` of a layer with a stream on the same kind of device returned."""
-        self._own_stream().set_state(state.cpu())
+        self._own_generator().set_state(state.cpu())
+
+    def _own_generator(self) -> torch.Generator:
+        if self._generator is None:
+            raise ValueError("seed: expected an integer, got None: the layer then has no state of its own")
+        return self._generator
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        if self._generator is not None:  # neither a generator nor a short-lived tensor travels to a spawned process
+            state["_generator"] = (self._generator.device, bytes(self._generator.get_state().tolist()))
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if self._generator is not None:
+            device, rng_state = state["_generator"]
+            self._generator = torch.Generator(device)
+            self._generator.set_state(torch.frombuffer(bytearray(rng_state), dtype=torch.uint8))
 
     def extra_repr(self) -> str:
         """What `print` shows."""
@@ -152,31 +180,10 @@ class DropGaussian(nn.Module):
         seed = "" if self.seed is None else f", seed={self.seed}"
         return f"p={self.p:g}, schedule={name}, progress={progress}{seed}"
 
-    def _own_stream(self) -> torch.Generator:
-        if self._stream is None:
-            raise ValueError("seed: expected an integer, got None: the layer then has no state of its own")
-        return self._stream
-
-    def _warn_once(self, kind: str, message: str) -> None:
-        if kind not in self._warned:
-            self._warned.add(kind)
-            warnings.warn(f"DropGaussian: {message}", stacklevel=3)
-
-    def _replicate_for_data_parallel(self) -> Self:
-        replica: Self = super()._replicate_for_data_parallel()
-        if self._stream is not None and self.training:  # in order here; the replicas' threads would race for one stream
-            device = self._stream.device
-            seed = int(torch.randint(2**62, (), generator=self._stream, device=device))
-            replica._stream = torch.Generator(device).manual_seed(seed)
-        return replica
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value.detach() if isinstance(value, Tensor) else value)
-
 
 def _fraction(name: str, value: Any, closed: bool = False) -> float:
     """A number in [0, 1), or in [0, 1]."""
-    number = float(value) if isinstance(value, (Real, Tensor)) else -1.0
+    number = float(value) if isinstance(value, Real | Tensor) else -1.0
     if not (0.0 <= number < 1.0 or (closed and number == 1.0)):
         raise ValueError(f"{name}: expected a number in [0, 1{']' if closed else ')'}, got {value!r}")
     return number

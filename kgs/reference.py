@@ -14,7 +14,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from .types import Gaussians, RasterOptions, check_kind, check_tensor
+from .types import Gaussians, RasterOptions, check_intrinsics, check_kind, check_tensor
 
 __all__ = ["Layers", "layers", "render"]
 
@@ -69,7 +69,8 @@ def render(
 
     Raises:
         TypeError: `gaussians` or `camera` is of another type.
-        ValueError: more than one camera or row of opacities, or a background of another shape.
+        ValueError: more than one camera or row of opacities, intrinsics whose third row is not (0, 0, 1), or a
+            background of another shape.
         torch.linalg.LinAlgError: `eps2d` is 0 and a footprint is flat.
     """
     drawn = layers(gaussians, camera, alpha_threshold, transmittance_stop, near_plane, eps2d)
@@ -97,8 +98,9 @@ def layers(
     if camera.batch_size != 1 or gaussians.opacities.numel() != len(gaussians):
         shape = tuple(gaussians.opacities.shape)
         raise ValueError(f"camera: expected one camera and one row of opacities, got {camera.batch_size} and {shape}")
+    check_intrinsics("camera", camera.intrinsics)
     height, width = int(camera.height), int(camera.width)
-    intrinsics, extrinsics = camera.intrinsics[0, :3, :3].double(), camera.extrinsics[0].double()
+    intrinsics, extrinsics = camera.intrinsics[0, :2, :3].double(), camera.extrinsics[0].double()
     rotation, translation = extrinsics[:3, :3], extrinsics[:3, 3]
     rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities.reshape(-1, 1), gaussians.colors)
     with torch.no_grad():
@@ -109,7 +111,7 @@ def layers(
     means, quats, scales, opacities, colors = (value.index_select(0, order).double() for value in rows)
 
     points = means @ rotation.T + translation
-    means2d = (points @ intrinsics.T)[:, :2] / (points @ intrinsics.T)[:, 2:]
+    means2d = points @ intrinsics.T / points[:, 2:]
     pixels = torch.cartesian_prod(torch.arange(height), torch.arange(width)).flip(1).to(means)
     offsets = pixels - means2d[:, None]
     jacobians = _jacobians(points, intrinsics, height, width) @ rotation

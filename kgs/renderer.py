@@ -109,8 +109,6 @@ class GaussianRenderer(nn.Module):
             gaussians = dataclasses.replace(gaussians, opacities=opacities)
         image = "image" in outputs
         projected = project(gaussians, cameras, options=self.options, colors=image, backend=self.backend)
-        if projected.means2d.requires_grad:
-            projected.means2d.retain_grad()
         features = {"image": projected.colors}
         if "depth" in outputs:
             features["depth"] = projected.depths[:, None]

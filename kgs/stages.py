@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .backends import choose
 from .backends.base import Compositor
-from .camera import Cameras, image_size, intrinsics
+from .camera import Cameras, image_size, intrinsics, with_constant_last_rows
 from .covariance import compensations, reach, variances
 from .types import (
     Composited,
@@ -59,7 +59,8 @@ def project(
 
     Args:
         gaussians: N Gaussians.
-        cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`.
+        cameras: C cameras of one image size, a `PinholeCamera` or a `PosedCamera`. The third row of a pinhole camera's
+            intrinsics is (0, 0, 1): a constant, without gradient.
         options: None for the defaults. near_plane, far_plane, radius_clip, eps2d, antialiased, frame and
             alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are seen).
         colors: whether colours are computed.
@@ -73,8 +74,8 @@ def project(
     Raises:
         TypeError: `gaussians` or `cameras` are of another type, dtype or device, or both `options` and fields of them
             are given.
-        ValueError: an option is out of range, cameras of different image sizes, or opacities `(C, N)` for another
-            number of cameras.
+        ValueError: an option is out of range, cameras of different image sizes, intrinsics whose third row is not
+            (0, 0, 1), or opacities `(C, N)` for another number of cameras.
     """
     options = raster_options(options, fields)
     check_kind("gaussians", gaussians, Gaussians)
@@ -84,6 +85,7 @@ def project(
     shape, count, n = tuple(gaussians.opacities.shape), cameras.extrinsics.shape[0], len(gaussians)
     if shape[:-1] not in ((), (count,)):
         raise ValueError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
+    cameras = with_constant_last_rows(cameras)
     device = gaussians.means.device
     chosen = choose(backend, "projection", device, lambda candidate: candidate.covers(gaussians.means))
     return _with_options(chosen.project(gaussians, cameras, size, options, colors), options)

@@ -209,8 +209,8 @@ class ProjectedGaussians:
     Args:
         camera_ids: `(M,)` int64.
         gaussian_ids: `(M,)` int64.
-        means2d: projected centres in pixels, `(M, 2)`. A render with gradients on keeps its `.grad`; after
-            :func:`kgs.project` call `means2d.retain_grad()`.
+        means2d: projected centres in pixels, `(M, 2)`. Call `means2d.retain_grad()` before `backward` to keep its
+            `.grad`, as :meth:`kgs.Densifier.observe` needs.
         factors: `(M, 2, 3)`, the product J W R S in pixels: the covariance is `factors @ factors.mT + eps2d I`.
         depths: z in the camera frame, `(M,)`.
         radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.
@@ -285,6 +285,20 @@ def check_tensor(name: str, value: Any, like: Tensor | None = None, whose: str =
         raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
     if like is not None and (value.dtype, value.device) != (like.dtype, like.device):
         raise TypeError(f"{name}: expected {like.dtype} on {like.device}{whose}, got {value.dtype} on {value.device}")
+
+
+def check_intrinsics(name: str, matrices: Tensor) -> None:
+    """Raise a ValueError for intrinsics `(..., 3, 3)` or `(..., 4, 4)` that are not those of a pinhole camera.
+
+    The third row has to be (0, 0, 1), and the fourth row and column those of the unit matrix. This reads the values, so
+    on a GPU it waits.
+    """
+    size = matrices.shape[-1]
+    last_rows = [[float(i == j) for j in range(size)] for i in range(2, size)]
+    for matrix in matrices.detach().reshape(-1, size, size).tolist():
+        if matrix[2:] != last_rows or any(value != 0.0 for row in matrix[:2] for value in row[3:]):
+            why = "to resize the images, scale the first two rows alone: K[:2] /= factor"
+            raise ValueError(f"{name}: expected intrinsics with (0, 0, 1) as third row, got {matrix}; {why}")
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:

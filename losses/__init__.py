@@ -1,6 +1,5 @@
 """Losses of the fit."""
 
-from .opacity import opacity_l1
 from .photometric import TargetMoments, photometric_loss, target_moments
 
-__all__ = ["opacity_l1", "photometric_loss", "target_moments", "TargetMoments"]
+__all__ = ["photometric_loss", "target_moments", "TargetMoments"]

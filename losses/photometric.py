@@ -7,8 +7,9 @@ IEEE TIP 13(4), 2004, eq. 13:
     S = a b / (c d + eps),   a = 2 m_x m_y + c1,   b = 2 s_xy + c2,   c = m_x^2 + m_y^2 + c1,   d = s_xx + s_yy + c2
 
 with m and s the mean, variance and covariance under the window around a pixel. Window (11 taps, standard deviation
-1.5), constants, `eps` and reflected border are Kornia's: the result is that of `l1_loss + 2 w kornia.losses.ssim_loss`,
-except that Kornia clamps (1 - SSIM) / 2 to [0, 1], which acts only where rounding leaves that range.
+1.5), constants, `eps` and reflected border are Kornia's: the result is that of `l1_loss + 2 w kornia.losses.ssim_loss`.
+Rounding may take the SSIM of nearly equal images above 1. Kornia therefore clamps the SSIM of each pixel; here its mean
+is clamped, and the gradient is not.
 """
 
 import functools
@@ -222,7 +223,7 @@ class _MeanSsim(torch.autograd.Function):
                     derivative.masked_fill_(outside, 0.0)
             ctx.save_for_backward(padded, target, by_mean, by_square, by_product)
             ctx.count = ssim.numel() if outside is None else int((~outside).sum())
-        return _mean(ssim, outside)
+        return _mean(ssim, outside).clamp_max(1.0)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:

@@ -179,11 +179,3 @@ def folder(tmp_path_factory):
         content = {"camera_angle_x": 2 * float(np.arctan(width / 2 / focal)), "frames": frames}
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
     return root
-
-
-@pytest.fixture(scope="session")
-def threads():
-    """The address of a Dask scheduler with two threads of this process, where no process is wanted."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0") as cluster:
-        yield cluster.scheduler_address

@@ -17,7 +17,7 @@ from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
 __all__ += ["pinhole", "posed", "random_camera", "random_cloud", "random_gaussians", "random_model", "random_opacities"]
-__all__ += ["random_scene", "random_views", "replace", "select", "splat_columns", "with_camera"]
+__all__ += ["random_scene", "random_views", "replace", "select", "splat_columns", "whole_matrices", "with_camera"]
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -70,6 +70,13 @@ def batch(*cameras: PinholeCamera) -> PinholeCamera:
     """One batch of all of them."""
     parts = ("intrinsics", "extrinsics", "height", "width")
     return PinholeCamera(*(torch.cat([getattr(camera, part) for camera in cameras]) for part in parts))
+
+
+def whole_matrices(rows: Tensor) -> Tensor:
+    """Intrinsics `(C, 4, 4)` of their first two rows `(C, 2, 3)`, the only ones that are free."""
+    full = torch.eye(4, dtype=rows.dtype).repeat(len(rows), 1, 1)
+    full[:, :2, :3] = rows
+    return full
 
 
 def with_camera(

@@ -83,6 +83,7 @@ def test_the_renderer_leaves_them_for_the_densifier():
     optimizer = torch.optim.Adam(model.parameters())
     renderer = kgs.GaussianRenderer(absgrad=True)
     out = renderer(model(), random_camera(HEIGHT, WIDTH, 1, torch.float32))
+    out.projected.means2d.retain_grad()
     out.image.square().sum().backward()
     assert (out.projected.means2d.absgrad >= out.projected.means2d.grad.abs() - 1e-6).all()
     usual, absolute = (kgs.Densifier(model, optimizer, 1.0, absgrad=absgrad) for absgrad in (False, True))

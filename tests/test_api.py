@@ -38,7 +38,7 @@ INVENTORY = {
         "rasterization",
         "save_ply",
     ],
-    "kgs.losses": ["TargetMoments", "opacity_l1", "photometric_loss", "target_moments"],
+    "kgs.losses": ["TargetMoments", "photometric_loss", "target_moments"],
     "kgs.datasets": ["Scene", "Views", "load_scene", "synthetic_scene"],
     "kgs.reference": ["Layers", "layers", "render"],
 }

@@ -147,6 +147,7 @@ def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(ke
 def test_gradients_of_the_centres_in_the_image_are_kept(kernel_backend):
     gaussians, _ = leaves(wide_scene()[0])
     out = GaussianRenderer(backend=kernel_backend)(gaussians, wide_scene()[1])
+    out.projected.means2d.retain_grad()
     out.image.square().sum().backward()
     assert out.projected.means2d.grad.abs().sum() > 0
 
@@ -173,15 +174,12 @@ def test_tensors_that_are_not_contiguous():
 
 def test_cameras_of_another_form_go_to_torch(kernel_backend, handed_over):
     gaussians, cameras = wide_scene()
-    bent = cameras.intrinsics.clone()
-    bent[0, 2, 0] = 1e-3
     flat = cameras.extrinsics.clone()
     flat[0, 2, :3] = 0.0
-    project(gaussians, with_camera(cameras, intrinsics=bent), backend=kernel_backend)
     with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
         project(gaussians, with_camera(cameras, extrinsics=flat), backend=kernel_backend)
     project(gaussians, cameras, near_plane=0.0, backend=kernel_backend)
-    assert len(handed_over) == 3
+    assert len(handed_over) == 2
 
 
 def test_float64_is_refused_by_name_and_left_to_torch_by_auto(kernel_backend):

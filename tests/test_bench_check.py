@@ -52,5 +52,3 @@ def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
 def test_apples_gpus_are_answered_in_a_line(capsys):
     assert check.check(device="mps") == 0
     assert capsys.readouterr().out.startswith("kgs: Apple's GPUs have no Triton")
-    with pytest.raises(ValueError, match="device: expected cpu or a GPU of this machine, got 'nothing'"):
-        check.check(device="nothing")

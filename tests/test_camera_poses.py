@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians, with_camera
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.vector import Vector3
@@ -58,6 +58,7 @@ def test_cameras_are_differentiable():
     assert torch.equal(pose.grad, torch.ones(4, 4))
     expected = torch.tensor(K)
     expected[:2, 2] -= 0.5
+    expected[2] = 0.0  # a constant
     assert torch.equal(k.grad, 2 * expected)
 
 
@@ -153,6 +154,60 @@ def test_pose_and_lens_that_are_parameters_are_optimised_with_one_camera_object(
 
 
 # --- unusual matrices -------------------------------------------------------------------------------------------
+
+
+def changed(k, change):
+    """Intrinsics `(1, 3, 3)` or `(1, 4, 4)` that are not those of a pinhole camera."""
+    k = k.clone()
+    if change == "halved":
+        return k / 2
+    row, column, value = change
+    k[0, row, column] = value
+    return k
+
+
+@pytest.mark.parametrize("change", ["halved", (2, 2, 2.0), (2, 0, 0.1), (2, 2, math.nan), (3, 3, 0.5), (0, 3, 5.0)])
+def test_intrinsics_that_are_not_a_pinhole_cameras_are_refused(change):
+    gaussians, camera = random_gaussians(5, 0), random_camera(*SIZE, 0)
+    k = changed(camera.intrinsics, change)
+    wrong = with_camera(camera, intrinsics=k)
+    with pytest.raises(ValueError, match=r"^cameras: expected .* \(0, 0, 1\) .*first two rows"):
+        GaussianRenderer()(gaussians, wrong)
+    with pytest.raises(ValueError, match=r"^cameras: expected"):
+        kgs.project(gaussians, wrong)
+    with pytest.raises(ValueError, match=r"^camera: expected .* \(0, 0, 1\)"):
+        kgs.reference.render(gaussians, wrong)
+    with pytest.raises(ValueError, match=r"^Ks: expected .* \(0, 0, 1\)"):
+        kgs.pinhole_cameras(camera.extrinsics, k, SIZE[1], SIZE[0])
+    if not torch.equal(k[:, :3, :3], camera.intrinsics[:, :3, :3]):
+        values = [getattr(gaussians, name) for name in FIELDS]
+        with pytest.raises(ValueError, match=r"^Ks: expected .* \(0, 0, 1\)"):
+            kgs.rasterization(*values, camera.extrinsics, k[:, :3, :3], SIZE[1], SIZE[0], sh_degree=0)
+
+
+def test_intrinsics_that_change_in_place_are_checked_again():
+    gaussians, camera = random_gaussians(5, 0), random_camera(*SIZE, 0)
+    GaussianRenderer()(gaussians, camera)
+    camera.intrinsics.div_(2)
+    with pytest.raises(ValueError, match="^cameras: expected"):
+        GaussianRenderer()(gaussians, camera)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_optimiser_of_whole_intrinsics_leaves_their_last_rows(dtype):
+    gaussians, camera = random_gaussians(20, 0, dtype), random_camera(*SIZE, 0, dtype)
+    for k, drawn in (
+        (camera.intrinsics.clone(), lambda k: with_camera(camera, intrinsics=k)),
+        (camera.intrinsics[0, :3, :3].clone(), lambda k: kgs.pinhole_cameras(camera.extrinsics, k, SIZE[1], SIZE[0])),
+    ):
+        before = k.clone()
+        adam = torch.optim.Adam([k.requires_grad_()], lr=0.1)
+        for _ in range(2):
+            adam.zero_grad()
+            GaussianRenderer()(gaussians, drawn(k)).image.square().sum().backward()
+            adam.step()
+        assert torch.equal(k[..., 2:, :], before[..., 2:, :])
+        assert not torch.equal(k[..., :2, :], before[..., :2, :])
 
 
 @pytest.mark.parametrize("change", ["scaled", "mirrored", "sheared"])

@@ -176,6 +176,9 @@ def test_observe_says_what_is_missing():
     projected.means2d.grad = None
     with pytest.raises(ValueError, match=r"means2d\.grad, got None"):
         densifier.observe(projected)
+    projected.means2d.requires_grad_(False)
+    with pytest.raises(ValueError, match="requires_grad=True"):
+        densifier.observe(projected)
     other, _, _ = make([SMALL] * 2)
     with pytest.raises(ValueError, match="3 Gaussians, got one of 2"):
         densifier.observe(seen(other, [0], [(1, 0)]))

@@ -8,9 +8,13 @@ import re
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
+
+from kgs.fit.config import DETAILS, PRESETS, FitConfig, with_pace
+from kgs.init_points.dense import FEWEST, MOST, PIXELS_OF_A_POINT
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}
@@ -57,6 +61,76 @@ def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypat
     found = doctest.testmod(importlib.import_module(module))
     assert found.attempted
     assert not found.failed
+
+
+# -- numbers ---------------------------------------------------------------------------------------------------------
+
+AUTO, PAPER, LOW, HIGH = FitConfig(), PRESETS["paper"], DETAILS["low"], DETAILS["high"]
+FEW, MANY = with_pace(AUTO, 3), with_pace(AUTO, 4)  # the default for up to three views, and for more
+STEPS_OF_BOTH = [FEW.steps, MANY.steps]
+# A page, what it says with a # for each number, and these numbers.
+NUMBERS = [
+    ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
+    ("README.md", "whose rate grows to #.", [AUTO.drop]),
+    ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
+    ("docs/layer.md", "is p = #, with nothing dropped in the last #", [AUTO.drop, AUTO.undropped_steps]),
+    ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
+    ("docs/comparison.md", "initial points, of which there are # to #", [FEWEST, MOST]),
+    ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
+    ("docs/measured.md", "| fit, # steps |", [FEW.steps]),
+    ("docs/measured.md", "from # to #, for # steps with three views and # with more", [FEWEST, MOST, *STEPS_OF_BOTH]),
+    ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
+    ("docs/command.md", "# to #, one for every # pixels", [FEWEST, MOST, PIXELS_OF_A_POINT]),
+    ("docs/command.md", "known depth | #, up to three photos # |", [MANY.steps, FEW.steps]),
+    ("docs/command.md", "| high | # | # |", [HIGH.size, HIGH.entries["init_points"]]),
+    ("docs/recipe.md", "times # (up to three", [FEW.recipe.opacity_decay]),
+    ("docs/recipe.md", "or # after every step, from # % of", [MANY.recipe.opacity_decay, 100 * AUTO.recipe.decay_from]),
+    ("docs/recipe.md", "| steps | #, here # | # for up", [PAPER.recipe.steps, PAPER.steps, FEW.steps]),
+    ("docs/recipe.md", "| initial points | # of", [PAPER.init_points]),
+    ("docs/recipe.md", "every # pixels on whose depth two views agree, # to #", [PIXELS_OF_A_POINT, FEWEST, MOST]),
+    ("docs/recipe.md", "| scales #, quaternions # | scales", [PAPER.recipe.lr_scales, PAPER.recipe.lr_quats]),
+    ("docs/recipe.md", "| scales #, quaternions # | in", [AUTO.recipe.lr_scales, AUTO.recipe.lr_quats]),
+    ("docs/recipe.md", "L1 + # (1 - SSIM) | L1 + # (1", [PAPER.recipe.dssim_weight, AUTO.recipe.dssim_weight]),
+    ("docs/recipe.md", "centre exceeds # |", [PAPER.recipe.grad_threshold]),
+    ("docs/recipe.md", "(AbsGS) exceeds # |", [AUTO.recipe.grad_threshold]),
+    ("docs/recipe.md", "opacities below # | opacities", [PAPER.recipe.prune_opacity]),
+    ("docs/recipe.md", "| opacities below # | they fade", [AUTO.recipe.prune_opacity]),
+    ("docs/recipe.md", "| # t/T to the end | # t/T, none", [PAPER.drop, AUTO.drop]),
+    ("docs/recipe.md", "none in the last # steps", [AUTO.undropped_steps]),
+    ("notebooks/03_three_views.ipynb", "`kgs fit` takes # steps on larger photos", [FEW.steps]),
+    ("notebooks/03_three_views.ipynb", "with a drop rate that grows to #", [AUTO.drop]),
+    ("docs/departures.md", "| # x the 1st percentile", [PAPER.recipe.near_plane]),
+]
+
+
+@pytest.mark.parametrize(("page", "text", "numbers"), NUMBERS)
+def test_numbers_of_the_settings_are_those_of_the_code(page, text, numbers):
+    pattern = re.escape(text).replace(r"\#", r"(\d+(?: \d{3})*(?:\.\d+)?)").replace(r"\ ", r"\s+")
+    found = re.search(pattern, (ROOT / page).read_text(encoding="utf-8"))
+    assert found, "the page does not say so"
+    assert [float(number.replace(" ", "")) for number in found.groups()] == pytest.approx(numbers)
+
+
+def test_each_page_of_the_guide_leads_to_the_next():
+    yaml = pytest.importorskip("yaml")
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    (guide,) = [section["Guide"] for section in site["nav"] if "Guide" in section]
+    entries = [entry for page in guide for entry in page.items()]
+    assert [name.split()[0] for name, _ in entries] == sorted(name.split()[0] for name, _ in entries)
+    for (name, page), (_, following) in pairwise(entries):
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8").rstrip()
+        assert text.startswith(f"# {name.split()[0]}. "), page
+        assert re.fullmatch(rf"Next: \[.+\]\({following}\)\.", text.splitlines()[-1]), page
+
+
+def test_each_folder_of_results_says_what_made_it():
+    results = ROOT / "docs" / "results"
+    folders = {path.name for path in results.iterdir() if path.is_dir()} - {"rebuild"}
+    rows = re.findall(r"^\| (\[.+) \| (.+) \|$", (results / "README.md").read_text(encoding="utf-8"), re.M)
+    assert {place for names, _ in rows for place in re.findall(r"\]\(([\w-]+)/", names)} == folders
+    assert all("`" in command for _, command in rows)
+    for script in re.findall(r"python (docs/results/\S+\.py)", " ".join(command for _, command in rows)):
+        assert (ROOT / script).is_file()
 
 
 # -- links -----------------------------------------------------------------------------------------------------------
@@ -109,7 +183,7 @@ def test_its_links_lead_somewhere(path):
 def test_links_are_found():
     text = "![a](b.png) [c\nd](e.md#f) `[g](h)` [i](https://j.k) <img alt='' src=\"l.png\">\n\n```\n[m](n)\n```\n"
     assert links(text) == ["b.png", "e.md#f", "l.png"]
-    assert "against-given-poses" in anchors(ROOT / "docs" / "photos.md")
+    assert "against-given-poses" in anchors(ROOT / "docs" / "results" / "cameras" / "photos.md")
 
 
 @pytest.mark.skipif(shutil.which("sed") is None, reason="no sed")

@@ -1,6 +1,5 @@
 """DropGaussian against `torch.nn.Dropout`: what it does to values and gradients, its rates and its warnings."""
 
-import copy
 import math
 import warnings
 
@@ -100,15 +99,6 @@ def test_the_layer_adds_nothing_to_the_state_dict():
     assert layer.state_dict() == {}
     assert list(layer.parameters()) == []
     nn.Sequential(nn.Linear(1, 1), layer).load_state_dict(nn.Sequential(nn.Linear(1, 1), nn.Identity()).state_dict())
-
-
-@pytest.mark.parametrize("value", [torch.ones(3), nn.Parameter(torch.ones(3)), torch.ones(3, requires_grad=True) * 2])
-def test_nothing_that_is_assigned_becomes_state(value):
-    layer = at(0.4, p=0.2, seed=3)
-    layer.note, layer.net = value, nn.Linear(1, 1)
-    assert layer.state_dict() == {}
-    assert list(layer.parameters()) == []
-    assert torch.equal(copy.deepcopy(layer).note, value)
 
 
 @pytest.mark.parametrize("seed", [None, 3])
@@ -228,6 +218,14 @@ def test_progress_outside_zero_to_one_is_refused_and_the_old_one_stays(progress)
     assert layer.progress == 0.5
 
 
+def test_values_are_read_in_the_first_call_alone():
+    layer, x = at(1.0, p=0.5), draw()
+    layer(x)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        layer(x + 1)
+
+
 def test_never_set_progress_is_one_warns_once_and_is_dropout_at_p():
     layer, x = DropGaussian(p=0.5), draw()
     assert layer.progress == 1.0
@@ -265,18 +263,8 @@ def test_logits_are_warned_about_once_for_each_layer(values, seed):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         layer(x)
-        layer._replicate_for_data_parallel()(x)
         for fine in (torch.tensor([0.0, 1.0]), torch.empty(0), torch.tensor([math.nan]), torch.ones(2, device="meta")):
             at(1.0, seed=seed)(fine)
-
-
-def test_replicas_share_the_warning_about_progress():
-    layer = DropGaussian()
-    with pytest.warns(UserWarning, match="never set"):
-        layer._replicate_for_data_parallel()(draw())
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        layer._replicate_for_data_parallel()(draw())
 
 
 def test_vmap_draws_a_mask_for_each_sample():

@@ -5,15 +5,29 @@ import io
 import itertools
 import math
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
 from factories import drop_layer as at
 from factories import random_opacities as draw
-from torch import nn
 
 from kgs import DropGaussian, drop_gaussian
+
+
+class Masks(torch.utils.data.Dataset):
+    """A data set that drops, in whatever process it is asked."""
+
+    def __init__(self, layer):
+        self.layer = layer
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, index):
+        return self.layer(draw())
 
 
 def halved(progress):
@@ -132,6 +146,39 @@ def test_a_numpy_seed_is_an_integer():
     assert torch.equal(stream(at(1.0, p=0.5, seed=np.int64(3))), stream(at(1.0, p=0.5, seed=3)))
 
 
+SPAWNED = """
+import torch
+from kgs import DropGaussian
+
+def draw(layer, queue):
+    queue.put(layer(torch.full((100,), 0.5)).tolist())
+
+if __name__ == "__main__":
+    layer = DropGaussian(p=0.5, schedule="constant", seed=3)
+    layer(torch.full((100,), 0.5))
+    context = torch.multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=draw, args=(layer, queue))
+    process.start()
+    got = queue.get(timeout=60)
+    process.join()
+    assert got == layer(torch.full((100,), 0.5)).tolist()
+"""
+
+
+def test_a_spawned_process_continues_the_stream(tmp_path):
+    script = tmp_path / "spawned.py"
+    script.write_text(SPAWNED)
+    subprocess.run([sys.executable, script], check=True, timeout=100)
+
+
+def test_a_worker_of_a_data_loader_continues_the_stream():
+    layer = at(1.0, p=0.5, seed=3)
+    stream(layer)
+    loader = torch.utils.data.DataLoader(Masks(layer), batch_size=None, num_workers=1)
+    assert torch.equal(torch.stack(list(loader)), stream(layer))
+
+
 @pytest.mark.parametrize("shape", [(1000,), (3, 50)])
 def test_the_stream_is_that_of_bernoulli_on_the_cpu_for_tensors_on_any_device(shape):
     reference = torch.Generator().manual_seed(3)
@@ -154,37 +201,6 @@ def test_a_stream_continues_from_cuda_to_the_cpu_and_back():
         other.set_rng_state(layer.get_rng_state())
         layer = other
         assert torch.equal(layer(draw().to(device)).cpu(), reference(draw()))
-
-
-def shallow_copy(layer):
-    replica = layer.__new__(type(layer))
-    replica.__dict__ = layer.__dict__.copy()
-    return replica
-
-
-@pytest.mark.parametrize("replicate", [shallow_copy, copy.copy, DropGaussian._replicate_for_data_parallel])
-def test_replicas_made_for_each_call_draw_new_masks_that_differ(replicate):
-    def calls():
-        layer = nn.Sequential(at(1.0, p=0.5, seed=3))
-        return [replicate(layer[0])(draw()) for _ in range(3) for _ in range(2)]
-
-    masks = calls()
-    assert len({tuple(mask.tolist()) for mask in masks}) == 6
-    assert all(torch.equal(one, two) for one, two in zip(masks, calls(), strict=True))
-
-
-def test_replicas_may_run_in_any_order_and_those_in_eval_leave_the_stream_alone():
-    def step(layer, order):
-        replicas = [layer._replicate_for_data_parallel() for _ in range(2)]
-        masks = {i: replicas[i](draw()) for i in order}
-        return masks[0], masks[1]
-
-    one, two = (at(1.0, p=0.5, seed=3) for _ in range(2))
-    step(two.eval(), (0, 1))
-    two.train()
-    for order in ((0, 1), (1, 0)):
-        for a, b in zip(step(one, (0, 1)), step(two, order), strict=True):
-            assert torch.equal(a, b)
 
 
 def test_the_functions_generator_argument_is_used():

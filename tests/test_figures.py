@@ -12,11 +12,11 @@ import pytest
 import torch
 from factories import random_views
 
-from kgs.bench.study.plots import STYLES
-from kgs.bench.study.presets import AUTO, OFF
 from kgs.datasets.scene import Views
 from kgs.io.figures import DEFAULT, WITHOUT, write_curve, write_sheet
 from kgs.machine import check_device, peak_rss_mb, revision, versions
+from kgs.study.plots import STYLES
+from kgs.study.presets import AUTO, OFF
 
 CURVE = [{"step": k, "seconds": 0.1 * k, "test_psnr": 20.0 + k, "train_psnr": None} for k in range(3)]
 

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 import torch
-from factories import random_camera, random_gaussians
+from factories import random_camera, random_gaussians, whole_matrices
 from kornia.geometry.camera import PinholeCamera
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
@@ -28,12 +28,13 @@ def make_inputs(seed, n=5, sh_degree=3, dtype=torch.float64, size=SIZE):
     gaussians = dataclasses.replace(gaussians, means=gaussians.means * torch.tensor([0.7, 0.7, 1.0], dtype=dtype))
     camera = random_camera(*size, seed, dtype)
     background = torch.rand(3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
-    values = [getattr(gaussians, name) for name in FIELDS] + [camera.extrinsics, camera.intrinsics, background]
+    values = [getattr(gaussians, name) for name in FIELDS]
+    values += [camera.extrinsics, camera.intrinsics[:, :2, :3], background]
     return [value.clone().requires_grad_() for value in values]
 
 
 def render(inputs, size=SIZE, outputs=("image",), **options):
-    camera = PinholeCamera(inputs[6], inputs[5], torch.tensor([size[0]]), torch.tensor([size[1]]))
+    camera = PinholeCamera(whole_matrices(inputs[6]), inputs[5], torch.tensor([size[0]]), torch.tensor([size[1]]))
     return GaussianRenderer(**options)(Gaussians(*inputs[:5]), camera, inputs[7], outputs)
 
 

@@ -16,7 +16,7 @@ import kgs.fit
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
-FLOORS = ("core", "io", "metrics", "sfm", "init_points", "fit", "page", "bench", "cli")
+FLOORS = ("core", "io", "metrics", "sfm", "init_points", "fit", "page", "bench", "study", "cli")
 HEAVY = ("cv2", "PIL", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "distributed")
 
 
@@ -90,7 +90,8 @@ def test_imports_go_one_way():
         "init_points": ground | {"init_points", "sfm"},
         "fit": ground | {"fit", "init_points", "metrics"},
         "page": ground | {"page", "fit", "metrics"},
-        "bench": {*FLOORS, "losses", "datasets"} - {"cli"},
+        "bench": {*FLOORS, "losses", "datasets"} - {"study", "cli"},
+        "study": {*FLOORS, "losses", "datasets"} - {"cli"},
         "cli": {*FLOORS, "losses", "datasets"},
     }
     small = ("kgs.errors", "kgs.json_files", "kgs.backends")  # what losses and datasets may use
@@ -103,6 +104,11 @@ def test_imports_go_one_way():
         and not (floor(name) in ("losses", "datasets") and within(other, *small))
     ]
     assert not wrong
+
+
+def test_the_command_alone_imports_the_study():
+    clients = {name for name in SOURCES for other in imported_modules(name) if floor(other) == "study"}
+    assert {name for name in clients if floor(name) != "study"} == {"kgs.cli.study"}
 
 
 def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():

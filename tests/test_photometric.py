@@ -62,6 +62,21 @@ def test_fast_path_is_as_accurate_as_kornia(shape, kind):
     assert (gradient - exact).abs().max() <= max(1e-5 * exact.abs().max(), 2 * kornia_error)
 
 
+@pytest.mark.parametrize("shape", [(1, 3, 64, 64), (2, 3, 45, 67)])
+@pytest.mark.parametrize("kind", ["flat", "bright"])
+@pytest.mark.parametrize("apart", [0.0, 1e-7, 1e-6])
+def test_nearly_equal_images_have_no_negative_loss(shape, kind, apart):
+    target = torch.full(shape, 0.9) if kind == "flat" else make_pair(shape, "bright")[1]
+    image = target + apart
+    mask = torch.ones(shape[-2:])
+    mask[:20] = 0
+    l1 = float((image - target).abs().mean())
+    for options in ({}, {"mask": mask}, {"moments": target_moments(target)}):
+        assert float(photometric_loss(image, target, 1.0, **options)) >= 0.99 * l1
+    image[0, 0, 30, 30] = math.nan
+    assert photometric_loss(image, target, 1.0).isnan()
+
+
 def test_gradient_of_black_images_keeps_kornias_eps():
     image, target = torch.full((1, 3, 16, 16), 1e-4), torch.zeros(1, 3, 16, 16)
     value, gradient = value_and_gradient(lambda x: photometric_loss(x, target, 1.0), image)

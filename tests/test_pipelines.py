@@ -1,8 +1,7 @@
-"""The layer and the loss in pipelines that are not ours: checkpointing, replicas, compilers, a plain splatting loop."""
+"""The layer and the loss in pipelines that are not ours: checkpointing, compilers, a plain splatting loop."""
 
 import copy
 import math
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -10,6 +9,7 @@ from factories import drop_layer as at
 from factories import pinhole, random_camera, random_gaussians, random_model
 from factories import random_opacities as draw
 from torch import nn
+from torch._dynamo.testing import CompileCounter
 from torch.utils.checkpoint import checkpoint
 
 from kgs import DropGaussian, GaussianRenderer, Gaussians
@@ -58,6 +58,26 @@ def _check_compiled(backend):
         torch.testing.assert_close(grad, out)
         assert abs(kept.double().mean() - (1 - rate)) < 5 * math.sqrt(rate * (1 - rate) / len(out))
     assert identity_in_eval
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("schedule", ["linear", "constant", math.sqrt])
+def test_a_rate_that_rises_is_not_compiled_anew(seed, schedule):
+    def run(compiled):
+        torch._dynamo.reset()
+        torch.manual_seed(0)
+        layer, counter = DropGaussian(p=0.4, schedule=schedule, seed=seed), CompileCounter()
+        counts, outputs = [], []
+        step = torch.compile(lambda x: layer(x * 2) * 2, backend=counter) if compiled else lambda x: layer(x * 2) * 2
+        for i in range(12):
+            layer.progress = (i + 1) / 12
+            outputs.append(step(torch.full((100,), 0.25)))
+            counts.append(counter.frame_count)
+        return counts, outputs
+
+    (counts, outputs), (_, expected) = run(True), run(False)
+    assert counts == [2] * 12, "what is before the layer, and what is behind it"
+    assert all(torch.equal(a, b) for a, b in zip(outputs, expected, strict=True))
 
 
 def test_torch_compile_follows_the_progress():
@@ -152,54 +172,6 @@ def test_a_compiled_step_is_the_step(seed, dtype):
     if dtype == torch.float64:
         for one, two in zip(network.parameters(), eager.parameters(), strict=True):
             torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
-
-
-# -- replicas, as nn.DataParallel makes them in each step ----------------------------------------------------------
-
-
-def replicate(network, count):
-    """What `torch.nn.parallel.replicate` does, on one device: shallow copies of all modules, wired anew."""
-    modules = list(network.modules())
-    copies = [{m: m._replicate_for_data_parallel() for m in modules} for _ in range(count)]
-    for replicas in copies:
-        for module, replica in replicas.items():
-            for name, child in module._modules.items():
-                setattr(replica, name, replicas[child])
-            for name, parameter in module._parameters.items():
-                setattr(replica, name, parameter)
-    return [replicas[network] for replicas in copies]
-
-
-class Scaled(nn.Module):
-    def __init__(self, seed):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(1000))
-        self.drop = DropGaussian(p=0.5, schedule="constant", seed=seed)
-
-    def forward(self, x):
-        return self.drop(x * self.weight)
-
-
-def test_replicas_in_threads_draw_new_masks_each_step_each_its_own_and_the_same_in_each_run():
-    def run():
-        network, masks = Scaled(seed=3), []
-        for _ in range(3):
-            with ThreadPoolExecutor(2) as pool:
-                masks += pool.map(lambda replica: replica(torch.full((1000,), 0.5)), replicate(network, 2))
-        sum(mask.sum() for mask in masks).backward()
-        assert set(network.weight.grad.tolist()) <= {float(k) for k in range(7)}
-        return [tuple(mask.tolist()) for mask in masks]
-
-    masks = run()
-    assert len(set(masks)) == 6
-    assert masks == run()
-
-
-def test_data_parallel_without_devices_is_the_layer():
-    network, alone = nn.DataParallel(Scaled(seed=3), device_ids=[]), Scaled(seed=3)
-    x = torch.full((1000,), 0.5)
-    for _ in range(2):
-        assert torch.equal(network(x), alone(x))
 
 
 # -- other contexts ------------------------------------------------------------------------------------------------

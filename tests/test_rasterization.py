@@ -163,6 +163,7 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
     k = cameras.intrinsics[:, :3, :3].clone().requires_grad_()
     pose = cameras.extrinsics.clone().requires_grad_()
     renders, _, meta = rasterization(*inputs, pose, k, 32, 24, sh_degree=1, pixel_centers="integer")
+    meta["means2d"].retain_grad()
     renders.square().sum().backward()
     again, expected = leaves(gaussians)
     image = GaussianRenderer()(again, kgs.pinhole_cameras(cameras.extrinsics, k.detach(), 32, 24)).image
@@ -278,6 +279,7 @@ def test_the_dense_layout_says_what_the_packed_one_does():
     for packed in (True, False):
         leaf, inputs = leaves(gaussians)
         renders, alphas, meta = call(leaf, cameras, packed=packed, absgrad=True)
+        meta["means2d"].retain_grad()
         renders.square().sum().backward()
         found.append((renders, alphas, meta, inputs))
     (renders, alphas, packed, inputs), (again, alphas_again, dense, inputs_again) = found
@@ -333,11 +335,13 @@ def test_leading_dimensions_are_scenes_of_their_own(packed, sh_degree):
     assert renders.shape == (2, 3, 2, 24, 32, 4)
     assert alphas.shape == (2, 3, 2, 24, 32, 1)
     assert (meta["n_batches"], meta["n_cameras"]) == (6, 2)
+    meta["means2d"].retain_grad()
     (renders.square().sum() + alphas.sum()).backward()
     for b, (gaussians, _) in enumerate(scenes):
         inputs = leaves(gaussians)[1]
         one, two = pose.flatten(0, 1)[b].detach(), k.flatten(0, 1)[b].detach()
         image, alpha, alone = rasterization(*inputs, one, two, 32, 24, backgrounds=backgrounds[b], **options)
+        alone["means2d"].retain_grad()
         (image.square().sum() + alpha.sum()).backward()
         assert torch.equal(image, renders.flatten(0, 1)[b])
         assert torch.equal(alpha, alphas.flatten(0, 1)[b])
@@ -425,14 +429,15 @@ def test_features_of_no_width_in_a_batch():
     assert renders.shape == (2, 2, 24, 32, 1)
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value):
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("place", [(0, 1), (0, 0), (1, 1), (2, 2)])
+def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value, place):
     gaussians, cameras = scene(dtype=torch.float32)
     turned = quaternion_to_rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
     covars = turned @ turned.mT
     rest = torch.arange(60) != 7
     expected = call(gaussians[rest], cameras, covars=covars[rest], quats=None, scales=None)[0]
-    covars[7, 0, 1] = value
+    covars[7][place] = value
     covars.requires_grad_()
     renders = call(gaussians, cameras, covars=covars, quats=None, scales=None)[0]
     assert torch.allclose(renders, expected, atol=1e-5)

@@ -52,6 +52,7 @@ def compare(values, bound=1e-5, packed=False, **options):
     image, alpha, expected = gsplat_render(true, SIZE, **options)
     options = {name: x.float() if isinstance(x, torch.Tensor) else x for name, x in options.items()}
     renders, alphas, meta = ours(own, packed=packed, **options)
+    meta["means2d"].retain_grad()
     generator = torch.Generator().manual_seed(3)
     weights = (
         torch.randn(image.shape, generator=generator, dtype=torch.float64),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians, replace
+from factories import pinhole, random_camera, random_gaussians, replace, whole_matrices
 from kornia.geometry.camera import PinholeCamera
 from oracles import enumerate_drops, quaternion_product
 from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, posed, stack, tensor
@@ -165,11 +165,11 @@ def test_gradients_of_all_inputs(sh_degree):
     colors = gaussians.colors if sh_degree is None else gaussians.colors / 4
 
     def image(means, quats, scales, opacities, colors, extrinsics, intrinsics, background):
-        seen = posed(camera, extrinsics=extrinsics, intrinsics=intrinsics)
+        seen = posed(camera, extrinsics=extrinsics, intrinsics=whole_matrices(intrinsics)[0])
         return render(Gaussians(means, quats, scales, opacities, colors), seen, background, **EXACT)
 
     inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors]
-    inputs += [camera.extrinsics[0], camera.intrinsics[0], tensor(0.1, 0.5, 0.9)]
+    inputs += [camera.extrinsics[0], camera.intrinsics[:, :2, :3], tensor(0.1, 0.5, 0.9)]
     inputs = [value.detach().clone().requires_grad_() for value in inputs]
     assert torch.autograd.gradcheck(image, inputs, eps=1e-6, atol=1e-7)
     for value, gradient in zip(inputs, torch.autograd.grad(image(*inputs).square().sum(), inputs), strict=True):

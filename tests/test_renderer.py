@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
@@ -141,6 +142,7 @@ def test_dropped_gaussians_are_seen_but_not_drawn(exactly):
     assert 10 < dropped.sum() < 50
     assert torch.equal(out.projected.gaussian_ids, full.projected.gaussian_ids)
     assert torch.equal(out.projected.radii, full.projected.radii)
+    out.projected.means2d.retain_grad()
     out.image.square().sum().backward()
     ids = out.projected.gaussian_ids[dropped]
     assert all(not x.grad[ids].any() for x in inputs)
@@ -214,9 +216,20 @@ def test_inference_keeps_no_graph(mode, threads):
     assert not out.projected.means2d.requires_grad
 
 
-def test_gradient_of_means2d_is_kept():
+def test_threads_may_differentiate_one_graph():
+    gaussians, inputs = leaves(random_gaussians(200, 0, torch.float32, 1))
+    out = GaussianRenderer()(gaussians, random_camera(24, 32, 0, torch.float32))
+    assert not out.projected.means2d.retains_grad, "its hook is not safe in threads"
+    loss = out.image.square().sum()
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: torch.autograd.grad(loss, inputs, retain_graph=True), range(16)))
+    assert all(torch.equal(a, b) for one in found for a, b in zip(one, found[0], strict=True))
+
+
+def test_gradient_of_means2d_is_kept_where_it_is_asked_for():
     gaussians, inputs = leaves(random_gaussians(40, 0))
     out = GaussianRenderer()(gaussians, random_camera(24, 32, 0))
+    out.projected.means2d.retain_grad()
     out.image.square().sum().backward()
     assert out.projected.means2d.grad.shape == (len(out.projected), 2)
     assert out.projected.means2d.grad.any()

@@ -1,36 +1,14 @@
-"""The renderer inside other people's programs: replicas, compilers, other defaults, transforms of functions."""
+"""The renderer inside other people's programs: compilers, other defaults, transforms of functions."""
 
 import pytest
 import torch
 from factories import FIELDS, OUTPUTS, leaves, random_camera, random_gaussians
 
 import kgs
-from kgs import DropGaussian, GaussianRenderer, Gaussians
+from kgs import GaussianRenderer, Gaussians
 from kgs.losses import photometric_loss
 
 SIZE = (24, 32)
-
-
-def replicas(module, count):
-    """What `nn.DataParallel` makes of a module, on the CPU: shallow copies with copies of their children."""
-    made = [module._replicate_for_data_parallel() for _ in range(count)]
-    for name, child in module.named_children():
-        for one, part in zip(made, replicas(child, count), strict=True):
-            setattr(one, name, part)
-    return made
-
-
-@pytest.mark.usefixtures("each_backend")
-@pytest.mark.parametrize("seed", [None, 3])
-def test_replicas_of_data_parallel_render_with_masks_of_their_own(seed):
-    gaussians, camera = random_gaussians(200, 0, torch.float32), random_camera(*SIZE, 0, torch.float32)
-    renderer = GaussianRenderer(DropGaussian(p=0.5, schedule="constant", seed=seed))
-    seen = [part(gaussians, camera) for _ in range(2) for part in replicas(renderer, 2)]
-    dropped = [out.projected.opacities == 0 for out in seen]
-    assert all(mask.any() for mask in dropped)
-    assert all(not torch.equal(a, b) for i, a in enumerate(dropped) for b in dropped[:i])
-    first, second = (part(gaussians, camera).image for part in replicas(renderer.eval(), 2))
-    assert torch.equal(first, second)
 
 
 @pytest.mark.usefixtures("each_backend")

@@ -1,6 +1,6 @@
 """The layer and kgs's call in other people's trainers: in the projects' own functions that render.
 
-What docs/gsplat.md changes there is changed here. nerfstudio's file comes from its wheel; those of gsplat's examples
+What docs/layer.md changes there is changed here. nerfstudio's file comes from its wheel; those of gsplat's examples
 and of the paper's release from clones in the folder KGS_PEERS (gsplat, DropGaussian_release). CUDA is replaced, and
 what else a function needs of its project.
 """

@@ -54,7 +54,9 @@ def wood(rng: np.random.Generator, color: Color, along: int = 0, plank: float = 
 
 def printed(picture: Picture, width: float, height: float, axes: Sequence[int] = (0, 2)) -> Texture:
     """A picture on a rectangle around the origin, spanned by two axes; beyond it the picture's border is repeated."""
-    image = torch.from_numpy(np.ascontiguousarray(picture[::-1].transpose(2, 0, 1)))[None] / 255
+    # torch would divide integers into its default dtype, and the texture is cached
+    levels = np.ascontiguousarray(picture[::-1].transpose(2, 0, 1), dtype=np.float32)
+    image = torch.from_numpy(levels)[None] / 255
     half = np.array([width, height], dtype=np.float32) / 2
 
     def texture(points: Array) -> Array:

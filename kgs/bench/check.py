@@ -30,8 +30,8 @@ _EXTRAS = {
 _NO_TRITON = {"mps": "Apple's GPUs have no Triton, and kgs has not been tried on them: use --device cpu"}
 
 
-class _Found(NamedTuple):
-    """How a backend does on a device; "" where nothing is wrong."""
+class _Result(NamedTuple):
+    """How a backend does on a device: error, milliseconds by count, and what is wrong, "" if nothing is."""
 
     agreement: float
     milliseconds: list[float]
@@ -60,9 +60,9 @@ def check(*, device: str | None = None) -> int:
         print(f"{place}: {_describe(place)}")
         taken = backends.resolve("auto", place)
         for backend in backends.BACKENDS:
-            found = _examine(backend, place) if _is_there(backend, place) else _Found(0.0, [], "")
-            faults += bool(found.wrong)
-            print(f"  {backend.name:<22}{_row(backend, place, found, backend.name == taken)}")
+            result = _examine(backend, place) if _is_there(backend, place) else _Result(0.0, [], "")
+            faults += bool(result.wrong)
+            print(f"  {backend.name:<22}{_row(backend, place, result, backend.name == taken)}")
     print(f"\noff by: from the reference in float64, image and gradients, 300 Gaussians; expected at most {BOUND:g}")
     print(f"10 000, 50 000: Gaussians; a training step at {SIZE[1]}x{SIZE[0]} without densification")
     missing = {extra: of for extra, of in _EXTRAS.items() if find_spec(of[0]) is None}
@@ -73,12 +73,12 @@ def check(*, device: str | None = None) -> int:
 
 def _devices() -> list[torch.device]:
     """The CPU, and all GPUs that torch can use."""
-    found = [torch.device("cpu")]
+    devices = [torch.device("cpu")]
     if torch.cuda.is_available():
-        found += [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
+        devices += [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
     if torch.xpu.is_available():
-        found += [torch.device("xpu", i) for i in range(torch.xpu.device_count())]
-    return found
+        devices += [torch.device("xpu", i) for i in range(torch.xpu.device_count())]
+    return devices
 
 
 def _describe(device: torch.device) -> str:
@@ -96,7 +96,7 @@ def _is_there(backend: Backend, device: torch.device) -> bool:
     return backend.runs_on(device) and backend.is_installed() and (device.type, backend.name) != ("cpu", "triton")
 
 
-def _examine(backend: Backend, device: torch.device) -> _Found:
+def _examine(backend: Backend, device: torch.device) -> _Result:
     """Agreement and times; what is wrong in one line."""
     try:
         off = _off_by(backend.name, device)
@@ -104,9 +104,9 @@ def _examine(backend: Backend, device: torch.device) -> _Found:
             off = max(off, disagreement(backend, device))
         milliseconds = [1e3 * _seconds(count, backend.name, device) for count in COUNTS]
     except Exception as error:  # whatever a compiler, a driver or a broken package does
-        return _Found(float("nan"), [], f"{type(error).__name__}: {error}".splitlines()[0])
+        return _Result(float("nan"), [], f"{type(error).__name__}: {error}".splitlines()[0])
     wrong = "" if off <= BOUND else f"expected at most {BOUND:g}"
-    return _Found(off, milliseconds, wrong)
+    return _Result(off, milliseconds, wrong)
 
 
 def _off_by(backend: str, device: torch.device) -> float:
@@ -127,14 +127,14 @@ def _seconds(count: int, backend: str, device: torch.device) -> float:
     return take_turns({"step": cases.train}, 3, device)["step"].wall
 
 
-def _row(backend: Backend, device: torch.device, found: _Found, taken: bool) -> str:
-    """What is said of a backend."""
-    if found.wrong:
-        return f"WRONG: {found.wrong}" + (f" (off by {found.agreement:.1e})" if found.milliseconds else "")
-    if not found.milliseconds:
+def _row(backend: Backend, device: torch.device, result: _Result, taken: bool) -> str:
+    """The line of a backend, without its name."""
+    if result.wrong:
+        return f"WRONG: {result.wrong}" + (f" (off by {result.agreement:.1e})" if result.milliseconds else "")
+    if not result.milliseconds:
         package, how = backend.package or ("", "")
         if backend.runs_on(device) and not backend.is_installed():
             return f"not installed: {package}; {how}"
         return f"not for {device.type}"
-    times = "".join(f"{value:>8.1f} ms" for value in found.milliseconds)
-    return f"{found.agreement:>9.1e}{times}{'   auto takes it' if taken else ''}"
+    times = "".join(f"{value:>8.1f} ms" for value in result.milliseconds)
+    return f"{result.agreement:>9.1e}{times}{'   auto takes it' if taken else ''}"

@@ -25,7 +25,9 @@ from .output import Row, markdown_table, write_results
 from .scenes import DTYPES, Scene, cast, centred_camera, exact, gradients, relative_errors
 from .timing import CPU
 
-SIZE, FOCAL, COUNT = (48, 48), 60.0, 200
+SIZE = (48, 48)
+FOCAL = 60.0  # pixels
+COUNT = 200
 SHAPE = torch.tensor([1.0, 0.6, 0.3], dtype=torch.float64)  # of Gaussians that are not round: round ones cannot turn
 NUMBERS = ("forward_float32", "gradient_float32", "forward_float64", "gradient_float64", "near_plane")
 
@@ -65,24 +67,33 @@ def render(scene: Scene, dtype: torch.dtype, **options: Any) -> tuple[Tensor, di
 
 def errors(case: Row, dtype: str, device: torch.device = CPU) -> Row:
     """One row: errors on a device against the dense reference on the CPU, which gets the rounded numbers."""
-    (cloud, view), near_plane = SCENES[case["case"]](), case["near_plane"]
+    cloud, view = SCENES[case["case"]]()
+    near_plane = case["near_plane"]
     expected, expected_gradients = exact(cast((cloud, view), DTYPES[dtype]), near_plane)
-    image, got = render((cloud.to(device), move_camera(view, device)), DTYPES[dtype], near_plane=near_plane)
-    image, got = image.cpu(), {name: gradient.cpu() for name, gradient in got.items()}
-    worst = relative_errors(got, expected_gradients).max().item()
-    found = {"forward": float((image - expected).abs().max()), "gradient": worst}
-    row = {name: case[name] for name in ("case", "stiff", "treatment")} | {"dtype": dtype}
-    for name, error in found.items():
-        row |= {name: error, f"{name}_bound": case[f"{name}_{dtype}"]}
-    met = all(error <= case[f"{name}_{dtype}"] for name, error in found.items())  # NaN misses
-    return {**row, "verdict": "met" if met else "MISSED"}
+    image, slopes = render((cloud.to(device), move_camera(view, device)), DTYPES[dtype], near_plane=near_plane)
+    slopes = {name: gradient.cpu() for name, gradient in slopes.items()}
+    worst = {
+        "forward": float((image.cpu() - expected).abs().max()),
+        "gradient": relative_errors(slopes, expected_gradients).max().item(),
+    }
+    row = {name: case[name] for name in ("case", "stiff", "treatment")}
+    row["dtype"] = dtype
+    met = True
+    for name, error in worst.items():
+        bound = case[f"{name}_{dtype}"]
+        row[name] = error
+        row[f"{name}_bound"] = bound
+        met = met and error <= bound  # NaN misses
+    row["verdict"] = "met" if met else "MISSED"
+    return row
 
 
 def _markdown(rows: list[Row]) -> str:
     lines = []
     for low, high in zip(rows[::2], rows[1::2], strict=True):  # float32, float64
-        pairs = ((row, part) for row in (low, high) for part in ("forward", "gradient"))
-        cells = (f"{row[part]:.0e} ({row[f'{part}_bound']:.0e})" for row, part in pairs)
+        cells = []
+        for row in (low, high):
+            cells += [f"{row[part]:.0e} ({row[f'{part}_bound']:.0e})" for part in ("forward", "gradient")]
         verdict = "met" if low["verdict"] == high["verdict"] == "met" else "MISSED"
         lines.append([low["case"], low["stiff"], *cells, verdict, low["treatment"]])
     heads = ("what is stiff", "image, float32", "gradient, float32", "image, float64", "gradient, float64")
@@ -117,7 +128,9 @@ def _uniform(low: float, high: float, *shape: int, generator: torch.Generator | 
 
 
 def _off_axis() -> Scene:
-    tangent, angle, depth = _uniform(0.8, 5.0, COUNT), _uniform(0, 2 * math.pi, COUNT), gaussians().means[:, 2]
+    tangent = _uniform(0.8, 5.0, COUNT)
+    angle = _uniform(0, 2 * math.pi, COUNT)
+    depth = gaussians().means[:, 2]
     rays = torch.stack([tangent * angle.cos(), tangent * angle.sin(), torch.ones_like(depth)], 1)
     return ordinary(means=rays * depth[:, None], scales=_uniform(0.1, 3.0, COUNT, 3))
 
@@ -137,7 +150,8 @@ def _beside_the_camera() -> Scene:
 
 
 def _far_from_the_origin(distance: float) -> Scene:
-    shift, view = distance * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64), centred_camera(SIZE, FOCAL)
+    shift = distance * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
+    view = centred_camera(SIZE, FOCAL)
     view.extrinsics[:, :3, 3] = -shift
     return gaussians(means=gaussians().means + shift), view
 

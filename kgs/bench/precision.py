@@ -33,7 +33,8 @@ class Setting:
     backend: str = "auto"
 
 
-DEFAULT, EXACT = Setting(), Setting(alpha_threshold=0.0, transmittance_stop=0.0)
+DEFAULT = Setting()
+EXACT = Setting(alpha_threshold=0.0, transmittance_stop=0.0)
 EXACT64 = replace(EXACT, dtype="float64")
 _ALPHAS = (0.0, 1e-4, 1 / 1024, 1 / 512, 1 / 255, 1 / 128)
 _GRADIENTS = ("gradient", *(f"gradient_{name}" for name in PARAMETERS))
@@ -51,8 +52,9 @@ _COLUMNS = {
     "default": DEFAULT,
     "default, torch": replace(DEFAULT, backend="torch"),
     "alpha 1/1024": replace(DEFAULT, alpha_threshold=1 / 1024),
+    "exact, float32": EXACT,
+    "exact, float64": EXACT64,
 }
-_COLUMNS |= {"exact, float32": EXACT, "exact, float64": EXACT64}
 
 
 def precision(*, out: Path, quick: bool = False) -> None:
@@ -83,7 +85,8 @@ class Measured:
     """A scene in float64 that is rendered in both dtypes, black background."""
 
     def __init__(self, scene: Scene, near_plane: float = RasterOptions.near_plane) -> None:
-        self.near_plane, self.inputs = near_plane, {name: cast(scene, dtype) for name, dtype in DTYPES.items()}
+        self.near_plane = near_plane
+        self.inputs = {name: cast(scene, dtype) for name, dtype in DTYPES.items()}
 
     def image(self, s: Setting, grad: bool = False) -> Tensor:
         """The image alone, with or without its graph."""
@@ -120,7 +123,8 @@ def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> Mea
     model, camera = layered_scene(count, (size, size))
     with torch.no_grad():
         g = model.double()()
-    camera, pose = centred_camera((size, size), float(camera.fx)), torch.eye(4, dtype=torch.float64)
+    camera = centred_camera((size, size), float(camera.fx))
+    pose = torch.eye(4, dtype=torch.float64)
     if far:
         pose[:3, :3] = torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]], dtype=torch.float64)
         pose[:3, 3] = -pose[:3, :3] @ (far * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64))
@@ -132,8 +136,11 @@ def _ordinary(count: int, size: int, unit: float = 1.0, far: float = 0.0) -> Mea
 def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, float]) -> Measured:
     """A cloud that fills the picture; `spread`: longest standard deviation in pixels, `ratios`: to the others."""
     bounds = {"depths": (2.0, 6.0), "spread": (1.0, 5.0), "ratios": (1.0, 4.0), "opacities": (0.05, 0.95), **changes}
-    n, rng, half = count // 2, np.random.default_rng([7, count]), math.tan(math.radians(angle) / 2)
-    (shortest, longest), (least, most) = bounds["spread"], bounds["ratios"]
+    n = count // 2
+    rng = np.random.default_rng([7, count])
+    half = math.tan(math.radians(angle) / 2)
+    shortest, longest = bounds["spread"]
+    least, most = bounds["ratios"]
     z = rng.uniform(*bounds["depths"], (n, 1))
     scales = shortest * (longest / shortest) ** rng.random((n, 1)) * z * 2 * half / size
     scales = np.concatenate([scales, scales / (least * (most / least) ** rng.random((n, 2)))], 1)
@@ -162,8 +169,8 @@ def _find(rows: list[Row], scene: str, setting: Setting) -> Row:
 def _markdown(rows: list[Row]) -> str:
     lines: dict[str, list[str]] = {row["scene"]: [] for row in rows}
     for scene, line in lines.items():
-        found = (_find(rows, scene, setting) for setting in _COLUMNS.values())
-        line += [scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in found)]
+        of_scene = [_find(rows, scene, setting) for setting in _COLUMNS.values()]
+        line += [scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in of_scene)]
     return markdown_table("Largest error: image / gradient, relative to its largest value", _COLUMNS, lines.values())
 
 
@@ -172,8 +179,8 @@ def _plot(path: Path, rows: list[Row], error: str, seconds: str, label: str) -> 
     for scene in dict.fromkeys(row["scene"] for row in rows):
         lines = panels[scene] = {}
         for (knob, settings), marker in zip([*KNOBS.items(), ("the default", [DEFAULT])], _LOOKS, strict=True):
-            found = (_find(rows, scene, setting) for setting in settings)
-            lines[knob] = [(1e3 * row[seconds], max(row[error], 1e-8)) for row in found], marker
+            of_knob = [_find(rows, scene, setting) for setting in settings]
+            lines[knob] = [(1e3 * row[seconds], max(row[error], 1e-8)) for row in of_knob], marker
         times = [x for points, _ in lines.values() for x, _ in points]
         lines |= {name: ([(min(times), y), (max(times), y)], look) for name, (y, look) in LEVELS.items()}
     write_plot(path, panels, 2, xlabel="wall time [ms]", ylabel=label, ylim=(6e-9, 2))

@@ -21,7 +21,8 @@ SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 Scene = tuple[Gaussians, PinholeCamera]
-_DEPTHS, _SHARES = np.array([[2.2, 3.0, 4.0, 5.5, 7.5, 9.5], [0.10, 0.18, 0.22, 0.20, 0.16, 0.14]])
+_DEPTHS = np.array([2.2, 3.0, 4.0, 5.5, 7.5, 9.5])  # of the layers
+_SHARES = np.array([0.10, 0.18, 0.22, 0.20, 0.16, 0.14])  # of the Gaussians in each
 
 
 def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0) -> tuple[GaussianModel, PinholeCamera]:
@@ -65,15 +66,17 @@ def cast_camera(camera: PinholeCamera, dtype: torch.dtype) -> PinholeCamera:
 
 def cast(scene: Scene, dtype: torch.dtype) -> Scene:
     """The scene rounded to a dtype; its Gaussians are leaves that want gradients."""
-    leaves = (getattr(scene[0], name).detach().to(dtype).requires_grad_() for name in PARAMETERS)
-    return Gaussians(*leaves), cast_camera(scene[1], dtype)
+    gaussians, camera = scene
+    leaves = {name: getattr(gaussians, name).detach().to(dtype).requires_grad_() for name in PARAMETERS}
+    return Gaussians(**leaves), cast_camera(camera, dtype)
 
 
 def gradients(image: Tensor, gaussians: Gaussians) -> dict[str, Tensor]:
     """Those of a sum of the pixels with random weights, which are the same for all images of one size."""
-    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(image.dtype)
-    found = torch.autograd.grad((image * weights).sum(), [getattr(gaussians, name) for name in PARAMETERS])
-    return dict(zip(PARAMETERS, found, strict=True))
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image.dtype)
+    slopes = torch.autograd.grad((image * weights).sum(), [getattr(gaussians, name) for name in PARAMETERS])
+    return dict(zip(PARAMETERS, slopes, strict=True))
 
 
 def exact(scene: Scene, near_plane: float) -> tuple[Tensor, dict[str, Tensor]]:
@@ -85,7 +88,11 @@ def exact(scene: Scene, near_plane: float) -> tuple[Tensor, dict[str, Tensor]]:
 
 def relative_errors(got: dict[str, Tensor], expected: dict[str, Tensor]) -> Tensor:
     """The largest error of each parameter's gradient over its largest value, `(5,)` float64; NaN stays."""
-    return torch.stack([((got[p] - expected[p]).abs().max() / expected[p].abs().max()).double() for p in PARAMETERS])
+    errors = []
+    for name in PARAMETERS:
+        error = (got[name] - expected[name]).abs().max() / expected[name].abs().max()
+        errors.append(error.double())
+    return torch.stack(errors)
 
 
 def check_scenes(data: Path, scenes: Iterable[str]) -> None:

@@ -26,8 +26,8 @@ from .scenes import PARAMETERS, layered_scene
 from .timing import CPU, Case, busy_processes, seconds_of_exp, take_turns, time_parts
 
 SIZE = (378, 504)
-# What kgs is held to on two cores, by count of Gaussians: numba's time in torch's, the most MiB over what importing
-# takes, and the most wall time beside two busy processes in that of a quiet machine.
+# The targets of kgs on two cores, by count of Gaussians: how many times faster than torch numba is, the most MiB over
+# what importing takes, and the most wall time beside two busy processes in that of a quiet machine.
 TARGETS = {
     "forward + backward": {10_000: 4.0, 50_000: 4.0, 200_000: 3.5},
     "training step": {10_000: 4.0, 50_000: 4.0, 200_000: 3.3},
@@ -57,18 +57,31 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     scaled = [(count, SIZE) for count in (counts[0] // 2, *counts)] + [(counts[0], size) for size in sizes]
     plan = [(table, count, SIZE) for count in counts for table in ("main", "busy", "stages")]
     plan += [("left out", counts[1], SIZE), *(("scaling", *scene) for scene in dict.fromkeys(scaled))]
-    unit, rows, how = seconds_of_exp(where), [], (repeats, where)
+    unit = seconds_of_exp(where)
+    rows = []
     for table, count, (height, width) in plan:
         print(f"{table}: {count} Gaussians at {width}x{height} ...")
         cases = Cases(count, (height, width), where)
-        with busy_processes(2 * (table == "busy")):
-            found = time_parts(cases.stages, *how) if table == "stages" else take_turns(cases.of(table), *how)
-        for name, times in found.items():
+        with busy_processes(2 if table == "busy" else 0):
+            if table == "stages":
+                times_of = time_parts(cases.stages, repeats, where)
+            else:
+                times_of = take_turns(cases.of(table), repeats, where)
+        for name, times in times_of.items():
             case, _, backend = name.partition(", by ")
-            row = {"table": table, "case": case, "backend": backend or "auto", "gaussians": count}
-            row |= {"height": height, "width": width, "pairs_millions": cases.pairs, "repeats": repeats}
+            row: Row = {
+                "table": table,
+                "case": case,
+                "backend": backend or "auto",
+                "gaussians": count,
+                "height": height,
+                "width": width,
+                "pairs_millions": cases.pairs,
+                "repeats": repeats,
+            }
             row |= {f"{key}_s": value for key, value in times._asdict().items()}
-            rows.append({**row, "wall_in_exp_per_pair": times.wall / (cases.pairs * 1e6) / unit})
+            row["wall_in_exp_per_pair"] = times.wall / (cases.pairs * 1e6) / unit
+            rows.append(row)
     alone = backends(where) if where.type == "cpu" else []
     memory = {backend: {count: _memory_of_its_own(count, backend) for count in counts} for backend in alone}
     points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
@@ -89,8 +102,11 @@ class Cases:
 
     def __init__(self, count: int, size: tuple[int, int], device: torch.device, backend: str = "auto") -> None:
         model, camera = layered_scene(count, size)
-        self.count, self.device, self.renderer = count, device, GaussianRenderer(backend=backend)
-        self.model, self.camera = model.to(device), move_camera(camera, device)
+        self.count = count
+        self.device = device
+        self.renderer = GaussianRenderer(backend=backend)
+        self.model = model.to(device)
+        self.camera = move_camera(camera, device)
         generator = torch.Generator().manual_seed(0)
         self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
         self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
@@ -136,7 +152,8 @@ class Cases:
 
     def train(self) -> None:
         """One step of training, densification left aside."""
-        image, backend = self.renderer(self.model(), self.camera).image, self.renderer.backend
+        image = self.renderer(self.model(), self.camera).image
+        backend = self.renderer.backend
         photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments, backend=backend).backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -184,7 +201,8 @@ def _memory_of_its_own(count: int, backend: str) -> float:
 
 def _memory(count: int, backend: str) -> float:
     Cases(10, (16, 16), CPU, backend).both()  # imports what it needs
-    before, cases = peak_rss_mb(), Cases(count, SIZE, CPU, backend)
+    before = peak_rss_mb()
+    cases = Cases(count, SIZE, CPU, backend)
     for _ in range(3):
         cases.both()
     return peak_rss_mb() - before
@@ -213,25 +231,23 @@ def _markdown(rows: list[Row], memory: dict[str, dict[int, float]], unit: float,
     for row in rows:
         name = row["case"] if row["backend"] == "auto" else f"{row['case']}, {row['backend']}"
         tables.setdefault(row["table"], {}).setdefault(name, []).append(row)
-    quiet, busy, main = tables["main"], tables["busy"], []
+    quiet = tables["main"]
     counts = [f"{row['gaussians'] // 1000}k" for row in next(iter(quiet.values()))]
-    for name, found in quiet.items():
-        main.append([name, *map(_cell, found)])
+    main = []
+    for name, by_count in quiet.items():
+        main.append([name, *map(_cell, by_count)])
         case, _, backend = name.rpartition(", ")
         if backend == "numba":
-            pairs = zip(quiet[f"{case}, torch"], found, strict=True)
-            ratios = [(other["wall_s"] / row["wall_s"], row) for other, row in pairs]
-            main.append([f"{case}, times faster", *(_held(x, case, row["gaussians"], ".1f") for x, row in ratios)])
-    for name, found in busy.items():
-        ratios = [(row["wall_s"] / before["wall_s"], row) for before, row in zip(quiet[name], found, strict=True)]
-        cells = (_held(ratio, "busy", row["gaussians"], ".1f") for ratio, row in ratios)
+            main.append([f"{case}, times faster", *_ratios(quiet[f"{case}, torch"], by_count, case)])
+    for name, by_count in tables["busy"].items():
+        cells = _ratios(by_count, quiet[name], "busy")
         main.append([f"{name}, wall beside two busy processes over that", *cells])
     for backend, peaks in memory.items():
-        name = "peak memory" if backend == "numba" else ""  # torch is held to nothing
-        cells = (_held(mb, name, count, ".0f") for count, mb in peaks.items())
+        target = "peak memory" if backend == "numba" else ""  # torch has no target
+        cells = [_with_target(mb, target, count, ".0f") for count, mb in peaks.items()]
         main.append([f"peak memory over importing, {backend}, MiB", *cells])
-    stages = [[name, *(f"{row['wall_s'] * 1e3:.0f}" for row in found)] for name, found in tables["stages"].items()]
-    savings = [row for found in tables["left out"].values() for row in found]
+    stages = [[name, *(f"{row['wall_s'] * 1e3:.0f}" for row in rows)] for name, rows in tables["stages"].items()]
+    savings = [row for rows in tables["left out"].values() for row in rows]
     whole = savings[0]["wall_s"]
     left_out = [[row["case"], f"{row['wall_s'] * 1e3:.0f}", f"{row['wall_s'] / whole:.2f}"] for row in savings]
     grows = ", ".join(f"{name}^{power:.2f}" for name, power in exponents.items())
@@ -247,7 +263,13 @@ def _cell(row: Row) -> str:
     return "{:.0f} ({:.0f} to {:.0f}) ms".format(*(1e3 * row[f"{name}_s"] for name in ("wall", "best", "worst")))
 
 
-def _held(value: float, name: str, count: int, digits: str) -> str:
-    """A number, and what it is held to."""
+def _ratios(over: list[Row], under: list[Row], name: str) -> list[str]:
+    """The wall time of some rows in that of others, of the same counts."""
+    pairs = zip(over, under, strict=True)
+    return [_with_target(one["wall_s"] / other["wall_s"], name, one["gaussians"], ".1f") for one, other in pairs]
+
+
+def _with_target(value: float, name: str, count: int, digits: str) -> str:
+    """A number and its target."""
     target = TARGETS.get(name, {}).get(count)
     return f"{value:{digits}}" + ("" if target is None else f"; {target:g}")

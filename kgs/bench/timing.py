@@ -37,16 +37,20 @@ def take_turns(cases: dict[str, Case], repeats: int = 5, device: torch.device = 
 def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch.device = CPU) -> dict[str, Times]:
     """As `take_turns`, of the parts of `run`, which yields the name of each when it is done; a GPU is waited for."""
     wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
-    found: dict[str, list[tuple[float, float]]] = {}
+    walls: dict[str, list[float]] = {}
+    cpus: dict[str, list[float]] = {}
     for round_ in range(repeats + 1):
         wall, cpu = time.perf_counter(), time.process_time()
         for name in run():
             wait()
             if round_ > 0:
-                found.setdefault(name, []).append((time.perf_counter() - wall, time.process_time() - cpu))
+                walls.setdefault(name, []).append(time.perf_counter() - wall)
+                cpus.setdefault(name, []).append(time.process_time() - cpu)
             wall, cpu = time.perf_counter(), time.process_time()
-    times = {name: tuple(zip(*pairs, strict=True)) for name, pairs in found.items()}
-    return {n: Times(statistics.median(w), min(w), max(w), statistics.median(c)) for n, (w, c) in times.items()}
+    return {
+        name: Times(statistics.median(of), min(of), max(of), statistics.median(cpus[name]))
+        for name, of in walls.items()
+    }
 
 
 @contextmanager
@@ -63,6 +67,7 @@ def busy_processes(count: int) -> Iterator[None]:
 
 def seconds_of_exp(device: torch.device) -> float:
     """Seconds per element of `torch.exp` over 2^18 float32 in cache, on all threads: to compare two machines."""
-    values, results = torch.full((2**18,), -1.0, device=device), torch.empty(2**18, device=device)
+    values = torch.full((2**18,), -1.0, device=device)
+    results = torch.empty_like(values)
     times = take_turns({"exp": lambda: [torch.exp(values, out=results) for _ in range(50)]}, 5, device)
     return times["exp"].best / 50 / len(values)

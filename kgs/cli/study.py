@@ -37,7 +37,7 @@ def study(
             done.
         report_only: fit nothing; write the report of the fits that are done.
     """
-    from kgs.bench.study import study
+    from kgs.study import study
 
     return study(
         out=out,

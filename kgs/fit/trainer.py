@@ -169,7 +169,7 @@ class Trainer:
         rendering: Rendering = self.renderer(gaussians, camera, background)
         return rendering
 
-    def loss_of(self, image: Tensor, view: Target, gaussians: Gaussians) -> Tensor:
+    def loss_of(self, image: Tensor, view: Target) -> Tensor:
         """The loss of a training step, 0-d: of an image `(1, 3, H, W)` beside its photo."""
         recipe = self.plan.config.recipe
         return photometric_loss(image, view.image, recipe.dssim_weight, moments=view.moments, backend=self.plan.backend)
@@ -272,9 +272,10 @@ class Trainer:
         if config.training_background == "random":
             background = torch.rand(3, generator=state.colors, dtype=torch.float32, device=self.plan.device)
             view = view.over(background)
-        gaussians = state.model()
-        rendering: Any = self.render_view(gaussians, camera, background)
-        loss = self.loss_of(view.seen(rendering.image), view, gaussians)
+        rendering: Any = self.render_view(state.model(), camera, background)
+        if rendering.projected.means2d.requires_grad:
+            rendering.projected.means2d.retain_grad()  # for the densifier
+        loss = self.loss_of(view.seen(rendering.image), view)
         looks = state.step % self._look_every == 0 or state.step == steps or math.isnan(self._loss)
         if looks:
             self._loss = float(loss.detach())

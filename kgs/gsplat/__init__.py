@@ -115,10 +115,10 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     Returns:
         Renders `(..., C, H, W, D)`, where a depth is the last channel; alphas `(..., C, H, W, 1)`; and a dict `meta`.
         Of the M pairs (camera, Gaussian) that were seen it has depths and opacities `(M,)`; means2d `(M, 2)` in the
-        pixels of `Ks`, which keeps its `.grad`; radii `(M, 2)`, int32, 3.33 standard deviations along x and y in
-        pixels, rounded up; conics `(M, 3)`; batch_ids, camera_ids and gaussian_ids `(M,)`. With `packed=False` they are
-        `(..., C, N)` and so on, 0 where a Gaussian is not seen, and the ids are None. Also width, height, tile_size,
-        tile_width, tile_height, n_batches and n_cameras.
+        pixels of `Ks`, whose gradient `retain_grad()` keeps, as in gsplat; radii `(M, 2)`, int32, 3.33 standard
+        deviations along x and y in pixels, rounded up; conics `(M, 3)`; batch_ids, camera_ids and gaussian_ids `(M,)`.
+        With `packed=False` they are `(..., C, N)` and so on, 0 where a Gaussian is not seen, and the ids are None. Also
+        width, height, tile_size, tile_width, tile_height, n_batches and n_cameras.
 
     Raises:
         TypeError: an argument is not a tensor, or of another dtype or device.
@@ -183,8 +183,6 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     pairs = Pairs(projected, batch, count, n, packed)
     half = 0.5 if pixel_centers == "half" else 0.0
     means2d = pairs.spread(joined([p.means2d for p in projected]) + half)
-    if means2d.requires_grad:
-        means2d.retain_grad()
     drawn = []
     for b, (scene, rows) in enumerate(zip(scenes, pairs.gathered(means2d), strict=True)):
         projected[b] = dataclasses.replace(projected[b], means2d=rows - half)

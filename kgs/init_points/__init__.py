@@ -177,7 +177,7 @@ def _random_points(views: Views, count: int, near: float, far: float, generator:
     found: list[Tensor] = []
     for required in [min(2, len(views))] * 50 + [1] * 50:
         draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
-        view = (torch.rand(4 * count, generator=generator) * len(views)).long()
+        view = (torch.rand(4 * count, generator=generator, dtype=torch.float32) * len(views)).long()
         depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
         points = unproject(draws[:, :2] * size - 0.5, depths, view, views.cameras)
         # a place that k views see is drawn k times as often, so it is kept with probability required / k

@@ -79,5 +79,5 @@ def _read_cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         points = points - origin
     points = points.float()
     if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # no colours, or not one for each point
-        return points, torch.full((len(points), 3), 0.5)
+        return points, torch.full((len(points), 3), 0.5, dtype=torch.float32)
     return points, colors[:, :3].float() / 255.0

@@ -33,8 +33,8 @@ _WINDOW = 11
 def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpips | None = None) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
-    Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a "vgg16" network on the device of the renders. A ValueError
-    for another network, or a render that differs in shape from its photo or holds NaN or infinity.
+    Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a network on the device of the renders. A ValueError for a
+    render that differs in shape from its photo or holds NaN or infinity.
 
     Returns:
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
@@ -42,11 +42,10 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
         what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one).
     """
-    if lpips is not None and lpips.net != "vgg16":
-        raise ValueError(f"lpips: expected a network 'vgg16', got {lpips.net!r}")
     rows = list[dict[str, Any]]()
     for index, name in enumerate(views.names):
-        image, target = render(views.camera(index)), views.images[index : index + 1]
+        image = render(views.camera(index))
+        target = views.images[index : index + 1]
         if image.shape != target.shape:
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):

@@ -28,84 +28,83 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 NORM_EPS = 1e-10
 
-# Convolutions (width, size, stride, padding), each with a ReLU, and poolings (size, stride), in torchvision's order.
-LAYERS = {
-    "alexnet": ((64, 11, 4, 2), (3, 2), (192, 5, 1, 2), (3, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
-    "vgg16": (
-        *(*[(64, 3, 1, 1)] * 2, (2, 2), *[(128, 3, 1, 1)] * 2, (2, 2), *[(256, 3, 1, 1)] * 3, (2, 2)),
-        *(*[(512, 3, 1, 1)] * 3, (2, 2), *[(512, 3, 1, 1)] * 3),
-    ),
-}
-# Positions among the layers of the ReLUs whose outputs are compared; and the smallest image they take.
-TAPS = {"alexnet": (1, 4, 7, 9, 11), "vgg16": (3, 8, 15, 22, 29)}
-MIN_SIZE = {"alexnet": 31, "vgg16": 16}
+# VGG16 in torchvision's order: blocks of convolutions of size 3, each with a ReLU, and between blocks a pooling by 2.
+BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+MIN_SIZE = 16  # pixels, of the smallest image that four poolings leave something of
 MAX_HEADER = 10_000  # bytes of an array's
 
 
 class Lpips(nn.Module):
-    """Perceptual distance of two images; `net` is "vgg16" or "alexnet".
+    """Perceptual distance of two images, by VGG16.
 
     The state dict has the names of the weight files: torchvision's `features.0.weight`, ... and `lin0` to `lin4`. A
     module made without `load` has random features and heads of ones: a distance, but not LPIPS.
     """
 
-    def __init__(self, net: str = "vgg16") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        if net not in TAPS:
-            raise ValueError(f"net: expected one of {sorted(TAPS)}, got {net!r}")
-        self.net = net
-        layers, channels = list[nn.Module](), 3
-        for layer in LAYERS[net]:
-            if len(layer) == 2:
-                layers.append(nn.MaxPool2d(*layer))
-                continue
-            width, size, stride, padding = layer
-            layers += [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU()]
-            channels = width
-            if len(layers) - 1 in TAPS[net]:
-                self.register_buffer(f"lin{TAPS[net].index(len(layers) - 1)}", torch.ones(channels))
+        layers = list[nn.Module]()
+        channels = 3
+        self.taps = list[int]()  # positions of the ReLUs whose outputs are compared
+        for block, widths in enumerate(BLOCKS):
+            if block > 0:
+                layers.append(nn.MaxPool2d(2, 2))
+            for width in widths:
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+                channels = width
+            self.taps.append(len(layers) - 1)
+            self.register_buffer(f"lin{block}", torch.ones(channels))
         self.features = nn.Sequential(*layers)
         self.requires_grad_(False)
 
     @classmethod
-    def load(cls, folder: str | PathLike[str], net: str = "vgg16") -> Self:
+    def load(cls, folder: str | PathLike[str]) -> Self:
         """Read the weights, floating point of any width; the module is frozen, on the CPU, in float32.
 
-        The folder holds `<net>_features.npz` with the convolutions under torchvision's names (`features.0.weight`,
-        OIHW) and `lpips_lin_<net>.npz` with the heads `lin0` to `lin4`. Published tables have `net` "vgg16".
+        The folder holds `vgg16_features.npz` with the convolutions under torchvision's names (`features.0.weight`,
+        OIHW) and `lpips_lin_vgg16.npz` with the heads `lin0` to `lin4`.
 
-        DataError where the folder, a file or an array is missing or wrong, ValueError for an unknown `net`.
+        DataError where the folder, a file or an array is missing or wrong.
         """
         with torch.device("meta"):
-            module = cls(net)
-        network, lines = weight_files(folder, net)
+            module = cls()
+        network, lines = weight_files(folder)
         shapes = {name: tuple(value.shape) for name, value in module.state_dict().items()}
         heads = {name: shape for name, shape in shapes.items() if name.startswith("lin")}
         features = {name: shape for name, shape in shapes.items() if name not in heads}
-        module.load_state_dict(_read(network, features) | _read(lines, heads), assign=True)
+        module.load_state_dict(_read(lines, heads) | _read(network, features), assign=True)
         return module.requires_grad_(False).eval()
 
     def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:
         """Distances >= 0, `(B,)`, of images to their targets, both `(B, 3, H, W)` in [0, 1]; differentiable in both.
 
-        H and W are at least 16 for "vgg16" and 31 for "alexnet". `rescale` scales the images to [-1, 1], the range of
-        the network's training. False feeds them in [0, 1], as the published tables of Gaussian splatting do; the two
-        values cannot be compared. ValueError for other shapes.
+        H and W are at least 16. `rescale` scales the images to [-1, 1], the range of the network's training. False
+        feeds them in [0, 1], as the published tables of Gaussian splatting do; the two values cannot be compared.
+        ValueError for other shapes.
         """
-        smallest, taps = MIN_SIZE[self.net], TAPS[self.net]
-        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < smallest:
-            raise ValueError(f"image: expected shape (B, 3, H, W) with H, W >= {smallest}, got {tuple(image.shape)}")
+        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < MIN_SIZE:
+            raise ValueError(f"image: expected shape (B, 3, H, W) with H, W >= {MIN_SIZE}, got {tuple(image.shape)}")
         if target.shape != image.shape:
             raise ValueError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
-        shift, scale = (image.new_tensor(values).view(3, 1, 1) for values in (SHIFT, SCALE))
-        x, y = (((2.0 * value - 1.0 if rescale else value) - shift) / scale for value in (image, target))
+        x = _network_input(image, rescale)
+        y = _network_input(target, rescale)
         distance = image.new_zeros(len(image))
         for index, layer in enumerate(self.features):
-            x, y = layer(x), layer(y)
-            if index in taps:
-                head = self.get_buffer(f"lin{taps.index(index)}").view(-1, 1, 1)
+            x = layer(x)
+            y = layer(y)
+            if index in self.taps:
+                head = self.get_buffer(f"lin{self.taps.index(index)}").view(-1, 1, 1)
                 distance = distance + ((_unit(x) - _unit(y)).square() * head).sum(dim=1).mean(dim=(1, 2))
         return distance
+
+
+def _network_input(image: Tensor, rescale: bool) -> Tensor:
+    """The image in the network's range, scaled as ImageNet."""
+    if rescale:
+        image = 2.0 * image - 1.0
+    shift = image.new_tensor(SHIFT).view(3, 1, 1)
+    scale = image.new_tensor(SCALE).view(3, 1, 1)
+    return (image - shift) / scale
 
 
 def _unit(features: Tensor) -> Tensor:
@@ -115,7 +114,8 @@ def _unit(features: Tensor) -> Tensor:
 
 def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
     """The named arrays of an npz file as float32 tensors, each size checked before it is unpacked."""
-    field, weights = "", dict[str, Tensor]()
+    field = ""
+    weights = dict[str, Tensor]()
     try:
         with zipfile.ZipFile(path) as archive:
             for field, shape in shapes.items():

@@ -21,6 +21,7 @@ from damage import (
     damaged_zip_member,
 )
 from tiny_scenes import (
+    narrow_lpips,
     write_blender,
     write_colmap,
     write_config,
@@ -142,7 +143,9 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_lpips(folder: Path) -> None:
-    for name, value in Lpips.load(folder, "alexnet").state_dict().items():
+    with narrow_lpips():
+        module = Lpips.load(folder)
+    for name, value in module.state_dict().items():
         check_range(name, value, -3.5e38, 3.5e38)
 
 
@@ -194,7 +197,7 @@ SCENE_READERS = (
     ),
     Reader("nerfstudio", write_nerfstudio, _read, (("transforms.json", damaged_json),)),
 )
-_PNG, _HEADS = "image.png", "lpips_lin_alexnet.npz"
+_PNG, _HEADS = "image.png", "lpips_lin_vgg16.npz"
 _CHECKPOINT = "checkpoint.safetensors"
 _CLOUDS = {"ply": ("points.ply", damaged_bytes), "xyz": ("points.xyz", damaged_text)}
 FILE_READERS = (
@@ -217,7 +220,7 @@ FILE_READERS = (
         (
             (_HEADS, damaged_bytes),
             (_HEADS, damaged_zip_member),
-            ("alexnet_features.npz", damaged_bytes),
+            ("vgg16_features.npz", damaged_bytes),
         ),
     ),
     _image_reader("PNG", "png", (_PNG, damaged_bytes), (_PNG, damaged_png_chunk), channels=4),

@@ -5,43 +5,35 @@ import subprocess
 import sys
 
 import pytest
-
-from kgs.bench.compiled import CARDS, TARGETS, kernels
+from compiled_kernels import TARGETS, recorded_kernels, spilled_bytes
 
 pytestmark = pytest.mark.slow
 
 
-def test_the_kernels_of_a_training_step_compile_and_none_spills(tmp_path):
+@pytest.fixture(scope="module")
+def kernels():
+    """The kernels of a training step, and all forms of them."""
     compiler = pytest.importorskip("triton.compiler")
     if not hasattr(compiler, "ASTSource"):
         pytest.skip("another version of Triton")
-    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    subprocess.run([sys.executable, "-m", "kgs.bench.compiled", tmp_path], env=environment, check=True)
-    rows = [line.split(",") for line in (tmp_path / "compiled.csv").read_text().splitlines()[1:]]
-    assert {target for _, target, *_ in rows} == set(TARGETS)
-    assert len(rows) == len(TARGETS) * len(kernels())
-    assert not [row for row in rows if row[3] != "0"]
-    tables = (tmp_path / "compiled.md").read_text()
-    assert all(f"An estimate from below for one {card}" in tables for card in CARDS)
+    return {"training step": recorded_kernels(), "every form": recorded_kernels(every_form=True)}
 
 
-def test_every_form_of_every_kernel_compiles_and_none_spills():
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_kernels_of_a_training_step_compile_and_none_spills(kernels, target):
+    spilled = spilled_bytes(kernels["training step"], target)
+    assert len(spilled) == len(kernels["training step"]) >= 15
+    assert not [pair for pair in spilled if pair[1] != 0]
+
+
+@pytest.mark.parametrize("target", ["sm_90", "gfx942"])
+def test_every_form_of_every_kernel_compiles_and_none_spills(kernels, target):
     """Several cameras and their gradients, absolute gradients, median depths, features, row slices."""
-    compiler = pytest.importorskip("triton.compiler")
-    if not hasattr(compiler, "ASTSource"):
-        pytest.skip("another version of Triton")
-    names = [kernel.name for kernel in kernels()]
-    program = (
-        "from kgs.bench.compiled import build, kernels\n"
-        "for kernel in kernels(every_form=True):\n"
-        "    print(kernel.name, *(build(kernel, target).spills for target in ('sm_90', 'gfx942')))"
-    )
-    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    found = [line.split() for line in done.stdout.splitlines()]
-    assert {name for name, *_ in found} == set(names)
-    assert len(found) >= len(names) + 8
-    assert not [row for row in found if row[1:] != ["0", "0"]]
+    spilled = spilled_bytes(kernels["every form"], target)
+    names = {kernel["name"] for kernel in kernels["training step"]}
+    assert {name for name, _ in spilled} == names
+    assert len(spilled) >= len(names) + 8
+    assert not [pair for pair in spilled if pair[1] != 0]
 
 
 def test_the_oldest_version_that_torch_brings_draws_the_same(tmp_path):

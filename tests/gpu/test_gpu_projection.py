@@ -118,19 +118,16 @@ def test_gradients_of_cameras(degree, wanted, handed_over):
 
 def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
     gaussians, cameras = wide_scene()
-    bent = cameras.intrinsics[0].clone()
-    bent[2, 0] = 0.1
     flat = cameras.extrinsics[0].clone()
     flat[2, :3] = 0.0
     lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), cameras.extrinsics)
-    for camera in (with_camera(cameras, intrinsics=bent), lens):
-        got, expected = (project(gaussians, camera, backend=backend) for backend in ("triton", "torch"))
-        assert torch.equal(got.means2d, expected.means2d)
+    got, expected = (project(gaussians, lens, backend=backend) for backend in ("triton", "torch"))
+    assert torch.equal(got.means2d, expected.means2d)
     with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
         project(gaussians, with_camera(cameras, extrinsics=flat), backend="triton")
-    assert len(handed_over) == 3
+    assert len(handed_over) == 2
     assert len(project(gaussians[:0], cameras, backend="triton")) == 0
-    assert len(handed_over) == 4
+    assert len(handed_over) == 3
 
 
 def test_without_gradients_and_once_differentiable():

@@ -12,8 +12,6 @@ import torch
 import tyro
 
 from kgs.bench.output import markdown_table
-from kgs.bench.study.grid import Cell, run_grid
-from kgs.bench.study.pairs import grouped
 from kgs.datasets import load_scene
 from kgs.datasets.synthetic import synthetic_views
 from kgs.errors import DataError
@@ -21,6 +19,8 @@ from kgs.geometry import camera_centers, degrees_between
 from kgs.io.outputs import write_png
 from kgs.sfm import pose_photos
 from kgs.sfm.map import quiet_pycolmap
+from kgs.study.grid import Cell, run_grid
+from kgs.study.pairs import grouped
 
 SPACINGS = tuple(round(0.6 * 1.275**i, 2) for i in range(20))  # degrees between neighbours, up to 61
 EASY = 2.0, 20.0  # degrees between neighbours that overlap and differ

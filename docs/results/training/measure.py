@@ -11,16 +11,16 @@ import tyro
 from kgs.backends import available
 from kgs.bench.output import markdown_table, mean_sd
 from kgs.bench.scenes import SYNTHETIC, check_scenes
-from kgs.bench.study.cells import fit_and_measure
-from kgs.bench.study.grid import Cell, run_grid
-from kgs.bench.study.pairs import grouped
-from kgs.bench.study.plots import panels
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.run import choose_points
+from kgs.study.cells import fit_and_measure
+from kgs.study.grid import Cell, run_grid
+from kgs.study.pairs import grouped
+from kgs.study.plots import panels
 
 # The default of each stands in FitConfig; where None means the rule there, it is the default here too.
-KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "growth": (0.8,), "sh_degree": (0, 1)}
+KNOBS: dict[str, tuple[Any, ...]] = {"steps": (500, 1000), "coarse": (0.5,), "sh_degree": (0, 1)}
 KNOBS |= {"max_gaussians": (5_000, 10_000), "drop": (0.0, 0.1, 0.3), "backend": ("torch",)}
 HEADS = {"psnr": "PSNR [dB]", "gain": "over the default", "ssim": "SSIM", "train_psnr": "PSNR of training views"}
 HEADS |= {"cpu_seconds": "CPU seconds", "gaussians": "Gaussians"}

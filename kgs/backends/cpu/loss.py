@@ -29,7 +29,7 @@ def loss_and_gradient(
     maps, sums = np.empty((3, *x.shape), np.float32), np.zeros((bands, 2))
     over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
     absolute, ssim = sums.sum(0) / x.size
-    loss = image.new_tensor(absolute + dssim_weight * (1.0 - ssim))
+    loss = image.new_tensor(absolute + dssim_weight * (1.0 - np.minimum(ssim, 1.0)))
     if not gradient:
         return loss, None
     found = torch.empty_like(image, memory_format=torch.contiguous_format)

@@ -28,7 +28,7 @@ def loss_and_gradient(
     shape = (pixels, height, width)
     launch(ssim_maps, (count,), x, y, mean_y, variance_y, *shape, *half, across, maps, sums, count, BLOCK=_BLOCK)
     absolute, ssim = wide_sum(sums, 1) / pixels
-    loss = (absolute + dssim_weight * (1.0 - ssim)).to(image.dtype)
+    loss = (absolute + dssim_weight * (1.0 - ssim.clamp_max(1.0))).to(image.dtype)
     if not gradient:
         return loss, None
     down, found = across, torch.empty_like(x)

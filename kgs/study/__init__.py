@@ -1,0 +1,80 @@
+"""The study of sparse views: a grid of fits whose finished cells are kept, and its report."""
+
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from kgs.errors import DataError
+
+Preset = Literal["quick", "cpu", "field", "field-long", "paper", "beyond"]
+
+
+def study(
+    *,
+    out: Path,
+    preset: Preset = "quick",
+    processes: int | None = None,
+    scheduler: str | None = None,
+    lpips_weights: Path | None = None,
+    report_only: bool = False,
+) -> int:
+    """DropGaussian on and off, its schedules and rivals, and the starts; goes on where it stopped.
+
+    For example:
+      kgs study -o study
+      KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
+
+    Writes sparse.jsonl (beyond.jsonl), a line per fit as they come, and the report also when it is interrupted. For
+    many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on each, and --scheduler.
+
+    Args:
+        out: folder for the results; cells that its JSONL file has are not repeated.
+        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
+            field hours on the same in full size, field-long on three of them with 10 000 steps; paper is the paper's
+            10 000 steps on every scene there in the size it has, for a large machine; beyond measures the default from
+            cameras farther out than the photos', on two built-in scenes in minutes, with KGS_DATA on three more.
+        processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
+        scheduler: address of a Dask scheduler whose workers run the cells instead; they find scenes and weights under
+            the same paths.
+        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out, for good: a cell that
+            is there is not measured again.
+        report_only: fit nothing; write the report of the cells that are there.
+
+    Raises:
+        DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
+    """
+    from . import beyond, beyond_report, presets
+    from .cells import sparse_cell
+    from .grid import finished_rows, read_rows, run_grid
+    from .report import write_report
+
+    data = None if "KGS_DATA" not in os.environ else Path(os.environ["KGS_DATA"])
+    if preset == "beyond":
+        cells = beyond.beyond_cells(data)
+        path = out / "beyond.jsonl"
+        do_cell = beyond.beyond_cell
+        write = beyond_report.write_beyond
+    else:
+        cells = presets.sparse_cells(preset, data)
+        path = out / "sparse.jsonl"
+        do_cell = sparse_cell
+        write = write_report
+    if (report_only or read_rows(path)) and not finished_rows(cells, path):
+        raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
+    work = partial(
+        do_cell,
+        data=None if data is None else os.path.abspath(data),
+        lpips_weights=None if lpips_weights is None else os.path.abspath(lpips_weights),
+    )
+    try:
+        if not report_only:
+            run_grid(cells, work, path, scheduler=scheduler, processes=processes)
+    finally:
+        rows = finished_rows(cells, path)
+        if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
+            scenes = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
+            options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
+            write(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
+    return int(len(rows) < len(cells))

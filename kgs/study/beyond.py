@@ -1,0 +1,174 @@
+"""Beyond the photos: what cameras see that lie farther out than those of the training views.
+
+Of synthetic scenes the truth is known everywhere: cameras 1, 2 and 3 times as far from the middle of the training
+cameras as these, over the pixels whose surface a training view shows. Of real scenes the outermost photos are held out
+and the most central ones are trained on.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from math import ceil, inf, log10
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.bench.scenes import check_scenes
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.scene import Scene, Views
+from kgs.datasets.synthetic import synthetic_depths, views_beyond
+from kgs.errors import DataError
+from kgs.fit.run import choose_points
+from kgs.geometry import camera_centers
+from kgs.metrics.coverage import views_that_show
+from kgs.metrics.evaluate import MEASURES
+from kgs.metrics.lpips import Lpips
+
+from .cells import fit_and_measure, fit_config
+from .grid import Cell
+from .presets import AUTO
+
+WORLDS = {"room": 3, "arc": 6}  # the synthetic scenes and their training views
+PHOTOS = {"llff/fern": 3, "colmap/trex": 3, "nerfstudio/fox": 12}  # the real scenes and theirs
+OUT = (1, 2, 3)  # distances from the middle of the training cameras, over theirs
+SIZE = (189, 252)  # pixels of the synthetic views, height and width
+CAMERAS = 6  # at each of these distances
+OUTER = 0.25  # share of a real scene's photos that are held out
+_FITS = {True: {"steps": 500, "sh_degree": 0}, False: {"steps": 1000, "sh_degree": 0}}  # of synthetic and real scenes
+_lpips = lru_cache(maxsize=1)(Lpips.load)
+
+
+class Target(NamedTuple):
+    """Views from beyond the photos, and the pixels of each that count, bool `(H, W)`."""
+
+    views: Views
+    shown: Sequence[Tensor]
+
+
+def beyond_cells(data: Path | None) -> list[Cell]:
+    """The cells of the preset: three seeds of the synthetic scenes, then, with a folder `data`, of the real ones.
+
+    DataError: `data` lacks a scene.
+    """
+    scenes: list[tuple[str, int]] = [*WORLDS.items()]
+    if data is not None:
+        check_scenes(data, PHOTOS)
+        scenes += PHOTOS.items()
+    cells = [_cell(scene, views, seed) for seed, (scene, views) in product(range(3), scenes)]
+    return sorted(cells, key=lambda cell: cell["scene"] not in WORLDS)  # stable: by seed within each part
+
+
+def _cell(scene: str, views: int, seed: int) -> Cell:
+    synthetic = scene in WORLDS
+    return {
+        "scene": scene,
+        "views": views,
+        "downscale": None if synthetic else 2.0,
+        "method": AUTO,
+        "seed": seed,
+        "fit": {"preset": AUTO, **_FITS[synthetic]},
+    }
+
+
+def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
+    """Fit once, and measure test views and, of a synthetic scene, the views beyond the photos.
+
+    Args:
+        cell: "scene" (of `WORLDS`, or a folder below `data`), "views", "downscale", "method" (a name, for the report),
+            "seed", and "fit": the fields of FitConfig that are not those of the default.
+        data: the folder of the real scenes; DataError: the scene is not there or damaged.
+        lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
+
+    Returns:
+        What every cell stores of a fit; "test" and "train": the means of `evaluate`; "beyond": by distance, as text,
+        what `measure_target` returns; of real scenes, whose test views are the outer ones, it is empty.
+    """
+    config = fit_config("dense", cell["seed"], cell["fit"])
+    scene = _scene(cell["scene"], cell["views"], cell["downscale"], data)
+    points = choose_points(scene, config)
+    lpips = None if lpips_weights is None else _lpips(lpips_weights)
+    _, fit, stored = fit_and_measure(scene, config, points, lpips)
+    targets = synthetic_targets(cell["scene"], scene) if cell["scene"] in WORLDS else {}
+    stored["beyond"] = {str(out): measure_target(fit.render, target, lpips) for out, target in targets.items()}
+    stored |= {part: {name: fit.metrics[part][name] for name in MEASURES} for part in ("test", "train")}
+    return stored | {"init": fit.history["init"], "protocol": fit.metrics["protocol"]}
+
+
+def synthetic_targets(kind: str, scene: Scene) -> dict[int, Target]:
+    """For each distance of `OUT` the views of a synthetic scene from there, and the pixels that count.
+
+    A pixel counts if at least one training view shows its surface: by exact depths, see `views_that_show`.
+    """
+    train = scene.train
+    height, width = train.images.shape[-2:]
+    train_depths = list(synthetic_depths(train.cameras, kind)[:, 0])
+    targets = {}
+    for out in OUT:
+        views = views_beyond(kind, out, CAMERAS, (height, width))
+        shown = []
+        for i, depth in enumerate(synthetic_depths(views.cameras, kind)[:, 0]):
+            shown.append(views_that_show(depth, views.camera(i), train_depths, train.cameras) > 0)
+        targets[out] = Target(views, shown)
+    return targets
+
+
+@torch.no_grad()
+def measure_target(
+    render: Callable[[PinholeCamera], Tensor], target: Target, lpips: Lpips | None = None
+) -> dict[str, float | None]:
+    """Compare renders `(1, 3, H, W)` with views over the pixels that count.
+
+    Returns:
+        "share" of the pixels that count; "psnr" of these in dB, and "lpips" (inputs in [0, 1]) of renders whose other
+        pixels are the truth's; means over the views with such pixels, None without any or without the network, "psnr"
+        also if one is infinite.
+    """
+    levels = list[float]()
+    distances = list[float]()
+    shares = list[float]()
+    for i, shown in enumerate(target.shown):
+        truth = target.views.images[i]
+        image = target.views.as_photo(render(target.views.camera(i))[0].cpu())
+        shares.append(float(shown.float().mean()))
+        if not shown.any():
+            continue
+        error = float((image - truth).square().mean(dim=0)[shown].mean())
+        levels.append(-10 * log10(error) if error > 0 else inf)
+        if lpips is not None:
+            distances.append(float(lpips(torch.where(shown, image, truth)[None], truth[None], False)))
+    psnr = fmean(levels) if levels else inf
+    return {
+        "share": round(fmean(shares), 4),
+        "psnr": round(psnr, 4) if psnr < inf else None,
+        "lpips": round(fmean(distances), 5) if distances else None,
+    }
+
+
+def from_the_middle(scene: Scene, count: int) -> Scene:
+    """A scene without test views, split again: the `count` most central views to train on, the outermost ones to test.
+
+    The middle is the mean of all camera centres; views are ordered by the distance of their centre from it. The last
+    `OUTER` of them, rounded up, are test views; what lies between the two groups is left out.
+    """
+    views = scene.train
+    centers = camera_centers(views.cameras.extrinsics).double()
+    order = (centers - centers.mean(dim=0)).norm(dim=1).argsort(stable=True).tolist()
+    held_out = min(ceil(OUTER * len(order)), len(order) - count)
+    train = sorted(order[:count])
+    test = sorted(order[len(order) - held_out :])
+    finer = None if scene.finer is None else scene.finer.select(train)
+    return replace(scene, train=views.select(train), test=views.select(test), finer=finer)
+
+
+@lru_cache(maxsize=1)
+def _scene(name: str, views: int, downscale: float | None, data: str | None) -> Scene:
+    if name in WORLDS:
+        return synthetic_scene(name, views, CAMERAS, SIZE)
+    if data is None:
+        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+    return from_the_middle(load_scene(Path(data) / name, downscale=downscale, hold_out=0), views)

@@ -1,0 +1,158 @@
+"""One cell of the study: one fit, and everything the report needs of it."""
+
+import time
+import warnings
+from dataclasses import asdict, fields, replace
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import kgs
+from kgs.bench.scenes import SYNTHETIC
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError
+from kgs.fit.config import PRESETS, FitConfig
+from kgs.fit.fit import Fit
+from kgs.fit.measure import measure
+from kgs.fit.plan import make_plan
+from kgs.fit.probes import decide
+from kgs.fit.prune import prune
+from kgs.fit.run import choose_points
+from kgs.fit.trainer import Trainer
+from kgs.init_points import InitialPoints
+from kgs.machine import peak_rss_mb, revision
+from kgs.metrics.evaluate import MEASURES
+from kgs.metrics.lpips import Lpips
+from kgs.page.pictures import Picture, encoded
+
+from .overfitting import coadaptation, count_over_threshold
+from .rivals import Rival, RivalTrainer
+
+FULL = "full-model"  # initial points that use test views: an upper bound
+_FULL_MODEL = f"{FULL}: points seen in any two photos that are not test views, refined with test views; not allowed"
+_lpips = lru_cache(maxsize=1)(Lpips.load)
+
+
+def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
+    """Fit once and measure. Fits of one scene, views, start and seed share initial points and the order of views.
+
+    Args:
+        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of
+            initial points, or "full-model": 10 000 points of a COLMAP model of all photos but the test views),
+            "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given), and the
+            fields of FitConfig and of Rival that are not as it has them.
+        data: the folder of the scenes; DataError: the scene is not there or damaged.
+        lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
+    """
+    preset = cell["fit"].get("preset", "paper")
+    scene, points, seconds = _start(
+        data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"], preset
+    )
+    lpips = None if lpips_weights is None else _lpips(lpips_weights)
+    settings, rival = _split(cell["fit"])
+    config = fit_config(cell["start"], cell["seed"], settings)
+    probed = replace(config, drop=PRESETS[preset].drop)  # methods that differ in dropping decide alike
+    trainer, fit, result = fit_and_measure(scene, config, points, lpips, probed, rival)
+    metrics = fit.metrics
+    if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
+        result["pictures"] = _pictures(fit)
+    for part in ("test", "train"):
+        result[part] = {name: metrics[part][name] for name in MEASURES}
+    result["test_views"] = {view["name"]: view["psnr"] for view in metrics["test"]["views"]}
+    result["init"] = fit.history["init"] | {"seconds": round(seconds, 2)}
+    result["coadaptation"] = coadaptation(trainer.model, scene.test, near_plane=fit.options.near_plane)
+    result["thresholds"] = count_over_threshold(trainer, points.points)
+    result["protocol"] = metrics["protocol"]
+    if cell["start"] == FULL:
+        result["protocol"] = metrics["protocol"] | {"init": _FULL_MODEL}
+    return result
+
+
+def fit_and_measure(
+    scene: Scene,
+    config: FitConfig,
+    points: InitialPoints,
+    lpips: Lpips | None = None,
+    probed: FitConfig | None = None,
+    rival: Rival | None = None,
+) -> tuple[Trainer, Fit, dict[str, Any]]:
+    """One trainer, its fit with metrics, and what every cell stores of it.
+
+    "cpu_seconds" are those of probes, training, curve and leaving out, "wall_seconds" those of the training alone.
+    `probed`, or else `config`, is what probes decide for; `rival` replaces random dropping.
+    """
+    start = time.process_time()
+    decided = decide(scene, make_plan(scene, probed or config), choose_points)
+    plan = make_plan(scene, replace(config, sh_degree=decided.config.sh_degree))
+    plan = replace(plan, needs=decided.needs)
+    trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
+    fit = prune(trainer.fit())
+    cpu_seconds = time.process_time() - start
+    fit = replace(fit, metrics=measure(fit, lpips))
+    stored = {
+        "cpu_seconds": round(cpu_seconds, 2),
+        "curve": fit.history["curve"],
+        "gaussians": len(fit.model),
+        "needs": fit.history["needs"],
+        "config": plan.config.to_dict() | ({} if rival is None else asdict(rival)),
+        "seen": fit.metrics["seen"],
+        "wall_seconds": fit.history["seconds"],
+        "peak_rss_mb": peak_rss_mb(),
+        "versions": fit.metrics["versions"],
+        "revision": revision(Path(kgs.__file__).parent),
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+    return trainer, fit, stored
+
+
+def _pictures(fit: Fit) -> list[str]:
+    """The first test view, its render and their difference, for the page; of other scenes none may be published."""
+    views = fit.scene.test
+    render = fit.render(views.camera(0))[0]
+    (picture,) = encoded([Picture(views.names[0], views.images[0], {"": render})], 2**20)
+    return [picture["photo"], *picture["renders"][0][1:]]
+
+
+@lru_cache(maxsize=1)  # cells of one start follow each other
+def _start(
+    data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int, preset: str
+) -> tuple[Scene, InitialPoints, float]:
+    """A scene, its initial points, and the processor's seconds that they took."""
+    if name == SYNTHETIC:
+        scene = synthetic_scene(train_views=views, size=(72, 96))
+    elif data is None:
+        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+    else:
+        scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
+    config = fit_config(start, seed, {"preset": preset})
+    begin = time.process_time()
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback
+        points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
+    return scene, points, time.process_time() - begin
+
+
+def _split(fit: dict[str, Any]) -> tuple[dict[str, Any], Rival | None]:
+    """The settings of a cell for `FitConfig`, and those of a rival if it has any."""
+    names = {field.name for field in fields(Rival)}
+    settings = {name: value for name, value in fit.items() if name not in names}
+    of_rival = {name: value for name, value in fit.items() if name in names}
+    return settings, Rival(**of_rival) if of_rival else None
+
+
+def fit_config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
+    """The configuration of a cell: a preset (paper unless `fit` names one), with a start, a seed and other settings."""
+    settings = {"init": "model-points" if start == FULL else start, "seed": seed} | fit
+    preset = settings.pop("preset", "paper")
+    return replace(PRESETS[preset], **settings)
+
+
+def _full_model(scene: Scene, seed: int) -> InitialPoints:
+    """Points of the model that two photos observe, none of them a test view."""
+    everything = load_scene(scene.root, points="model-points")
+    chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
+    points = everything.points[chosen].double() + (everything.offset - scene.offset)
+    return InitialPoints(points.float(), everything.point_colors[chosen], FULL)

@@ -1,0 +1,209 @@
+"""Runs the cells of an experiment on Dask, each once: a finished cell is a line of a file, and is not done again."""
+
+import asyncio
+import json
+import logging
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+from distributed.core import rpc
+
+from kgs.io.results_folder import held
+
+Cell = dict[str, Any]
+Work = Callable[[Cell], dict[str, Any]]
+_key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
+PATIENCE = 10  # seconds for a scheduler to answer
+_LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
+
+
+def run_grid(
+    cells: Sequence[Cell],
+    work: Work,
+    path: Path,
+    *,
+    processes: int | None = None,
+    scheduler: str | None = None,
+    say: Callable[[str], None] = print,
+) -> list[dict[str, Any]]:
+    """Do the cells that the file does not have yet; return the lines of those that it has then, in the cells' order.
+
+    A run that is killed goes on where it stopped when it is started again. Dask repeats a cell whose worker dies, three
+    times at most; those that died as often are tried once more in the end, each alone. A cell that fails is reported
+    and does not stop the others.
+
+    Args:
+        cells: dicts of plain values, each different.
+        work: a function of a module (other processes import it): takes a cell, returns its result in plain values.
+        path: JSONL file; gets a line `{"cell": ..., "result": ...}` as soon as a cell is done.
+        processes: how many processes of this machine do the cells, None for one per core; they share the cores.
+        scheduler: address of a Dask scheduler, whose workers do the cells instead; they need the same packages and
+            data.
+        say: takes a line of text for the user.
+
+    Raises:
+        ValueError: two cells are equal, `processes` is below 1, another run writes the file, or the scheduler does not
+            answer or was lost.
+    """
+    if processes is not None and processes < 1:
+        raise ValueError(f"processes: expected at least 1, got {processes}")
+    if len({_key(cell) for cell in cells}) < len(cells):
+        raise ValueError("cells: expected each one once, got two that are equal")
+    with _alone(path):
+        done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
+        missing = [cell for cell in cells if _key(cell) not in done]
+        say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
+        if missing:
+            with _client(processes, scheduler) as client:
+                _do(client, work, missing, path, say)
+    return finished_rows(cells, path)
+
+
+def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Callable[[str], None]) -> None:
+    """Do the cells on the client's workers and append each to the file when it is done."""
+    cell_of: dict[Any, Cell] = {}  # of the futures that are not done
+    waiting = deque(cells)
+    suspects = deque[Cell]()  # their workers died: each is done alone in the end
+    alone = False
+    finished = 0
+    failed = 0
+    futures = as_completed()
+
+    def submit() -> None:
+        nonlocal alone
+        if not cell_of and not waiting and suspects:
+            alone = True
+            waiting.append(suspects.popleft())
+        if not cell_of and waiting:
+            client.wait_for_workers(1)  # at the start, and where the last one died
+        try:
+            free = sum(client.nthreads().values()) - len(cell_of)  # a queued cell would be lost with its worker
+        except OSError:
+            raise ValueError(_LOST) from None
+        for _ in range(min(free, len(waiting))):
+            cell = waiting.popleft()
+            future = client.submit(work, cell, pure=False)
+            cell_of[future] = cell
+            futures.add(future)
+
+    submit()
+    for future in futures:
+        cell = cell_of.pop(future)
+        if future.status in ("cancelled", "lost"):
+            raise ValueError(_LOST)
+        error = future.exception()
+        if isinstance(error, KilledWorker) and not alone:
+            suspects.append(cell)
+        elif error:
+            failed += 1
+            say(f"failed: {_key(cell)}: {type(error).__name__}: {error}")
+        else:
+            finished += 1
+            _append(path, {"cell": cell, "result": future.result()})
+            say(f"{finished + failed} of {len(cells)}: {_key(cell)}")
+        future.release()  # else Dask does the cell again if this worker dies later
+        submit()
+    if failed:
+        say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(_key(row) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
+    """A client of the scheduler at this address, or of processes of this machine."""
+    if scheduler is not None:
+        _check_scheduler(scheduler)
+        with Client(scheduler) as client:
+            yield client
+        return
+    cores = os.cpu_count() or 1
+    count = processes or cores
+    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // count))
+    before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
+    try:
+        cluster = LocalCluster(
+            count,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,  # a cell may need any share of the memory; Dask would kill its process
+            env={"OMP_NUM_THREADS": threads},
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        )
+        with cluster, Client(cluster) as client:
+            yield client
+    finally:
+        for name in set(os.environ) - before:
+            del os.environ[name]
+
+
+def _check_scheduler(address: str) -> None:
+    """Raise a ValueError unless a scheduler answers; a Client waits for ever for an open port that says nothing."""
+    with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
+        answer = thread.submit(asyncio.run, _identify(address))
+    kind = answer.exception() or answer.result()
+    if kind != "Scheduler":
+        expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+        raise ValueError(f"scheduler: {expected}, got {address!r} ({kind!r})")
+
+
+async def _identify(address: str) -> str:
+    """What answers at the address."""
+    async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
+        return str((await asyncio.wait_for(server.identity(), PATIENCE))["type"])
+
+
+def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
+    """The lines of a JSONL file, none if there is no file. A last line that was cut short is left out.
+
+    Args:
+        path: the file.
+        repair: also remove a last line that was cut short from the file.
+
+    Raises:
+        ValueError: another line is not JSON.
+    """
+    lines = path.read_bytes().splitlines() if path.exists() else []
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append(json.loads(line))
+        except ValueError as error:
+            if number < len(lines):
+                raise ValueError(
+                    f"{path}: line {number}: expected JSON, got an error of its parser: {error}"
+                ) from error
+    if repair and lines:
+        with path.open("r+b") as file:
+            file.seek(max(0, sum(len(line) + 1 for line in lines[: len(rows)]) - 1))
+            file.write(b"\n" if rows else b"")
+            file.truncate()
+    return rows
+
+
+def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
+    """The lines of the cells that the file has, in the cells' order; where a cell has two lines, the last."""
+    done = {_key(row["cell"]): row for row in read_rows(path)}
+    return [done[key] for key in map(_key, cells) if key in done]
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Keep other runs from writing the file, which is created if it is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with held(path) as ours:
+        if not ours:
+            raise ValueError(f"{path}: expected no other run to write this file, but one does")
+        yield

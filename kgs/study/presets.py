@@ -1,0 +1,151 @@
+"""The methods that the study compares, and which cells each preset has."""
+
+from collections.abc import Iterable
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from kgs.bench.scenes import SYNTHETIC, check_scenes
+from kgs.errors import DataError
+
+from .cells import FULL
+from .grid import Cell
+
+OFF = "off"
+PAPER = "progressive 0.2"
+FIXED = "fixed 0.1"
+MAIN = (OFF, PAPER, FIXED)
+AUTO = "auto"  # kgs fit as it comes
+AUTO_OFF = "auto, off"  # the same without dropping
+# The settings of each method's fit that are not those of the preset paper. Tables and plots keep this order.
+METHODS: dict[str, dict[str, Any]] = {
+    OFF: {"drop": 0.0},
+    PAPER: {"drop": 0.2},
+    FIXED: {"drop": 0.1, "drop_schedule": "constant"},
+    AUTO: {"preset": "auto"},
+    AUTO_OFF: {"preset": "auto", "drop": 0.0},
+    **{f"progressive {rate}": {"drop": rate} for rate in (0.1, 0.3)},
+    **{f"fixed {rate}": {"drop": rate, "drop_schedule": "constant"} for rate in (0.05, 0.15, 0.2, 0.3)},
+    **{by: {"drop": 0.2, "drop_by": by.replace(" ", "-")} for by in ("high gradient", "low gradient", "near", "far")},
+}
+for _by, _weight in product(("gradient", "distance"), (0.001, 0.01)):
+    METHODS[f"L1 {_by} {_weight}"] = {"drop": 0.0, "opacity_l1": _weight, "opacity_l1_by": _by}
+FAMILIES = {
+    "The default, with and without dropping": [AUTO, AUTO_OFF],
+    "Rates and schedules": ["progressive 0.1", "progressive 0.3", *(f"fixed {r}" for r in (0.05, 0.1, 0.15, 0.2, 0.3))],
+    "Selected Gaussians dropped instead of random ones": [name for name, fit in METHODS.items() if "drop_by" in fit],
+    "An L1 penalty on opacities instead of dropping": [name for name in METHODS if name.startswith("L1")],
+}
+# The scenes of the preset "cpu" and how many views each is given; for "paper" the numbers by the scene's folder.
+FORWARD = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3}
+OBJECTS = {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/monstree": 8}
+SCENES = FORWARD | OBJECTS
+MORE_VIEWS = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
+VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
+_FITS: dict[str, dict[str, Any]] = {
+    "quick": {"steps": 200, "max_gaussians": 12_000},
+    "cpu": {"steps": 2000},
+    "field": {"steps": 2000},
+    "field-long": {"steps": 10_000},
+    "paper": {"steps": 10_000},
+}
+Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]  # seeds, scenes, starts, methods
+
+
+def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
+    """The cells of a preset, the most telling ones first, those of one start together.
+
+    Args:
+        preset: "quick": the synthetic scene, minutes. "cpu": the six scenes of `SCENES` in a quarter of the pixels of
+            504x378, 2000 steps, and the synthetic one to be shown; hours. "field": the six scenes in full size, 2000
+            steps, the default with its own number; hours. "field-long": the first three of them with 10 000 steps, one
+            seed; hours. "paper": 10 000 steps in full size on every scene below `data`; days on a CPU.
+        data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
+    """
+    if preset not in _FITS:
+        raise ValueError(f"preset: expected one of {list(_FITS)}, got {preset!r}")
+    if preset == "quick":
+        scene = [(SYNTHETIC, 3)]
+        blocks: list[Block] = [
+            (range(3), scene, ["dense"], MAIN),
+            ([0], scene, ["dense"], ("fixed 0.2", "far", "L1 distance 0.01")),
+            ([0], scene, ["dense"], (AUTO, AUTO_OFF)),
+            ([0], scene, ["sift", "random"], [PAPER]),
+        ]
+    elif data is None:
+        raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
+    else:
+        blocks = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper}[preset](data)
+    fits = {method: _FITS[preset] | settings for method, settings in METHODS.items()}
+    if preset == "field":
+        for method in (AUTO, AUTO_OFF):
+            fits[method]["steps"] = None  # their own number
+    return [
+        {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
+        | {"downscale": 2.0 if preset == "cpu" else None, "fit": fits[method]}
+        for block in blocks
+        for seed, (scene, views), start, method in product(*block)
+    ]
+
+
+def _cpu(data: Path) -> list[Block]:
+    """The six scenes in a quarter of the pixels."""
+    check_scenes(data, SCENES)
+    seeds = range(3)
+    fern = [("llff/fern", 3)]
+    flower = [("llff/flower", 3)]
+    lego = [("blender/lego", 8)]
+    auto = (AUTO, AUTO_OFF)
+    rivals = [name for name in METHODS if name not in (*MAIN, *auto)]
+    bounds = ("random", "model-points", FULL)  # no fit may have the last two
+    blocks: list[Block] = []
+    for seed in seeds:
+        for methods in (MAIN, auto):
+            blocks += [([seed], [scene], ["dense"], methods) for scene in SCENES.items()]
+    for seed in seeds:
+        blocks += [([seed], MORE_VIEWS, ["dense"], methods) for methods in ((OFF, PAPER), auto)]
+    blocks += [([seed], SCENES.items(), ["sift"], [PAPER]) for seed in seeds]
+    blocks.append((seeds, lego, ["scene"], MAIN))
+    blocks.append((seeds, fern, ["dense"], rivals))
+    blocks += [(seeds, fern, [start], [PAPER]) for start in bounds]
+    blocks += [([0], [(SYNTHETIC, 3)], ["dense"], methods) for methods in (MAIN, auto)]  # pictures for the page
+    blocks.append(([0], flower, bounds, [PAPER]))
+    return blocks
+
+
+def _field(data: Path) -> list[Block]:
+    """The field's protocol: photos in the size that they have, every eighth held out. LLFF's are 504x378."""
+    check_scenes(data, SCENES)
+    seeds = range(3)
+    auto = (AUTO, AUTO_OFF)
+    blocks: list[Block] = []
+    for scenes in (FORWARD, OBJECTS):
+        for seed in seeds:
+            blocks += [([seed], [scene], ["dense"], MAIN) for scene in scenes.items()]
+    for seed in seeds:
+        blocks += [([seed], [scene], ["dense"], auto) for scene in SCENES.items()]
+    for seed in seeds:
+        for setting in product(FORWARD, (6, 9)):
+            blocks += [([seed], [setting], ["dense"], methods) for methods in ((OFF, PAPER), auto)]
+    return blocks
+
+
+def _field_long(data: Path) -> list[Block]:
+    check_scenes(data, FORWARD)
+    return [([0], [scene], ["dense"], (OFF, PAPER, AUTO)) for scene in FORWARD.items()]
+
+
+def _paper(data: Path) -> list[Block]:
+    folders = [path for path in sorted(data.glob("*/*")) if path.is_dir() and path.parent.name in VIEWS]
+    if not folders:
+        raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
+    blocks: list[Block] = []
+    for seed in range(5):
+        for path in folders:
+            layout = path.parent.name
+            # Blender scenes also from the layout's random points, as published.
+            starts = ["dense", "scene"] if layout == "blender" else ["dense"]
+            for views in VIEWS[layout]:
+                methods = METHODS if layout == "llff" and views == 3 else MAIN
+                blocks.append(([seed], [(str(path.relative_to(data)), views)], starts, methods))
+    return blocks

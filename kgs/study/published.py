@@ -1,0 +1,50 @@
+"""What the paper prints for our methods (published.csv): means over 8 scenes (Mip-NeRF 360: 7), the best of five runs.
+
+H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025.
+"""
+
+from pathlib import Path
+
+import pandas as pd
+
+# Columns benchmark, views, table (the main comparison first), method, psnr, ssim, lpips.
+PUBLISHED = pd.read_csv(Path(__file__).with_name("published.csv"))
+_SCENES = {
+    "LLFF": "fern flower fortress horns leaves orchids room trex",
+    "Mip-NeRF 360": "bicycle bonsai counter garden kitchen room stump",
+    "Blender": "chair drums ficus hotdog lego materials mic ship",
+}
+
+# PSNR of a public training log of a method that starts from a pretrained matcher and uses monocular depths: 504x378,
+# three views, means of three seeds; of trex another undistortion of the same photos.
+PRIORS = {"llff/fern": 23.84, "llff/flower": 21.41, "colmap/trex": 23.51}
+FIELD_WIDTH = 500  # pixels, at least, of images in the field's size
+
+
+def benchmark_of(scene: str, views: int) -> str | None:
+    """The paper's benchmark that has a scene with so many views, whatever its folder; None: no such."""
+    known = set(PUBLISHED.benchmark[PUBLISHED.views == views])
+    return next((name for name in known if scene.rpartition("/")[2] in _SCENES[name].split()), None)
+
+
+def published(benchmark: str | None, views: int, method: str) -> str:
+    """All different "PSNR / SSIM / LPIPS" that the paper prints for a method, with "or" between them; "-" for none."""
+    lines = PUBLISHED.query("benchmark == @benchmark and views == @views and method == @method")
+    figures = lines[["psnr", "ssim", "lpips"]].drop_duplicates().to_numpy()
+    return " or ".join("{:.2f} / {:.3f} / {:.3f}".format(*line) for line in figures) or "-"
+
+
+def priors(scene: str, views: int, width: int) -> str:
+    """The PSNR in `PRIORS` of a scene with three views in the field's size; "-" for others."""
+    return f"{PRIORS[scene]:.2f}" if scene in PRIORS and views == 3 and width >= FIELD_WIDTH else "-"
+
+
+def published_difference(benchmark: str | None, views: int, method: str, base: str) -> str:
+    """As `published`: PSNR of a method less that of another, in dB, of the same table if it has both."""
+    lines = PUBLISHED.query("benchmark == @benchmark and views == @views").set_index("table")
+    of_method = lines.psnr[lines.method == method]
+    of_base = lines.psnr[lines.method == base]
+    if of_base.empty or method == base:
+        return "-"
+    gains = [f"{psnr - of_base.get(table, of_base.iloc[0]):+.2f}" for table, psnr in of_method.items()]
+    return " or ".join(dict.fromkeys(gains)) or "-"

@@ -1,0 +1,176 @@
+"""The study's views beyond the photos: where cameras lie, which pixels count, and what a cell and the report hold."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from init_point_scenes import as_views
+
+from kgs.datasets import synthetic_scene
+from kgs.datasets.scene import Scene, pinholes
+from kgs.datasets.synthetic import ARC_CENTER, ARC_HEIGHT, ARC_RADIUS, ARC_SPAN, room, synthetic_depths, views_beyond
+from kgs.geometry import camera_centers
+from kgs.study import beyond, study
+from kgs.study.beyond import Target, beyond_cells, from_the_middle, measure_target, synthetic_targets
+from kgs.study.beyond_report import write_beyond
+
+SIZE = (24, 32)
+
+
+@pytest.fixture(scope="module")
+def arc():
+    return synthetic_scene("arc", 6, 2, SIZE)
+
+
+@pytest.fixture(scope="module")
+def targets(arc):
+    return synthetic_targets("arc", arc)
+
+
+@pytest.mark.slow
+def test_cameras_before_the_room_lie_so_many_times_as_far_out():
+    for out in (1.0, 2.5):
+        centers = camera_centers(views_beyond("room", out, 4, (6, 8)).cameras.extrinsics).numpy()
+        flat = (centers - room.EYE)[:, :2] / room.PATCH[:2]
+        np.testing.assert_allclose(np.linalg.norm(flat, axis=1), out, rtol=1e-4)
+        np.testing.assert_allclose(centers[:, 2], room.EYE[2], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_cameras_of_the_arc_stay_at_their_distance_and_look_at_its_middle():
+    cameras = views_beyond("arc", 3.0, 5, (6, 8)).cameras
+    away = camera_centers(cameras.extrinsics).double().numpy() - ARC_CENTER
+    np.testing.assert_allclose(np.hypot(away[:, 0], away[:, 2]), ARC_RADIUS, rtol=1e-5)
+    angles = np.arctan2(away[:, 0], -away[:, 2])
+    np.testing.assert_allclose(np.hypot(angles / ARC_SPAN, away[:, 1] / ARC_HEIGHT), 3.0, rtol=1e-4)
+    axes = cameras.extrinsics[:, 2, :3].double().numpy()
+    np.testing.assert_allclose(axes, -away / np.linalg.norm(away, axis=1, keepdims=True), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_orbit_s_cameras_lie_on_a_larger_circle():
+    near, far = (camera_centers(views_beyond("orbit", out, 3, (6, 8)).cameras.extrinsics) for out in (1.0, 2.0))
+    middle = near.mean(dim=0)
+    torch.testing.assert_close(far - middle, 2 * (near - middle), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("out", "count"), [(0.0, 6), (float("nan"), 6), (1.0, 0)])
+def test_places_out_of_range_are_named(out, count):
+    with pytest.raises(ValueError, match=r"^out, count: expected"):
+        views_beyond("room", out, count, (6, 8))
+
+
+def test_the_sky_of_the_arc_is_as_good_as_infinitely_far_away(arc):
+    depths = synthetic_depths(arc.train.cameras, "arc")
+    assert (depths > 1).all()  # a camera sees ground or sky everywhere
+    sky = depths > 100
+    assert 0.3 < sky.double().mean() < 0.7
+    assert arc.train.images.amax() <= 1
+    blue = arc.train.images[:, 2:][sky].mean() - arc.train.images[:, :1][sky].mean()
+    assert blue > 0.05
+
+
+def test_all_that_a_training_view_sees_counts_in_it(arc):
+    depths = synthetic_depths(arc.train.cameras, "arc")[:, 0]
+    count = beyond.views_that_show(depths[2], arc.train.camera(2), list(depths), arc.train.cameras)
+    assert count.min() >= 1
+    assert count.max() == 6
+
+
+@pytest.mark.slow
+def test_fewer_pixels_count_farther_out(targets):
+    shares = [np.mean([float(shown.float().mean()) for shown in target.shown]) for target in targets.values()]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 0.9
+    assert 0.3 < shares[-1] < 0.8
+
+
+@pytest.mark.slow
+def test_the_truth_has_no_finite_psnr(targets):
+    views = targets[2].views
+    truth = iter(views.images.split(1))
+    found = measure_target(lambda camera: next(truth), targets[2])
+    assert found["psnr"] is None
+    assert found["lpips"] is None  # without the network
+    assert 0 < found["share"] < 1
+
+
+def test_only_pixels_that_count_are_compared():
+    camera = pinholes(torch.eye(4)[None], torch.eye(4)[None], (2, 3))
+    views = as_views(camera, torch.full((1, 3, 2, 3), 0.5))
+    shown = torch.tensor([[True, True, False], [False, False, False]])
+    image = torch.full((1, 3, 2, 3), 0.9)
+    image[0, :, 0, :2] = 0.6  # off by 0.1 where pixels count: 20 dB
+    found = measure_target(lambda _: image, Target(views, [shown]), lambda a, b, _: (a - b).abs().sum())
+    assert found["psnr"] == pytest.approx(20.0, abs=1e-3)
+    assert found["share"] == pytest.approx(1 / 3, abs=1e-4)
+    assert found["lpips"] == pytest.approx(0.6, abs=1e-4)  # 3 channels of 2 pixels
+    nothing = measure_target(lambda _: image, Target(views, [torch.zeros_like(shown)]))
+    assert nothing == {"share": 0.0, "psnr": None, "lpips": None}
+
+
+def test_real_scenes_are_trained_from_the_middle_and_tested_outside(tmp_path):
+    places = torch.tensor([5.0, 0.0, -1.0, 1.0, -6.0, 2.0, -2.0, 0.9])
+    extrinsics = torch.eye(4).repeat(8, 1, 1)
+    extrinsics[:, 0, 3] = -places
+    views = as_views(pinholes(torch.eye(4).repeat(8, 1, 1), extrinsics, (2, 3)), torch.rand(8, 3, 2, 3))
+    none = torch.zeros(0, 3)
+    whole = Scene(views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path, finer=views)
+    scene = from_the_middle(whole, 3)
+    assert scene.train.names == ("1.png", "2.png", "7.png")
+    assert scene.finer is not None
+    assert scene.finer.names == scene.train.names
+    assert scene.test.names == ("0.png", "4.png")
+    assert len(from_the_middle(whole, 7).test) == 1
+
+
+def test_cells_are_there_once_the_synthetic_ones_first(tmp_path):
+    alone = beyond_cells(None)
+    assert {cell["scene"] for cell in alone} == {*beyond.WORLDS}
+    for scene in beyond.PHOTOS:
+        (tmp_path / scene).mkdir(parents=True)
+    cells = beyond_cells(tmp_path)
+    assert cells[: len(alone)] == alone
+    assert {cell["scene"] for cell in cells} == {*beyond.WORLDS, *beyond.PHOTOS}
+    assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells) == 15
+    assert [cell["seed"] for cell in alone] == [0, 0, 1, 1, 2, 2]
+
+
+@pytest.mark.slow
+def test_a_run_keeps_its_cells_and_reports(tmp_path, monkeypatch, threads):
+    monkeypatch.setattr(beyond, "SIZE", SIZE)
+    beyond._scene.cache_clear()
+    cells = [cell | {"fit": {"steps": 3, "init": "sift", "evaluations": 1}} for cell in beyond_cells(None)[:2]]
+    monkeypatch.setattr(beyond, "beyond_cells", lambda _: cells)
+    monkeypatch.delenv("KGS_DATA", raising=False)
+    assert study(out=tmp_path, preset="beyond", scheduler=threads) == 0
+    beyond._scene.cache_clear()
+    rows = [json.loads(line) for line in (tmp_path / "beyond.jsonl").read_text().splitlines()]
+    assert sorted(row["cell"]["scene"] for row in rows) == ["arc", "room"]
+    for row in rows:
+        assert set(row["result"]["beyond"]) == {"1", "2", "3"}
+        assert row["result"]["beyond"]["2"]["psnr"] > 5
+    report = (tmp_path / "beyond.md").read_text(encoding="utf-8")
+    assert "kgs study --preset beyond -o OUT" in report
+    assert "2 of 2 cells" in report
+    before = (tmp_path / "beyond.jsonl").read_bytes()
+    assert study(out=tmp_path, preset="beyond", report_only=True) == 0
+    assert (tmp_path / "beyond.jsonl").read_bytes() == before
+
+
+def test_the_report_has_a_line_for_each_scene_with_its_seeds(tmp_path):
+    whole = {"psnr": 25.0, "lpips_vgg_unscaled": 0.1}
+    common = {"test": whole, "train": whole, "gaussians": 9, "wall_seconds": 2.0, "revision": "abc"}
+    far = {"share": 0.5, "psnr": 20.0, "lpips": None}
+    rows = [
+        {"cell": beyond._cell("arc", 6, seed), "result": common | {"beyond": {str(k): far for k in beyond.OUT}}}
+        for seed in range(2)
+    ]
+    seen = {"seen": {"psnr": 22.0, "share": 0.7}, "beyond": {}}
+    rows.append({"cell": beyond._cell("llff/fern", 3, 0), "result": common | seen})
+    text = write_beyond(rows, tmp_path / "new", "COMMAND", 15)
+    assert (tmp_path / "new" / "beyond.md").read_text(encoding="utf-8") == text.rstrip() + "\n"
+    assert "3 of 15 cells; by commit of kgs: 3 abc" in text
+    assert "| arc, 6 views | auto | 2 | 25.00 (0.00); 0.100 (0.000) | 20.00 (0.00) |" in text
+    assert "| llff/fern, 3 views | auto | 1 | 25.00; 0.100 | 22.00 | 0.70 |" in text

@@ -1,0 +1,221 @@
+"""The study of sparse views: its cells, what one of them measures, and that it goes on where it stopped."""
+
+import base64
+import json
+import math
+import re
+import sys
+from collections import Counter
+from dataclasses import replace
+from itertools import product
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from study_rows import tiny_cell
+
+from kgs.cli import main
+from kgs.datasets import load_scene
+from kgs.fit.config import FitConfig
+from kgs.study import cells as cells_module
+from kgs.study.cells import FULL, sparse_cell
+from kgs.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
+
+
+@pytest.fixture
+def data(tmp_path):
+    for scene in SCENES:
+        (tmp_path / scene).mkdir(parents=True)
+    return tmp_path
+
+
+# -- the cells ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("package", ["pandas", "distributed", "matplotlib", "scipy", "jinja2"])
+def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.startswith(("kgs.bench.", "matplotlib."))]:
+        parent, _, child = name.rpartition(".")
+        if parent in ("kgs.bench", "matplotlib") and hasattr(sys.modules[parent], child):
+            monkeypatch.setattr(sys.modules[parent], child, sys.modules[name])  # to be as before afterwards
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(SystemExit) as error:
+        main(["study", "-o", str(tmp_path / "out")])
+    assert error.value.code == 2
+    said = capsys.readouterr().err
+    assert re.match(rf"kgs: {package}\S* is missing: ", said)
+    assert f"[{'app' if package in ('matplotlib', 'jinja2') else 'study'}]" in said
+    assert not list(tmp_path.rglob("*.jsonl"))
+
+
+@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "field-long", "paper"])
+def test_each_cell_is_there_once_and_is_a_fit(preset, data):
+    cells = sparse_cells(preset, data)
+    assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
+    for cell in cells:
+        fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})
+        config = FitConfig.from_dict(FitConfig().to_dict() | fit)
+        assert config.drop == METHODS[cell["method"]].get("drop", FitConfig().drop)
+
+
+def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
+    cells = sparse_cells("field", data)
+    for cell in cells:
+        own = cell["method"] in (AUTO, AUTO_OFF)
+        assert cell["fit"]["steps"] == (None if own else 2000)
+        assert cell["downscale"] is None
+    forward, objects = cells[:27], cells[27:54]
+    assert {cell["method"] for cell in cells[:54]} == {*MAIN}
+    assert {(cell["scene"], cell["views"]) for cell in forward} == {*[*SCENES.items()][:3]}
+    assert {(cell["scene"], cell["views"]) for cell in objects} == {*[*SCENES.items()][3:]}
+    assert {cell["seed"] for cell in forward} == {cell["seed"] for cell in objects} == {0, 1, 2}
+    assert {cell["method"] for cell in cells[54:90]} == {AUTO, AUTO_OFF}
+    long = sparse_cells("field-long", data)
+    assert len(long) == 9
+    assert {cell["fit"]["steps"] for cell in long} == {10_000}
+
+
+def test_the_preset_cpu_holds_what_the_study_must_show(data):
+    cells = sparse_cells("cpu", data)
+    count = Counter((cell["scene"], cell["views"], cell["start"], cell["method"]) for cell in cells)
+    for scene, views in SCENES.items():
+        for method in ("off", "progressive 0.2", "fixed 0.1"):
+            assert count[scene, views, "dense", method] == 3
+        assert count[scene, views, "sift", "progressive 0.2"] == 3
+        assert count[scene, views, "dense", "auto"] == count[scene, views, "dense", "auto, off"] == 3
+    for scene, views in (
+        *product(("llff/fern", "llff/flower"), (6, 9)),
+        ("nerfstudio/fox", 6),
+        ("colmap/monstree", 12),
+    ):
+        for method in ("off", "progressive 0.2", "auto", "auto, off"):
+            assert count[scene, views, "dense", method] == 3
+    assert all(count["llff/fern", 3, "dense", method] == 3 for method in METHODS)
+    assert {cell["fit"]["steps"] for cell in cells} == {2000}
+
+
+def test_methods_of_one_start_follow_each_other(data):
+    cells = sparse_cells("cpu", data)[:6]
+    assert [cell["method"] for cell in cells] == ["off", "progressive 0.2", "fixed 0.1"] * 2
+    assert [cell["scene"] for cell in cells] == ["llff/fern"] * 3 + ["llff/flower"] * 3
+    assert {cell["seed"] for cell in cells} == {0}
+
+
+# -- one cell ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_cell_measures_and_repeats_bit_for_bit():
+    results = [sparse_cell(tiny_cell("progressive 0.2")) for _ in range(2)]
+    for result in results:
+        json.dumps(result, allow_nan=False)
+        assert math.isfinite(result["test"]["psnr"])
+        assert result["test"]["lpips_vgg"] is None
+        assert result["init"]["kind"] == "sift"
+        assert result["gaussians"] == sum(result["thresholds"]["gaussians"])
+        assert len(result["test_views"]) == len(result["protocol"]["test"])
+        assert result["config"]["drop"] == 0.2
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d", result["date"])
+        for key in ("wall_seconds", "cpu_seconds", "peak_rss_mb", "curve", "date", "revision"):
+            result.pop(key)
+        result["init"].pop("seconds")
+    assert results[0] == results[1]
+
+
+@pytest.mark.slow
+def test_only_the_built_in_scene_is_shown(folder):
+    """Photo, render and difference of a test view, in a few kilobytes."""
+    pictures = sparse_cell(tiny_cell())["pictures"]
+    assert sum(map(len, pictures)) < 40_000
+    data = (base64.b64decode(uri.removeprefix("data:image/jpeg;base64,")) for uri in pictures)
+    photo, render, difference = (cv2.imdecode(np.frombuffer(one, np.uint8), 1).astype(float) for one in data)
+    expected = cells_module._start(None, "synthetic", 2, None, "sift", 0, "paper")[0].test.images[0]
+    grey = photo.mean(axis=2) / 255 - expected.mean(dim=0).numpy()
+    assert np.abs(grey).mean() < 0.03  # of JPEG
+    assert np.abs(difference - np.clip(4 * np.abs(render - photo), 0, 255)).mean() < 25  # their noise fourfold
+    assert "pictures" not in sparse_cell(tiny_cell(seed=1))
+    other = tiny_cell(start="scene") | {"scene": folder.name, "views": 4}
+    assert "pictures" not in sparse_cell(other, data=str(folder.parent))
+
+
+@pytest.mark.slow
+def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
+    begun = []
+
+    def trainer(scene, config, first, needs):
+        begun.append((config.drop, first.points))
+        raise InterruptedError  # nothing else of the cell is wanted
+
+    monkeypatch.setattr(cells_module, "Trainer", trainer)
+    for method, seed in (("off", 0), ("fixed 0.1", 0), ("off", 1)):
+        cells_module._start.cache_clear()  # as in another process
+        with pytest.raises(InterruptedError):
+            sparse_cell(tiny_cell(method, seed, start="random"))
+    (off, first), (drop, second), (_, other) = begun
+    assert (off, drop) == (0.0, 0.1)
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+
+
+def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
+    drops, configs = [], []
+
+    def decide(scene, config, choose):
+        drops.append(config.drop)
+        return replace(config, sh_degree=2), {}
+
+    def trainer(scene, config, first, needs):
+        configs.append(config)
+        raise InterruptedError  # nothing else of the cell is wanted
+
+    monkeypatch.setattr(cells_module, "decide", decide)
+    monkeypatch.setattr(cells_module, "Trainer", trainer)
+    for method in ("auto", "auto, off"):
+        with pytest.raises(InterruptedError):
+            sparse_cell(tiny_cell(method, start="random"))
+    usual = FitConfig().drop
+    assert drops == [usual, usual]
+    assert [(config.drop, config.sh_degree) for config in configs] == [(usual, 2), (0.0, 2)]
+
+
+def test_a_scene_on_the_disk_and_its_own_points(folder):
+    cell = tiny_cell(start="scene") | {"scene": folder.name, "views": 4, "downscale": 2.0}
+    result = sparse_cell(cell, data=str(folder.parent))
+    assert result["init"]["kind"] == "random"
+    assert "come with the layout" in result["protocol"]["init"]
+    assert result["protocol"]["image_size"] == [18, 20]
+    assert (result["config"]["steps"], result["config"]["drop"]) == (3, 0.0)
+
+
+def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
+    """It is moved into the frame of the few views, and drawn by the seed."""
+    cloud = torch.rand(12_000, 3, dtype=torch.float64) * 4 - 2  # in the world of the files
+
+    def with_points(path, views=None, downscale=None, points="none"):
+        loaded = load_scene(path, views, downscale)
+        if views is not None:
+            return loaded
+        assert points == "model-points"
+        return replace(loaded, points=(cloud - loaded.offset).float(), point_colors=torch.zeros(len(cloud), 3))
+
+    monkeypatch.setattr(cells_module, "load_scene", with_points)
+    few, first, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 0, "paper")
+    _, other, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 1, "paper")
+    assert len(first.points) == 10_000
+    assert not torch.equal(first.points, other.points)
+    nearest = torch.cdist(first.points[:100].double() + few.offset, cloud).amin(1)
+    assert float(nearest.max()) < 1e-5
+    result = sparse_cell(tiny_cell(start=FULL) | {"scene": folder.name}, data=str(folder.parent))
+    assert result["init"]["kind"] == FULL
+    assert "not allowed" in result["protocol"]["init"]
+
+
+@pytest.mark.slow
+def test_lpips_is_measured_where_there_are_weights(kgs_data):
+    result = sparse_cell(tiny_cell(), lpips_weights=str(kgs_data / "weights"))
+    for part in ("test", "train"):
+        lpips, unscaled = result[part]["lpips_vgg"], result[part]["lpips_vgg_unscaled"]
+        assert 0 < lpips < 2
+        assert 0 < unscaled != lpips

@@ -1,0 +1,60 @@
+"""What is refused by the modules of the study: the type of the error, and the name that it begins with."""
+
+import json
+
+import pytest
+import torch
+from study_rows import made_up, tiny_cell
+
+from kgs import DataError
+from kgs.study.beyond import beyond_cell, beyond_cells
+from kgs.study.cells import sparse_cell
+from kgs.study.grid import read_rows, run_grid
+from kgs.study.overfitting import coadaptation
+from kgs.study.pairs import cells_frame
+from kgs.study.presets import sparse_cells
+from kgs.study.report import write_report
+from kgs.study.rivals import SelectiveDrop
+
+ROW = made_up("llff/fern", 3, "dense", "off", 0)
+LONGER = {"cell": ROW["cell"] | {"fit": {"steps": 10_000}}, "result": ROW["result"]}
+
+
+def damaged_lines(folder):
+    path = folder / "g.jsonl"
+    path.write_text('{"cell": \n{"cell": {}, "result": {}}\n')
+    read_rows(path)
+
+
+def scores_of_shape(*shape):
+    drop = SelectiveDrop(0.2, "constant")
+    drop.scores = torch.zeros(shape)
+    drop(torch.ones(5))
+
+
+CASES = [
+    ("preset", ValueError, lambda folder: sparse_cells("fast", folder)),
+    ("KGS_DATA", DataError, lambda _: sparse_cells("cpu", None)),
+    ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("cpu", folder)),
+    ("FOLDER", DataError, lambda folder: sparse_cells("paper", folder)),
+    ("FOLDER: llff/fern", DataError, lambda folder: beyond_cells(folder)),
+    ("llff/fern", DataError, lambda _: sparse_cell(tiny_cell() | {"scene": "llff/fern"})),
+    ("llff/fern", DataError, lambda _: beyond_cell(tiny_cell() | {"scene": "llff/fern"})),
+    ("cells", ValueError, lambda folder: run_grid([{"x": 1}, {"x": 1}], json.dumps, folder / "g.jsonl")),
+    ("processes", ValueError, lambda folder: run_grid([{"x": 1}], json.dumps, folder / "g.jsonl", processes=0)),
+    ("FOLDER/g.jsonl: line 1", ValueError, damaged_lines),
+    ("subsets", ValueError, lambda _: coadaptation(None, None, subsets=1)),
+    ("rows", ValueError, lambda _: cells_frame([])),
+    ("rows", ValueError, lambda _: cells_frame([ROW, ROW])),
+    ("rows", ValueError, lambda folder: write_report([], folder, "command", 0)),
+    ("rows", ValueError, lambda folder: write_report([ROW, LONGER], folder, "command", 2)),
+    *[("scores", ValueError, lambda _, shape=shape: scores_of_shape(*shape)) for shape in ((4,), (5, 1), (2, 5), (0,))],
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "call"), CASES)
+def test_what_is_wrong_is_named(name, kind, call, tmp_path):
+    with pytest.raises(kind) as error:
+        call(tmp_path)
+    assert type(error.value) is kind
+    assert str(error.value).startswith(f"{name.replace('FOLDER', str(tmp_path))}: ")

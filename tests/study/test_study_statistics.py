@@ -1,0 +1,287 @@
+"""Statistics against closed forms, enumeration and mpmath."""
+
+import math
+import random
+
+import numpy as np
+import pandas as pd
+import pytest
+from study_rows import MAIN, made_up, psnrs, student
+
+from kgs.bench.output import mean_sd
+from kgs.study.findings import findings, headline, regret
+from kgs.study.pairs import (
+    Difference,
+    Noise,
+    cells_frame,
+    difference,
+    main_cells,
+    noise_floor,
+    paired_difference,
+    wide,
+)
+from kgs.study.published import PUBLISHED, benchmark_of, priors, published, published_difference
+from kgs.study.tables import BEST_OF_5, sparse_tables
+
+PAPER = "progressive 0.2"
+
+
+def columns(*groups):
+    """A table with one group per column."""
+    return pd.DataFrame({k: pd.Series(values, dtype=float) for k, values in enumerate(groups)})
+
+
+def test_quantiles_of_student_in_closed_form():
+    # one degree of freedom: Cauchy; two: t = a sqrt(2 / (1 - a^2)) for P(|t| < t) = a
+    expected = {1: math.tan(math.pi / 2 * 0.95), 2: 0.95 * math.sqrt(2 / (1 - 0.95**2))}
+    expected |= {freedom: student(freedom) for freedom in (*range(3, 31), 100, 501)}
+    for freedom, quantile in expected.items():
+        assert Noise(1.0, freedom, 1).between_means(2) == pytest.approx(quantile, rel=1e-9)
+
+
+def test_mean_and_deviation_as_text():
+    assert mean_sd([20.0, math.nan, 22.0, 24.0], 1) == "22.0 (2.0)"
+    assert [mean_sd(values, 1) for values in ([2.0], [math.nan], [])] == ["2.0", "-", "-"]
+
+
+def test_interval_of_one_scene_is_that_of_a_paired_t_test():
+    differences = [0.31, -0.12, 0.44, 0.20, 0.05]
+    found = paired_difference(columns(differences))
+    half = student(4) * np.std(differences, ddof=1) / math.sqrt(5)
+    assert found.pairs == 5
+    assert (found.mean, found.low, found.high) == pytest.approx((0.176, 0.176 - half, 0.176 + half))
+
+
+def test_one_pair_has_no_interval_and_none_no_difference():
+    assert paired_difference(columns([0.5]))[:2] == (1, 0.5)
+    found = paired_difference(columns([0.5], [], [0.1]))
+    assert found[:2] == (2, pytest.approx(0.3))
+    assert math.isnan(found.low)
+    assert paired_difference(columns([], [])).pairs == paired_difference(pd.DataFrame()).pairs == 0
+
+
+def test_scenes_weigh_alike_and_share_their_variance():
+    found = paired_difference(columns([1.0, 3.0], [10.0, 10.0, 10.0, 10.0], [4.0]))
+    # variance between seeds (2 + 0) / (1 + 3); of the mean over scenes a ninth of 1/2 + 1/4 + 1/1 times that
+    half = student(4) * math.sqrt(0.5 * 1.75 / 9)
+    assert found.pairs == 7
+    assert (found.mean, found.low, found.high) == pytest.approx((16 / 3, 16 / 3 - half, 16 / 3 + half))
+
+
+def test_the_interval_over_scenes_is_that_of_a_t_test_on_their_means():
+    groups = ([1.0, 3.0], [10.0, 10.0, 10.0, 10.0], [4.0], [])
+    found = paired_difference(columns(*groups))
+    means = [2.0, 10.0, 4.0]
+    half = student(2) * np.std(means, ddof=1) / math.sqrt(3)
+    assert found.scenes == 3
+    assert found.over_scenes == pytest.approx((16 / 3 - half, 16 / 3 + half))
+    # two scenes: Cauchy's quantile, and half of their distance
+    found = paired_difference(columns([0.0, 0.2], [0.3]))
+    assert found.over_scenes == pytest.approx([0.2 + sign * 0.1 * math.tan(math.pi / 2 * 0.95) for sign in (-1, 1)])
+
+
+def test_a_single_scene_has_no_interval_over_scenes():
+    found = paired_difference(columns([0.31, -0.12, 0.44], []))
+    assert found.scenes == 1
+    assert np.isnan(found.over_scenes).all()
+    assert "over scenes" not in found.text(labels=True)
+    assert math.isfinite(found.low)
+
+
+@pytest.mark.slow
+def test_the_interval_over_scenes_covers_the_mean_of_all_scenes_as_often_as_it_says():
+    """Also of the scenes that were not drawn, where that over seeds does not."""
+    rng, held, too_sure, repeats = random.Random(2), 0, 0, 300
+    for _ in range(repeats):
+        effects = [0.4 + rng.gauss(0, 0.3) for _ in range(5)]
+        found = paired_difference(columns(*([effect + rng.gauss(0, 0.2) for _ in range(3)] for effect in effects)))
+        held += found.over_scenes[0] < 0.4 < found.over_scenes[1]
+        too_sure += not found.low < 0.4 < found.high
+    assert abs(held / repeats - 0.95) < 3 * math.sqrt(0.95 * 0.05 / repeats)
+    assert too_sure / repeats > 0.2
+
+
+@pytest.mark.slow
+def test_intervals_over_seeds_hold_as_often_as_they_say():
+    rng, held, repeats = random.Random(0), 0, 200
+    for _ in range(repeats):
+        scenes = [[effect + rng.gauss(0, 0.2) for _ in range(n)] for effect, n in ((0.5, 3), (-0.2, 2), (0.0, 1))]
+        found = paired_difference(columns(*scenes))
+        held += found.low < 0.1 < found.high
+    assert abs(held / repeats - 0.95) < 3 * math.sqrt(0.95 * 0.05 / repeats)
+
+
+def test_differences_as_text():
+    assert Difference(3, 0.314, 0.1, 0.526).text(2) == "+0.31 [+0.10, +0.53]"
+    none = (math.nan, math.nan)
+    assert [Difference(1, -0.001, *none).text(decimals) for decimals in (2, 3)] == ["+0.00", "-0.001"]
+    assert Difference(0, math.nan, *none).text() == "-"
+    several = Difference(6, 0.3, 0.2, 0.4, 0.1, 2, (-1.0, 1.6))
+    assert several.text(1) == "+0.3 [-1.0, +1.6] over scenes, [+0.2, +0.4] over seeds"
+    assert several._replace(low=math.nan).text(1) == "+0.3 [-1.0, +1.6] over scenes"
+    assert Difference(3, 0.3, 0.2, 0.4).text(1, labels=True) == "+0.3 [+0.2, +0.4] over seeds"
+
+
+def test_noise_floor():
+    found = noise_floor(columns([1.0, 3.0], [5.0], [10.0, 11.0, 12.0], []))
+    assert found == Noise(pytest.approx(math.sqrt((2 + 2) / 3)), 3, 2)
+    assert found.between_means(1) == pytest.approx(student(3) * math.sqrt(2) * found.sd)
+    assert found.between_means(4) == pytest.approx(found.between_means(1) / 2)
+    assert noise_floor(columns([1.0], [2.0])).freedom == 0
+
+
+@pytest.mark.slow
+def test_two_means_differ_by_less_than_the_noise_as_often_as_it_says():
+    rng, held, repeats = random.Random(1), 0, 600
+    for _ in range(repeats):
+        noise = noise_floor(columns(*([rng.gauss(0, 0.2) for _ in range(3)] for _ in range(2))))
+        first, second = (sum(rng.gauss(0, 0.2) for _ in range(3)) / 3 for _ in range(2))
+        held += abs(first - second) < noise.between_means(3)
+    assert abs(held / repeats - 0.95) < 3 * math.sqrt(0.95 * 0.05 / repeats)
+
+
+def test_the_best_of_five_normal_numbers():
+    draws = np.random.default_rng(0).standard_normal((200_000, 5)).max(1)
+    assert pytest.approx(draws.mean(), abs=4 * draws.std() / 200_000**0.5) == BEST_OF_5
+
+
+def test_pairs_are_those_of_the_seeds_that_both_have():
+    rows = [made_up("llff/fern", 3, "dense", "off", seed) for seed in (2, 0, 1)]
+    rows += [made_up("llff/fern", 3, "dense", "far", seed) for seed in (0, 2, 7)]
+    for row, psnr in zip(rows, (1.0, 5.0, 3.0, 4.5, 2.0, 0.0), strict=True):
+        row["result"]["test"]["psnr"] = psnr
+    frame = cells_frame(rows)
+    assert difference(frame, "method", "off", "far")[:2] == (2, pytest.approx((0.5 - 1.0) / 2))
+    assert difference(frame, "method", "off", "near").pairs == difference(frame, "method", "off", "off").pairs == 0
+
+
+def cells_of(psnrs):
+    """Made-up cells with these test PSNRs by (scene, views, method), a seed each, and a tenth of them as LPIPS."""
+    rows = []
+    for (scene, views, method), values in psnrs.items():
+        for seed, value in enumerate(values):
+            rows.append(made_up(scene, views, "dense", method, seed))
+            rows[-1]["result"]["test"] |= {"psnr": value, "lpips_vgg_unscaled": value / 10}
+    return cells_frame(rows)
+
+
+def test_the_main_setting_is_the_studys_number_of_views_where_it_is_there():
+    views = {"nerfstudio/fox": (6, 12), "llff/fern": (6, 9, 3), "colmap/trex": (24, 12), "another/scene": (9, 5)}
+    frame = cells_of({(scene, n, "off"): [20.0] for scene, counts in views.items() for n in counts})
+    main = main_cells(frame)
+    expected = {"nerfstudio/fox": 12, "llff/fern": 3, "colmap/trex": 12, "another/scene": 5}
+    assert dict(zip(main.scene, main.views, strict=True)) == expected
+
+
+SCENES = {
+    ("llff/fern", 3, "off"): [20.0, 21.0],
+    ("llff/fern", 3, MAIN[1]): [21.0, 22.5],
+    ("llff/fern", 3, "auto"): [22.012, 23.0],
+    ("llff/fern", 3, "auto, off"): [21.5, 22.7],
+    ("nerfstudio/fox", 12, "off"): [20.5, 20.1],
+    ("nerfstudio/fox", 12, MAIN[1]): [21.9, 22.3],
+    ("nerfstudio/fox", 12, "auto"): [21.54, 21.7],
+    ("nerfstudio/fox", 6, MAIN[1]): [1.0, 2.0],
+    ("nerfstudio/fox", 6, "auto"): [7.0, 9.0],
+}
+
+
+def test_the_headline_has_both_intervals_of_psnr_and_lpips():
+    lines = {(line[""], line["measure"]): line for line in headline(cells_of(SCENES))}
+    what = "The default (auto) over the paper's rule (progressive 0.2)"
+    differences = np.array([[1.012, 0.5], [-0.36, -0.6]])  # fern, fox
+    means = differences.mean(1)
+    over_scenes = student(1) * means.std(ddof=1) / math.sqrt(2)
+    over_seeds = student(2) * math.sqrt(differences.var(1, ddof=1).mean() / 4)
+    for measure, factor, decimals in (("PSNR [dB]", 1, 2), ("LPIPS (less is better)", 0.1, 3)):
+        line = lines[what, measure]
+        ends = (factor * (means.mean() + sign * half) for half in (over_scenes, over_seeds) for sign in (-1, 1))
+        a, b, c, d = (f"{end:+.{decimals}f}" for end in ends)
+        mean = f"{factor * means.mean():+.{decimals}f}"
+        assert line["mean and 95 % intervals"] == f"{mean} [{a}, {b}] over scenes, [{c}, {d}] over seeds"
+        assert (line["scenes"], line["pairs"]) == ("2", "4")
+        assert line["llff/fern"].startswith(f"{factor * means[0]:+.{decimals}f} [")
+        assert line["nerfstudio/fox"].startswith(f"{factor * means[1]:+.{decimals}f} [")
+        sentence = next(text for text in findings(cells_of(SCENES)) if text.startswith(what))
+        assert f"{measure} {mean} [{a}, {b}] over scenes, [{c}, {d}] over seeds" in sentence
+    only = lines["Dropping in the default (auto over auto, off)", "PSNR [dB]"]
+    half = student(1) * np.std([0.512, 0.3], ddof=1) / math.sqrt(2)
+    assert only["mean and 95 % intervals"] == f"+0.41 [{0.406 - half:+.2f}, {0.406 + half:+.2f}] over seeds"
+    assert (only["scenes"], only["nerfstudio/fox"]) == ("1", "-")
+
+
+def test_regret_is_against_the_best_other_method_of_each_scene():
+    frame = cells_of(SCENES)
+    lines = {(line["scene"], line["measure"]): [*line.values()][2:] for line in regret(frame)}
+    assert lines["llff/fern", "PSNR [dB]"][:2] == ["auto, off", "3"]
+    assert lines["llff/fern", "PSNR [dB]"][2].startswith("+0.41 [")
+    assert lines["nerfstudio/fox", "PSNR [dB]"][:2] == ["progressive 0.2", "2"]
+    assert lines["nerfstudio/fox", "PSNR [dB]"][2].startswith("-0.48 [")
+    assert lines["llff/fern", "LPIPS (less is better)"][0] == "off"  # the least
+    sentence = next(text for text in findings(frame) if "best other method" in text)
+    assert "-0.04 dB in the mean of 2 scenes, at worst -0.48 [" in sentence
+    assert "on nerfstudio/fox (over progressive 0.2)" in sentence
+    assert regret(cells_of({("llff/fern", 3, "off"): [1.0]})) == []
+
+
+@pytest.mark.slow
+def test_the_default_stands_beside_the_others():
+    """On each scene that has it, with what its probes chose; the means are over the scenes that a method has."""
+    settings = [("llff/fern", 3), ("nerfstudio/fox", 12), ("nerfstudio/fox", 6)]
+    cells = [(*setting, method) for setting in settings for method in (*MAIN, "auto", "auto, off")]
+    cells += [("blender/lego", 8, method) for method in MAIN]
+    rows = [made_up(*cell[:2], "dense", cell[2], seed) for cell in cells for seed in range(2)]
+    probed = {"chosen": 3, "by": "probes", "over": 0, "gain": 0.4, "noise": 0.05, "n": 2}
+    for row in rows:
+        if row["cell"]["method"] == "auto":
+            row["result"]["needs"] = {"sh_degree": probed if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
+    tables = sparse_tables(cells_frame(rows))
+    main = next(table for title, table in tables.items() if title.startswith("Test views"))
+    methods = {scene: [*lines.method] for scene, lines in main.groupby("scene")}
+    assert methods["llff/fern, 3 views, dense"] == [*MAIN, "auto", "auto, off"]
+    assert methods["mean of 3 scenes (fern, fox, lego)"] == [*MAIN]
+    assert methods["mean of 2 scenes (fern, fox)"] == ["auto", "auto, off"]
+    default = tables["The default, with and without dropping"].query("method == 'auto'").set_index("scene")
+    assert {f"{scene}, {n} views, dense" for scene, n in settings} | {"mean of 2 scenes (fern, fox)"} == {
+        *default.index
+    }
+    auto, paper = (psnrs(rows, "nerfstudio/fox", method, 6) for method in ("auto", PAPER))
+    gain = np.subtract(auto, paper).mean()
+    assert default[f"over {PAPER} [dB] (pairs)"]["nerfstudio/fox, 6 views, dense"].startswith(f"{gain:+.2f} [")
+    chosen = tables["What the probes chose: the degree of harmonics, by seed"]
+    assert [*chosen.iloc[0]] == ["llff/fern, 3 views", "auto", "rule, probes", "0, 3", "+0.40", "0.05"]
+
+
+def test_numbers_that_are_not_there_are_left_out():
+    rows = [made_up("s", 3, "dense", "off", seed) for seed in range(4)]
+    for row, psnr in zip(rows, (None, 2, math.inf, math.nan), strict=True):
+        row["result"]["test"]["psnr"] = psnr
+    rows[3]["result"].pop("coadaptation")
+    frame = cells_frame(rows)
+    assert wide(frame, "test.psnr")["s", 3, "dense", "off"].dropna().to_dict() == {1: 2.0}
+    assert frame.coadaptation.count() == 3
+
+
+def test_the_papers_figures():
+    assert benchmark_of("llff/fern", 3) == benchmark_of("colmap/trex", 6) == "LLFF"
+    assert benchmark_of("blender/lego", 8) == "Blender"
+    assert [benchmark_of("colmap/room", views) for views in (3, 24)] == ["LLFF", "Mip-NeRF 360"]
+    assert benchmark_of("nerfstudio/fox", 12) is benchmark_of("llff/fern", 12) is None
+    assert published("LLFF", 3, PAPER) == "20.76 / 0.713 / 0.200 or 20.56 / 0.708 / 0.207"  # it contradicts itself
+    assert published("LLFF", 3, "near") == published("LLFF", 3, "far")
+    assert published("LLFF", 6, "fixed 0.1") == published(None, 3, "off") == published("LLFF", 12, "off") == "-"
+    assert published_difference("LLFF", 3, PAPER, "off") == "+1.54 or +1.34"
+    assert published_difference("Mip-NeRF 360", 24, PAPER, "off") == "+1.33 or +1.12"  # the second from the text
+    assert published_difference("LLFF", 3, "fixed 0.1", PAPER) == "-0.28"  # of the same table
+    assert published_difference("LLFF", 3, "near", "off") == "-1.73"
+    assert [priors("llff/fern", *of) for of in ((3, 504), (3, 252), (6, 504))] == ["23.84", "-", "-"]
+    assert published_difference("Blender", 8, PAPER, "off") == "+3.86"
+    assert published_difference("Blender", 8, "fixed 0.1", "off") == published_difference(None, 3, PAPER, "off") == "-"
+    printed = PUBLISHED
+    sums = printed.groupby(["benchmark", "table"])[["psnr", "ssim", "lpips"]].sum()
+    assert list(sums.loc["LLFF", "rate and schedule"]) == pytest.approx([141.14, 4.858, 1.502])
+    mip = printed[printed.benchmark == "Mip-NeRF 360"][["psnr", "ssim", "lpips"]]
+    assert list(mip.sum()) == pytest.approx([109.11, 3.325, 1.522])
+    assert printed.psnr.between(15, 30).all()
+    assert printed.ssim.between(0.5, 0.9).all()
+    assert printed.lpips.between(0.08, 0.42).all()

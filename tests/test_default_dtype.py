@@ -1,0 +1,153 @@
+"""Everything public under both default dtypes of torch: the same dtypes, and the same numbers."""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+import kgs
+import kgs.reference
+from kgs.datasets import Scene, synthetic
+from kgs.fit import FitConfig, Trainer, initial_points
+from kgs.losses import photometric_loss, target_moments
+
+SIZE = (24, 32)
+
+
+def model(degree: int = 1) -> kgs.GaussianModel:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(30, 3, generator=generator, dtype=torch.float32) + torch.tensor((-0.5, -0.5, 2.0)).float()
+    return kgs.GaussianModel.from_points(points, torch.rand(30, 3, generator=generator, dtype=torch.float32), degree)
+
+
+def camera() -> PinholeCamera:
+    k = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    return kgs.pinhole_cameras(torch.eye(4, dtype=torch.float32), k, SIZE[1], SIZE[0], "half")
+
+
+def rasterization() -> object:
+    values = [value.detach() for value in vars(model()()).values()]
+    poses = camera()
+    return kgs.rasterization(
+        *values, poses.extrinsics, poses.intrinsics[:, :3, :3], SIZE[1], SIZE[0], sh_degree=1, render_mode="RGB+ED"
+    )
+
+
+def projected_and_composited() -> object:
+    projected = kgs.project(model()(), camera())
+    return projected, kgs.composite(projected, projected.colors, median_depth=True)
+
+
+def densified() -> object:
+    gaussians = model()
+    adam = torch.optim.Adam(gaussians.parameters(), lr=0.01)
+    densifier = kgs.Densifier(gaussians, adam, 1.0, grad_threshold=0.0)
+    projected = kgs.GaussianRenderer(absgrad=True)(gaussians(), camera()).projected
+    projected.means2d.retain_grad()
+    projected.means2d.square().sum().backward()
+    densifier.observe(projected)
+    densifier.step()
+    return gaussians.state_dict(), densifier.state_dict()
+
+
+def losses() -> object:
+    image = kgs.GaussianRenderer()(model()(), camera()).image
+    moments = target_moments(torch.zeros_like(image))
+    return moments, photometric_loss(image, moments), photometric_loss(image, image, mask=torch.ones(SIZE) > 0)
+
+
+def made_scene(kind: str = "room", new: bool = False) -> Scene:
+    if new:
+        synthetic._make_setup.cache_clear()
+    return synthetic.synthetic_scene(kind, train_views=3, test_views=1, size=(32, 40))
+
+
+def points_of_a_file() -> object:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "cloud.ply")
+        trimesh.PointCloud(np.random.default_rng(0).random((20, 3))).export(path)
+        return initial_points(made_scene().train, "file", file=path)
+
+
+def trained() -> object:
+    scene = made_scene()
+    trainer = Trainer(scene, FitConfig(steps=2, drop=0.3), initial_points(scene.train, "random", count=50))
+    for _ in range(2):
+        trainer.train_step()
+    return trainer.model.state_dict()
+
+
+def drop() -> object:
+    layer = kgs.DropGaussian(0.3, "constant", seed=1)
+    return layer(torch.full((50,), 0.5, dtype=torch.float32))
+
+
+FACTORIES: dict[str, Callable[[], object]] = {
+    "pinhole_cameras": lambda: [camera().intrinsics, camera().extrinsics],
+    "GaussianModel": lambda: model().state_dict(),
+    "Gaussians": lambda: model()(),
+    "DropGaussian": drop,
+    "GaussianRenderer": lambda: kgs.GaussianRenderer()(model()(), camera(), outputs=("image", "depth", "normal")),
+    "project and composite": projected_and_composited,
+    "rasterization": rasterization,
+    "reference": lambda: kgs.reference.render(model()(), camera()),
+    "Densifier": densified,
+    "camera_extent": lambda: torch.tensor(kgs.camera_extent(camera().extrinsics), dtype=torch.float64),
+    "losses": losses,
+    "synthetic_scene": lambda: made_scene("room", new=True),
+    "initial_points random": lambda: initial_points(made_scene().train, "random", count=50),
+    "initial_points sift": lambda: initial_points(made_scene().train, "sift", count=50),
+    "initial_points file": points_of_a_file,
+    "Trainer": trained,
+}
+
+
+@pytest.fixture
+def under() -> Iterator[Callable[[torch.dtype], None]]:
+    """Sets torch's default dtype."""
+    yield torch.set_default_dtype
+    torch.set_default_dtype(torch.float32)
+
+
+def tensors(value: object) -> Iterator[Tensor]:
+    """All tensors in a value, however deep."""
+    if isinstance(value, Tensor):
+        yield value.detach()
+    elif isinstance(value, PinholeCamera):
+        yield from tensors([value.intrinsics, value.extrinsics])
+    elif dataclasses.is_dataclass(value):
+        yield from tensors(list(vars(value).values()))
+    elif isinstance(value, dict):
+        yield from tensors(list(value.values()))
+    elif isinstance(value, list | tuple):
+        for part in value:
+            yield from tensors(part)
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_the_default_dtype_changes_nothing(name, under):
+    made = []
+    for dtype in (torch.float32, torch.float64):
+        under(dtype)
+        made.append(list(tensors(FACTORIES[name]())))
+    expected, got = made
+    assert expected
+    assert [x.dtype for x in got] == [x.dtype for x in expected]
+    assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["room", "orbit"])
+def test_a_cached_scene_does_not_keep_the_default_dtype_it_was_made_under(kind, under):
+    under(torch.float64)
+    first = made_scene(kind, new=True)
+    under(torch.float32)
+    again = made_scene(kind)
+    assert first.train.images.dtype == again.train.images.dtype == torch.float32
+    assert torch.equal(first.train.images, again.train.images)
