@@ -9,7 +9,6 @@ from typing import Any, TypeGuard
 
 from .errors import DataError
 
-GENERATOR = "made by kgs"  # what tells an object that kgs wrote from the user's
 _MOST_BYTES = 64 * 2**20
 
 
@@ -34,12 +33,7 @@ def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGua
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all; a ValueError if a number is not finite.
-
-    An object gets `GENERATOR` as its first entry, "generator".
-    """
-    if isinstance(value, dict):
-        value = {"generator": GENERATOR} | value
+    """Write JSON whole or not at all; a ValueError if a number is not finite."""
     write_whole(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 

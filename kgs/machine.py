@@ -32,9 +32,14 @@ def check_tools(device: str, backend: str, *packages: str) -> torch.device:
     """The device; raises if it, the backend or a package that a command needs is missing."""
     place = check_device(device)
     resolve(backend, place)
+    check_packages(*packages)
+    return place
+
+
+def check_packages(*packages: str) -> None:
+    """Raises if a package that a command needs is missing."""
     for package in packages:
         import_module(package)
-    return place
 
 
 def versions() -> dict[str, str]:

@@ -7,9 +7,10 @@ import torch
 from test_cli import one_line, run
 
 from kgs import DataError, backends
+from kgs.app.fit_folder import fit_folder
+from kgs.app.saved_fit import load_fit
 from kgs.fit import FitConfig, Trainer
-from kgs.fit.run import fit_scene
-from kgs.fit.saved import load_fit
+from kgs.fit.plan import make_plan
 from kgs.io.results_folder import CHECKPOINT
 from kgs.json_files import read_json
 
@@ -51,7 +52,7 @@ def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
 @pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch"), ("numba", "numba")])
 def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, asked, made):
     request = {"scene": "somewhere", "train_views": None, "downscale": None, "background": "black"}
-    metrics, _ = fit_scene(scene, replace(CONFIG, backend=asked), tmp_path, request=request)
+    metrics, _ = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, request=request)
     assert metrics["backend"] == made
     assert read_json(tmp_path / "config.json")["fit"]["backend"] == asked
     saved = load_fit(tmp_path)
@@ -64,12 +65,12 @@ def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, asked, 
 
 @pytest.mark.parametrize(("begun", "other"), [("torch", "numba"), ("numba", "torch")])
 def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, points, tmp_path, begun, other):
-    trainer = Trainer(scene, replace(CONFIG, backend=begun), points)
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, backend=begun)), points)
     trainer.train_step()
     trainer.save(tmp_path / CHECKPOINT)
     for asked in ("auto", begun):
         resumed = Trainer.resume(scene, replace(CONFIG, backend=asked), tmp_path / CHECKPOINT)
-        assert (resumed.backend, resumed.renderer.backend) == (begun, begun)
+        assert (resumed.plan.backend, resumed.renderer.backend) == (begun, begun)
     with pytest.raises(DataError, match=f"backend: expected '{begun}', as the fit was begun with, got '{other}'"):
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
 

@@ -10,6 +10,7 @@ from init_point_scenes import as_views, garden_from_above
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.border import border_transmittance
 from kgs.fit.config import FitConfig
+from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
@@ -106,7 +107,9 @@ def test_a_fit_renders_the_scene_without_the_border(scene):
     light, points = behind(left=3.0, top=0.0, right=0.0), choose_points(scene, FitConfig(init="sift"))
     edges = []
     for views in (scene, with_border(scene, light), ignored(with_border(scene, light))):
-        trainer = Trainer(views, FitConfig(steps=200, evaluations=1, training_background="scene"), points)
+        trainer = Trainer(
+            views, make_plan(views, FitConfig(steps=200, evaluations=1, training_background="scene")), points
+        )
         trainer.fit()
         edges.append(float(trainer.render(scene.train.camera(0))[..., :2].mean()))
     assert edges[1] == pytest.approx(edges[0], abs=0.1)

@@ -9,6 +9,7 @@ from kornia.metrics import psnr
 from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import pinholes
 from kgs.fit.config import FitConfig
+from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
 from kgs.metrics.coverage import MIN_VIEWS, measure_coverage, views_that_show
@@ -60,7 +61,7 @@ def test_a_pixel_without_depth_is_not_shown():
 def trainer():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
     config = FitConfig(steps=30, sh_degree=0, init="sift", evaluations=1)
-    trainer = Trainer(scene, config, choose_points(scene, config))
+    trainer = Trainer(scene, make_plan(scene, config), choose_points(scene, config))
     trainer.fit()
     return trainer
 

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 import torch
 
+from kgs.app.saved_fit import load_fit
 from kgs.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.config import FitConfig
-from kgs.fit.saved import load_fit
 from kgs.init_points import InitialPoints
 from kgs.metrics.lpips import Lpips
 from kgs.page.fit_page import refresh_page, spread, write_own_page

@@ -21,6 +21,7 @@ from kgs import Gaussians
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.config import DEMO
+from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
 from kgs.geometry import nearest_pixels, project_points, unproject
@@ -204,12 +205,12 @@ def test_surfaces_of_the_room_that_no_photo_shows_fade(browser: Browser, tmp_pat
     """In a fit of the room, whose surfaces are known, from 40 degrees beside the photos."""
     room = synthetic_scene("room", 3, 0, (189, 252), seed=0)
     config = replace(DEMO, steps=200)
-    trainer = Trainer(room, config, choose_points(room, config))
+    trainer = Trainer(room, make_plan(room, config), choose_points(room, config))
     trainer.fit()
     with torch.no_grad():
         gaussians = trainer.model()
     path, cameras = tmp_path / "index.html", room.train.cameras
-    rules: dict[str, Any] = {"near_plane": trainer.near_plane, "background": torch.zeros(3)}
+    rules: dict[str, Any] = {"near_plane": trainer.state.start.near_plane, "background": torch.zeros(3)}
     write_page(path, "room", gaussians, cameras, ["a", "b", "c"], ["training"] * 3, **rules)
     browser.size(1000, 800)
     browser.open(path, READY)

@@ -9,13 +9,14 @@ import torch
 from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
+from kgs.app.saved_fit import SavedFit, load_fit
 from kgs.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.errors import DataError
 from kgs.fit import FitConfig, Trainer, fit_scene
+from kgs.fit.plan import make_plan
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
-from kgs.fit.saved import SavedFit, load_fit
 from kgs.geometry import camera_centers
 from kgs.page.fit_page import write_own_page
 
@@ -116,7 +117,7 @@ def test_a_fit_turns_wrong_cameras_back():
     config = FitConfig(steps=150, seed=1, sh_degree=0, init_points=1500, max_gaussians=2000, evaluations=1)
     points, fits = choose_points(wrong, config), []
     for moves in (False, True):
-        fits.append(Trainer(wrong, replace(config, refine_poses=moves), points))
+        fits.append(Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves)), points))
         fits[-1].fit()
     fixed, moved = fits
     given, found = scene.train.cameras.extrinsics, moved.scene.train.cameras.extrinsics
@@ -128,16 +129,16 @@ def test_a_fit_turns_wrong_cameras_back():
 
 def test_a_resumed_fit_has_the_same_cameras(room, tmp_path):
     points, path = choose_points(room, CONFIG), tmp_path / "checkpoint.safetensors"
-    whole, half = Trainer(room, CONFIG, points), Trainer(room, CONFIG, points)
+    whole, half = Trainer(room, make_plan(room, CONFIG), points), Trainer(room, make_plan(room, CONFIG), points)
     whole.fit()
     half.fit(lambda trainer, _: trainer.step == 3)
     half.save(path)
     resumed = Trainer.resume(room, CONFIG, path)
     assert torch.equal(resumed.scene.train.cameras.extrinsics, half.scene.train.cameras.extrinsics)
     resumed.fit()
-    assert torch.equal(resumed.poses.extrinsics, whole.poses.extrinsics)
+    assert torch.equal(resumed.state.poses.extrinsics, whole.state.poses.extrinsics)
     assert torch.equal(resumed.model.means, whole.model.means)
-    assert not torch.equal(whole.poses.extrinsics, room.train.cameras.extrinsics.double())
+    assert not torch.equal(whole.state.poses.extrinsics, room.train.cameras.extrinsics.double())
     state = whole.state_dict()
     state["poses"]["extrinsics"] = state["poses"]["extrinsics"][:2]
     with pytest.raises(ValueError, match=r"^poses: expected extrinsics \(3, 4, 4\), got \(2, 4, 4\)"):

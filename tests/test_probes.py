@@ -15,6 +15,7 @@ from kgs.datasets import synthetic_scene
 from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit import probes as needs
 from kgs.fit.config import with_pace
+from kgs.fit.plan import make_plan
 from kgs.fit.probes import decide
 from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
 from kgs.fit.run import choose_points
@@ -137,7 +138,7 @@ def trained(scene, model, **changes):
     points = InitialPoints(torch.rand(8, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(8, 3), "file")
     config = FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes)
     start = replace(Start.from_points(scene, config, points), model=model, near_plane=0.01)
-    return Trainer(scene, config, start)
+    return Trainer(scene, make_plan(scene, config), start)
 
 
 def in_front(scene, n, sh_degree=0):
@@ -166,7 +167,7 @@ def test_contributions_are_sums_of_blending_weights(each_backend, scene):
         total += render(one_each, double, near_plane=0.01).sum((0, 2, 3)).detach()
     assert float(total[:-1].max()) > 1.0
     np.testing.assert_allclose(
-        contributions(trainer.model, trainer.scene.train, trainer.near_plane).double(),
+        contributions(trainer.model, trainer.scene.train, trainer.state.start.near_plane).double(),
         total,
         atol=1e-4 * float(total.max()),
     )
@@ -177,7 +178,7 @@ def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scen
     before = [trainer.render(scene.train.camera(i)) for i in range(3)]
     levels = [trainer.psnr(scene.train.select([i])) for i in range(3)]
     prune(trainer)
-    found = trainer.needs["gaussians"]
+    found = trainer.plan.needs["gaussians"]
     assert found["fitted"] == 40 == len(trainer.model)
     assert found["kept"] == len(trainer.shown) < 40
     assert not bool((trainer.shown.means == trainer.model.means[-1]).all(1).any())
@@ -190,7 +191,7 @@ def test_keep_all_keeps_all(scene):
     trainer = trained(scene, in_front(scene, 10), keep_all=True)
     prune(trainer)
     assert trainer.shown is trainer.model
-    assert "gaussians" not in trainer.needs
+    assert "gaussians" not in trainer.plan.needs
 
 
 @pytest.mark.parametrize(("size", "degree"), [(1e-5, 0), (1.0, 2)])
@@ -203,7 +204,7 @@ def test_harmonics_that_no_picture_shows_are_left_out(scene, size, degree):
     trainer.model.sh_degree = 3
     before = trainer.render(scene.train.camera(0))
     prune(trainer)
-    assert trainer.shown.max_sh_degree == trainer.needs["gaussians"]["sh_degree"] == degree
+    assert trainer.shown.max_sh_degree == trainer.plan.needs["gaussians"]["sh_degree"] == degree
     assert float((trainer.render(scene.train.camera(0)) - before).abs().max()) <= QUANTUM + 0.02
 
 
@@ -219,7 +220,7 @@ def test_harmonics_without_which_a_view_is_worse_stay(scene):
     trainer = trained(replace(scene, train=replace(scene.train, images=renders + noise)), model)
     trainer.model.sh_degree = 1
     prune(trainer)
-    assert trainer.needs["gaussians"]["sh_degree"] == 1
+    assert trainer.plan.needs["gaussians"]["sh_degree"] == 1
 
 
 def test_the_next_step_has_all_gaussians_again(scene):

@@ -11,6 +11,7 @@ from kgs.cli import main
 from kgs.datasets import synthetic_scene
 from kgs.fit import Trainer, initial_points
 from kgs.fit.config import PAPER
+from kgs.fit.plan import make_plan
 from kgs.metrics.evaluate import evaluate
 
 pytestmark = pytest.mark.slow
@@ -53,7 +54,7 @@ def test_dropping_gains_over_seeds():
         levels = []
         for drop in (0.0, PAPER.drop):
             config = replace(PAPER, steps=1200, drop=drop, seed=seed, max_gaussians=3000, recipe=recipe)
-            trainer = Trainer(scene, config, points)
+            trainer = Trainer(scene, make_plan(scene, config), points)
             trainer.fit()
             levels.append(evaluate(trainer.render, scene.test)["psnr"])
         gains.append(levels[1] - levels[0])

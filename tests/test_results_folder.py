@@ -16,13 +16,14 @@ from typing import Any
 import pytest
 import torch
 
+from kgs.app.fit_folder import fit_folder
+from kgs.app.saved_fit import load_fit
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError, TrainingDiverged
 from kgs.fit import run
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import FitConfig, Recipe, with_pace
-from kgs.fit.run import fit_scene
-from kgs.fit.saved import load_fit
+from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.io import staging
@@ -65,7 +66,7 @@ def fit(scene: Any, config: FitConfig, out: Path, **options: Any) -> list[str]:
     """Fit; the lines that were said."""
     lines: list[str] = []
     request = {"scene": "/photos", "train_views": 3, "downscale": None, "background": "black"}
-    fit_scene(scene, config, out, say=lines.append, request=request, **options)
+    fit_folder(scene, config, out, say=lines.append, request=request, **options)
     return lines
 
 
@@ -150,7 +151,7 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
     monkeypatch.setattr(run, "write_png", full)
     lines: list[str] = []
     with pytest.raises(OSError, match="space") as error:
-        fit_scene(scene, CONFIG, tmp_path, say=lines.append)
+        fit_folder(scene, CONFIG, tmp_path, say=lines.append)
     unfinished = tmp_path / "unfinished"
     assert error.value.filename == str(unfinished / "test" / "test_00.png")
     assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(unfinished))
@@ -173,11 +174,11 @@ def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
     monkeypatch.setattr(Trainer, "save", full_at_the_end)
     lines: list[str] = []
     if failures == 2:
-        fit_scene(scene, OTHER, done, say=lines.append)
+        fit_folder(scene, OTHER, done, say=lines.append)
         assert load_checkpoint(done / CHECKPOINT)["step"] == 3
         return
     with pytest.raises(OSError, match="No space"):
-        fit_scene(scene, OTHER, done, say=lines.append)
+        fit_folder(scene, OTHER, done, say=lines.append)
     assert any(line.startswith(f"{done / 'unfinished'}: holds the results") for line in lines)
     assert seed_of(done) == 0
     monkeypatch.undo()
@@ -256,7 +257,7 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done:
 def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one_is_resumed(
     scene: Any, done: Path
 ) -> None:
-    unfinished = Trainer(scene, OTHER, run.choose_points(scene, OTHER))
+    unfinished = Trainer(scene, make_plan(scene, OTHER), run.choose_points(scene, OTHER))
     make_own_folder(done / "unfinished")
     path = done / "unfinished" / CHECKPOINT
     unfinished.save(path)
@@ -321,7 +322,7 @@ def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -
 
 def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
     saved, trainer = load_fit(done), Trainer.resume(scene, CONFIG, done / CHECKPOINT)
-    assert trainer.config == with_pace(CONFIG, len(scene.train))
-    assert (saved.config, saved.step, saved.request["scene"]) == (trainer.config, 3, "/photos")
+    assert trainer.plan.config == with_pace(CONFIG, len(scene.train))
+    assert (saved.config, saved.step, saved.request["scene"]) == (trainer.plan.config, 3, "/photos")
     camera = scene.test.camera(0)
     assert torch.equal(saved.render(camera, scene.background), trainer.render(camera))

@@ -10,6 +10,7 @@ from kgs import DataError
 from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.config import Recipe
+from kgs.fit.plan import make_plan
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -19,7 +20,7 @@ CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, sh_degree=2, recipe
 @pytest.fixture(scope="module")
 def saved(each_backend, scene, points, tmp_path_factory):
     path = tmp_path_factory.mktemp("fit") / "checkpoint.safetensors"
-    trainer = Trainer(scene, CONFIG, points)
+    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
     trainer.fit(lambda trainer, _: trainer.step == 2)
     trainer.save(path)
     return path
@@ -97,37 +98,41 @@ def test_another_setting_is_named_by_its_flag(scene, saved, change, flag):
 def test_a_fit_may_go_on_on_another_device(scene, saved):
     resumed = Trainer.resume(scene, replace(CONFIG, device="cpu:0"), saved)
     assert resumed.step == 2
-    streams = [resumed.order.get_state(), resumed.drop.get_rng_state(), resumed.densifier.generator.get_state()]
+    streams = [
+        resumed.state.order.get_state(),
+        resumed.state.drop.get_rng_state(),
+        resumed.state.densifier.generator.get_state(),
+    ]
     assert {stream.device.type for stream in streams} == {"cpu"}
 
 
 def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
-    done = Trainer(scene, CONFIG, points)
+    done = Trainer(scene, make_plan(scene, CONFIG), points)
     done.fit()
     done.save(path)
     longer = replace(CONFIG, steps=9)
     with pytest.raises(DataError, match="steps: expected at least the 6 that are done, got 5"):
         Trainer.resume(scene, replace(CONFIG, steps=5), path)
     trainer = Trainer.resume(scene, longer, path)
-    assert [note for note in trainer.notes if "from step 6" in note and "fit of 9 steps from the start" in note]
+    assert [note for note in trainer.state.notes if "from step 6" in note and "fit of 9 steps from the start" in note]
     trainer.fit(lambda trainer, _: trainer.step == 7)
-    assert trainer.drop.progress == 7 / 9
+    assert trainer.state.drop.progress == 7 / 9
     assert trainer.model.sh_degree == done.model.sh_degree == 2  # nothing learned is switched off
     trainer.save(path)
     again = Trainer.resume(scene, longer, path)
-    assert again.notes == trainer.notes
+    assert again.state.notes == trainer.state.notes
     trainer.fit()
     again.fit()
     assert_same_bits(trainer, again)
-    assert [point["step"] for point in again.curve] == [6, 9]
+    assert [point["step"] for point in again.state.curve] == [6, 9]
     again.save(path)
     many = Trainer.resume(scene, replace(CONFIG, steps=1001), path)
-    assert many.config.recipe == again.config.recipe  # of itself so long a fit would fade more slowly
+    assert many.config.recipe == again.plan.config.recipe  # of itself so long a fit would fade more slowly
 
 
 def test_a_loop_of_ones_own(scene, points):
-    by_hand, whole = Trainer(scene, CONFIG, points), Trainer(scene, CONFIG, points)
+    by_hand, whole = Trainer(scene, make_plan(scene, CONFIG), points), Trainer(scene, make_plan(scene, CONFIG), points)
     whole.fit()
     losses, kept = [], None
     while by_hand.step < CONFIG.steps:
@@ -137,7 +142,7 @@ def test_a_loop_of_ones_own(scene, points):
     assert_same_bits(by_hand, whole)
     with pytest.raises(ValueError, match="steps"):
         by_hand.train_step()
-    other = Trainer(scene, CONFIG, InitialPoints(points.points[:20], points.colors[:20], "random"))
+    other = Trainer(scene, make_plan(scene, CONFIG), InitialPoints(points.points[:20], points.colors[:20], "random"))
     for trainer in (other, by_hand):  # a fresh one, and back in time
         trainer.load_state_dict(kept)
         assert trainer.step == 3
@@ -173,27 +178,31 @@ def test_a_photo_that_is_met_exactly_ends_no_fit(scene, points, tmp_path, photo)
         cameras=PinholeCamera(cameras.intrinsics, away, cameras.height, cameras.width),
         images=torch.full_like(scene.test.images, photo),
     )
-    trainer = Trainer(replace(scene, test=test, background=torch.full((3,), photo)), CONFIG, points)
+    trainer = Trainer(
+        replace(scene, test=test, background=torch.full((3,), photo)),
+        make_plan(replace(scene, test=test, background=torch.full((3,), photo)), CONFIG),
+        points,
+    )
     trainer.fit()
-    assert trainer.curve[-1]["test_psnr"] is None
-    assert trainer.curve[-1]["train_psnr"] > 0
+    assert trainer.state.curve[-1]["test_psnr"] is None
+    assert trainer.state.curve[-1]["train_psnr"] > 0
     trainer.save(tmp_path / "checkpoint.safetensors")
 
 
 @pytest.mark.parametrize("photo", [0.0, 1.0])
 def test_photos_of_one_colour_can_be_fitted(scene, points, photo):
     blank = replace(scene, train=replace(scene.train, images=torch.full_like(scene.train.images, photo)))
-    trainer = Trainer(blank, CONFIG, points)
+    trainer = Trainer(blank, make_plan(blank, CONFIG), points)
     trainer.fit()
     assert trainer.step == CONFIG.steps
 
 
 def test_a_program_in_float64_fits_the_same_bits(scene, points, monkeypatch):
-    whole = Trainer(scene, CONFIG, points)
+    whole = Trainer(scene, make_plan(scene, CONFIG), points)
     whole.fit()
     torch.set_default_dtype(torch.float64)
     try:
-        trainer = Trainer(scene, CONFIG, points)
+        trainer = Trainer(scene, make_plan(scene, CONFIG), points)
         trainer.fit()
     finally:
         torch.set_default_dtype(torch.float32)

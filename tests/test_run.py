@@ -17,7 +17,8 @@ from kgs.errors import DataError
 from kgs.fit import run
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.run import CHECKPOINT, fit_scene, train
+from kgs.fit.plan import make_plan
+from kgs.fit.run import CHECKPOINT, train
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 
@@ -38,7 +39,7 @@ def _few_points(monkeypatch: Any) -> None:
 
 @pytest.fixture
 def trainer(scene: Any) -> Trainer:
-    return Trainer(scene, CONFIG, run.choose_points(scene, CONFIG))
+    return Trainer(scene, make_plan(scene, CONFIG), run.choose_points(scene, CONFIG))
 
 
 def at_step(trainer: Trainer, step: int, act: Any) -> None:
@@ -75,7 +76,7 @@ def test_a_second_signal_acts_at_once(trainer: Trainer, tmp_path: Path) -> None:
 
 
 def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    fit_scene(scene, CONFIG, tmp_path / "whole", say=lambda line: None)
+    fit_folder(scene, CONFIG, tmp_path / "whole", say=lambda line: None)
     plain = Trainer.__init__
 
     def interrupted(self: Trainer, *arguments: Any) -> None:
@@ -83,10 +84,10 @@ def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path:
         at_step(self, 10, lambda: os.kill(os.getpid(), signal.SIGTERM))
 
     monkeypatch.setattr(Trainer, "__init__", interrupted)
-    metrics, stopped_by = fit_scene(scene, CONFIG, tmp_path / "cut", say=lambda line: None)
+    metrics, stopped_by = fit_folder(scene, CONFIG, tmp_path / "cut", say=lambda line: None)
     assert (metrics["steps"], stopped_by) == (10, signal.SIGTERM)
     assert (tmp_path / "cut" / "splat.ply").is_file()
-    metrics, stopped_by = fit_scene(scene, CONFIG, tmp_path / "cut", resume=True, say=lambda line: None)
+    metrics, stopped_by = fit_folder(scene, CONFIG, tmp_path / "cut", resume=True, say=lambda line: None)
     assert (metrics["steps"], stopped_by) == (12, 0)
     assert (tmp_path / "cut" / "splat.ply").read_bytes() == (tmp_path / "whole" / "splat.ply").read_bytes()
 
@@ -105,7 +106,7 @@ def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
     monkeypatch.setattr("os.fsync", full)
     assert train(trainer, tmp_path / CHECKPOINT) == 0
     assert failed == [6, 9]
-    notes = [note for note in trainer.notes if "no checkpoint" in note]
+    notes = [note for note in trainer.state.notes if "no checkpoint" in note]
     assert len(notes) == 2
     assert "step 6" in notes[0]
     assert CHECKPOINT in notes[0]
@@ -124,32 +125,32 @@ def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Pa
 
 def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, tmp_path: Path) -> None:
     lines: list[str] = []
-    fit_scene(scene, CONFIG, tmp_path, say=lines.append)
+    fit_folder(scene, CONFIG, tmp_path, say=lines.append)
     whole = (tmp_path / "splat.ply").read_bytes()
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-7])
-    fit_scene(scene, CONFIG, tmp_path, resume=True, say=lines.append)
+    fit_folder(scene, CONFIG, tmp_path, resume=True, say=lines.append)
     assert any("went on from the previous checkpoint" in line for line in lines)
     assert (tmp_path / "splat.ply").read_bytes() == whole
     for damaged in (path, previous(path)):
         damaged.write_bytes(b"")
     with pytest.raises(DataError, match=CHECKPOINT):
-        fit_scene(scene, CONFIG, tmp_path, resume=True, say=lines.append)
+        fit_folder(scene, CONFIG, tmp_path, resume=True, say=lines.append)
 
 
 def test_where_there_is_nothing_to_resume_it_says_so(scene: Any, tmp_path: Path) -> None:
     lines: list[str] = []
-    fit_scene(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
+    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
     assert f"{tmp_path}: there is nothing to resume: the fit starts at the beginning" in lines
     lines.clear()
-    fit_scene(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
+    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
     assert not any("nothing to resume" in line for line in lines)
 
 
 def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) -> None:
     short = replace(CONFIG, steps=2)
-    fit_scene(scene, short, tmp_path, say=lambda line: None)
-    fit_scene(scene, replace(short, seed=1), tmp_path, say=lambda line: None)
+    fit_folder(scene, short, tmp_path, say=lambda line: None)
+    fit_folder(scene, replace(short, seed=1), tmp_path, say=lambda line: None)
     assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
 
 
@@ -169,6 +170,6 @@ def test_nobody_has_to_listen(scene: Any, tmp_path: Path, monkeypatch: Any) -> N
         reader, writer = os.pipe()
         os.close(reader)
         monkeypatch.setattr(sys, name, open(writer, "w"))  # noqa: SIM115  # closed by nobody, as a shell's
-    fit_scene(scene, replace(CONFIG, steps=2), tmp_path)
+    fit_folder(scene, replace(CONFIG, steps=2), tmp_path)
     monkeypatch.undo()
     assert (tmp_path / "metrics.json").is_file()

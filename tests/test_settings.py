@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from kgs.app.saved_fit import read_settings
 from kgs.errors import DataError
 from kgs.fit.config import DETAILS, FitConfig
-from kgs.fit.saved import read_settings
 
 REQUEST: dict[str, Any] = {"scene": "/photos", "train_views": 3, "downscale": 2.0, "background": "black"}
 

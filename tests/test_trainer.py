@@ -13,6 +13,7 @@ from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
 from kgs.densify import Densifier
 from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.renderer import GaussianRenderer
 
@@ -29,7 +30,7 @@ def assert_same_bits(a, b):
 
 
 def fitted(scene, points, config=CONFIG):
-    trainer = Trainer(scene, config, points)
+    trainer = Trainer(scene, make_plan(scene, config), points)
     trainer.fit()
     return trainer
 
@@ -43,7 +44,7 @@ def test_it_learns(each_backend, scene, points):
     curve = fitted(scene, points, replace(CONFIG, steps=60)).curve
     assert [point["step"] for point in curve] == [20, 40, 60]
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"]
-    assert curve[-1]["train_psnr"] > Trainer(scene, CONFIG, points).psnr(scene.train) + 1
+    assert curve[-1]["train_psnr"] > Trainer(scene, make_plan(scene, CONFIG), points).psnr(scene.train) + 1
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
 
 
@@ -62,21 +63,23 @@ def test_opacities_decay_or_are_reset_when_the_timetable_says(scene, points, mon
 
     for name in ("decay_opacity", "reset_opacity"):
         note(name)
-    trainer = Trainer(scene, replace(CONFIG, recipe=Recipe(opacity_decay=0.9, decay_from=0.5)), points)
+    trainer = Trainer(
+        scene, make_plan(scene, replace(CONFIG, recipe=Recipe(opacity_decay=0.9, decay_from=0.5))), points
+    )
     trainer.fit()
     assert done == [("decay_opacity", step, 0.9) for step in range(16, 30)]  # the last step only looks
     done.clear()
     recipe = Recipe(prune_opacity=0.005, opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
-    trainer = Trainer(scene, replace(CONFIG, recipe=recipe), points)
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, recipe=recipe)), points)
     trainer.fit()
     assert done == [("reset_opacity", step, recipe.reset_opacity) for step in (9, 18)]
 
 
 def test_harmonics_come_one_degree_after_the_other(scene, points):
-    trainer, degrees = Trainer(scene, replace(CONFIG, sh_degree=3), points), []
+    trainer, degrees = Trainer(scene, make_plan(scene, replace(CONFIG, sh_degree=3)), points), []
     trainer.fit(lambda trainer, _: degrees.append(trainer.model.sh_degree))
     assert degrees == sorted(degrees)
-    assert [degrees.index(degree) + 1 for degree in (1, 2, 3)] == list(trainer.times.sh)
+    assert [degrees.index(degree) + 1 for degree in (1, 2, 3)] == list(trainer.plan.times.sh)
 
 
 def test_gaussians_were_added_on_the_way(whole, points):
@@ -95,7 +98,7 @@ def test_another_seed_other_bits(whole, scene, points):
 def test_with_and_without_drop_see_the_same_views(scene, points):
     orders = []
     for drop in (0.0, 0.5):
-        trainer = Trainer(scene, replace(CONFIG, drop=drop), points)
+        trainer = Trainer(scene, make_plan(scene, replace(CONFIG, drop=drop)), points)
         orders.append([trainer._next_view() for _ in range(20)])
     assert orders[0] == orders[1]
 
@@ -111,15 +114,15 @@ def test_with_and_without_drop_see_the_same_views(scene, points):
 )
 def test_resumed_is_bit_identical(whole, scene, points, tmp_path, at):
     if at == 10:
-        assert at in whole.times.densify
-    first = Trainer(scene, CONFIG, points)
+        assert at in whole.plan.times.densify
+    first = Trainer(scene, make_plan(scene, CONFIG), points)
     first.fit(lambda trainer, _: trainer.step == at)
     assert first.step == at
     first.save(tmp_path / "checkpoint.safetensors")
     second = Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")
     second.fit()
     assert_same_bits(whole, second)
-    assert [point["test_psnr"] for point in second.curve] == [point["test_psnr"] for point in whole.curve]
+    assert [point["test_psnr"] for point in second.state.curve] == [point["test_psnr"] for point in whole.state.curve]
 
 
 def test_test_views_never_matter(whole, scene, points):
@@ -139,7 +142,7 @@ def test_test_views_never_matter(whole, scene, points):
 def test_no_test_views_at_all(whole, scene, points):
     trainer = fitted(replace(scene, test=scene.test.select([])), points)
     assert_same_bits(whole, trainer)
-    assert trainer.curve[-1]["test_psnr"] is None
+    assert trainer.state.curve[-1]["test_psnr"] is None
 
 
 def test_evaluation_uses_all_gaussians(whole, scene):
@@ -151,20 +154,20 @@ def test_evaluation_uses_all_gaussians(whole, scene):
 def test_a_limit_that_leaves_no_room_holds_and_is_said_once(scene, points):
     trainer = fitted(scene, points, replace(CONFIG, max_gaussians=170))
     assert len(trainer.model) <= 170
-    assert len(trainer.notes) == 1
-    assert "max_gaussians: 170 leaves little room beside the 150 initial points" in trainer.notes[0]
+    assert len(trainer.state.notes) == 1
+    assert "max_gaussians: 170 leaves little room beside the 150 initial points" in trainer.state.notes[0]
 
 
 def test_the_usual_limit_is_reached_without_a_word(whole, points):
     assert len(whole.model) == 10 * CONFIG.steps
-    assert whole.notes == []
+    assert whole.state.notes == []
 
 
 @pytest.mark.slow
 def test_the_number_may_grow_evenly(scene, points):
     config = replace(CONFIG, max_gaussians=450, growth=0.5)
     counts = []
-    trainer = Trainer(scene, config, points)
+    trainer = Trainer(scene, make_plan(scene, config), points)
     trainer.fit(lambda trainer, _: counts.append(len(trainer.model)))
     assert all(count <= 150 + 20 * step for step, count in enumerate(counts, 1))
     assert 300 < max(counts) <= 450
@@ -175,7 +178,7 @@ def test_the_number_may_grow_evenly(scene, points):
 @pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
 def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(scene, points, name):
-    trainer = Trainer(scene, CONFIG, points)
+    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
     before = parameters(trainer)
     poison = torch.ones_like(trainer.model.get_parameter(name))
     poison[7] = torch.nan
@@ -189,7 +192,7 @@ def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(scene, points,
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_it_stops_at_a_parameter_that_is_not_finite(scene, points, tmp_path, name, value):
-    trainer = Trainer(scene, CONFIG, points)
+    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
     trainer.fit(lambda trainer, _: trainer.step == 2)
     trainer.save(tmp_path / "checkpoint.safetensors")
     with torch.no_grad():
@@ -203,15 +206,15 @@ def test_it_stops_at_a_parameter_that_is_not_finite(scene, points, tmp_path, nam
 
 
 def test_it_stops_at_a_gradient_whose_square_overflows(scene, points):
-    trainer = Trainer(scene, CONFIG, points)
+    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
     trainer.model.means.register_hook(lambda gradient: gradient.index_fill(0, torch.tensor([4]), 1e20))
     with pytest.raises(TrainingDiverged, match="step 1.*below 1e19.*means of Gaussian 4.*no checkpoint yet"):
         trainer.fit()
 
 
 def test_it_stops_where_scales_explode(scene, points):
-    trainer = Trainer(scene, CONFIG, points)
-    trainer.fit(lambda trainer, _: trainer.step == min(trainer.times.densify) - 1)
+    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
+    trainer.fit(lambda trainer, _: trainer.step == min(trainer.plan.times.densify) - 1)
     with torch.no_grad():
         trainer.model.log_scales[3, 1] = 40.0
     with pytest.raises(TrainingDiverged, match="scales below 1e[+]06 times the extent.*Gaussian 3"):
@@ -220,11 +223,11 @@ def test_it_stops_where_scales_explode(scene, points):
 
 def test_scales_that_grow_without_end_are_bounded(scene, points):
     """As those of the sky do in a long fit: no photo tells them from larger ones, and the fit goes on."""
-    trainer = Trainer(scene, replace(CONFIG, steps=60), points)
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, steps=60)), points)
     with torch.no_grad():
-        trainer.model.log_scales[3, 1] = math.log(5e5 * trainer.extent)
+        trainer.model.log_scales[3, 1] = math.log(5e5 * trainer.state.start.extent)
     trainer.fit(lambda trainer, _: trainer.step == 20)
-    assert trainer.model.log_scales.max() <= math.log(1.0001e4 * trainer.extent)
+    assert trainer.model.log_scales.max() <= math.log(1.0001e4 * trainer.state.start.extent)
     trainer.fit()
 
 
@@ -233,7 +236,9 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
     rates = {
         name: factor * getattr(CONFIG.recipe, name) for name in ("lr_means", "lr_scales", "lr_opacity", "lr_quats")
     }
-    trainer = Trainer(scene, replace(CONFIG, steps=45, recipe=replace(CONFIG.recipe, **rates)), points)
+    trainer = Trainer(
+        scene, make_plan(scene, replace(CONFIG, steps=45, recipe=replace(CONFIG.recipe, **rates))), points
+    )
     with contextlib.suppress(TrainingDiverged):
         trainer.fit()
     assert all(torch.isfinite(value).all() for value in parameters(trainer).values())
@@ -241,27 +246,27 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
 
 
 def test_the_memory_budget_reaches_the_renderer(scene, points):
-    small = Trainer(scene, replace(CONFIG, max_bytes=1000), points)
+    small = Trainer(scene, make_plan(scene, replace(CONFIG, max_bytes=1000)), points)
     with pytest.raises(ValueError, match="max_bytes"):
         small.fit()
 
 
 def test_a_dropped_layer_is_absent_at_rate_zero(scene, points):
-    trainer = Trainer(scene, replace(CONFIG, drop=0.0), points)
-    assert trainer.drop is None
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, drop=0.0)), points)
+    assert trainer.state.drop is None
 
 
 def test_the_rate_follows_the_papers_schedule(scene, points):
-    trainer = Trainer(scene, replace(CONFIG, steps=12), points)
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, steps=12)), points)
     rates = []
-    trainer.fit(lambda trainer, _: rates.append(trainer.drop.rate))
+    trainer.fit(lambda trainer, _: rates.append(trainer.state.drop.rate))
     assert rates == pytest.approx([0.3 * step / 12 for step in range(1, 13)])
 
 
 @pytest.mark.slow
 def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path):
     config = replace(CONFIG, coarse=0.5)
-    trainer = Trainer(scene, config, points)
+    trainer = Trainer(scene, make_plan(scene, config), points)
     sizes = []
     trainer.renderer.register_forward_hook(lambda *args: sizes.append(tuple(args[2].image.shape[-2:])))
     trainer.fit(lambda trainer, _: trainer.step == 15)
@@ -278,10 +283,13 @@ def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path)
 @pytest.mark.slow
 @pytest.mark.parametrize(("undropped", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
 def test_nothing_is_dropped_in_the_last_steps(scene, points, undropped, last):
-    trainer, active = Trainer(scene, replace(CONFIG, undropped_steps=undropped, evaluations=1), points), []
+    trainer, active = (
+        Trainer(scene, make_plan(scene, replace(CONFIG, undropped_steps=undropped, evaluations=1)), points),
+        [],
+    )
 
     def note(trainer, _):
-        active.append(trainer.drop.training)
+        active.append(trainer.state.drop.training)
         trainer.render(scene.train.camera(0))  # which draws all Gaussians, and may not change this
         return False
 
@@ -300,7 +308,7 @@ def test_dark_photos_become_opaque_before_random_backgrounds_alone(scene, points
     for background in ("random", "scene"):
         config = replace(CONFIG, steps=60, drop=0.0, training_background=background)
         trainer = fitted(dark, points, config)
-        renderer = GaussianRenderer(near_plane=trainer.near_plane).eval()
+        renderer = GaussianRenderer(near_plane=trainer.state.start.near_plane).eval()
         with torch.no_grad():
             out = renderer(trainer.model(), scene.train.camera(0), outputs=("alpha",))
         seen[background] = float(out.alpha.mean())
@@ -311,8 +319,8 @@ def test_dark_photos_become_opaque_before_random_backgrounds_alone(scene, points
 def test_transparent_photos_stay_transparent_before_random_backgrounds(scene, points):
     masks = torch.zeros_like(scene.train.images[:, :1])
     clear = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images), masks=masks))
-    trainer = Trainer(clear, replace(CONFIG, steps=60, drop=0.0), points)
-    renderer, alphas = GaussianRenderer(near_plane=trainer.near_plane).eval(), []
+    trainer = Trainer(clear, make_plan(clear, replace(CONFIG, steps=60, drop=0.0)), points)
+    renderer, alphas = GaussianRenderer(near_plane=trainer.state.start.near_plane).eval(), []
     for steps in (0, 59):
         trainer.fit(lambda trainer, _, steps=steps: trainer.step >= steps)
         with torch.no_grad():

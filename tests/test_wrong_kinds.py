@@ -17,6 +17,7 @@ from kgs import reference
 from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.densify import Densifier
 from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
+from kgs.fit.plan import make_plan
 from kgs.geometry import camera_extent
 from kgs.io.film import write_film
 from kgs.io.glb import save_glb
@@ -87,9 +88,12 @@ WRONG = {
         "extrinsics: expected a torch.Tensor, got PinholeCamera",
     ),
     "a scene for its views": (lambda: initial_points(SCENE), "views: expected Views, got Scene"),
-    "views for a scene": (lambda: Trainer(SCENE.train, CONFIG, POINTS), "scene: expected Scene, got Views"),
+    "views for a scene": (
+        lambda: Trainer(SCENE.train, make_plan(SCENE.train, CONFIG), POINTS),
+        "scene: expected Scene, got Views",
+    ),
     "a tensor for points": (
-        lambda: Trainer(SCENE, CONFIG, POINTS.points),
+        lambda: Trainer(SCENE, make_plan(SCENE, CONFIG), POINTS.points),
         "points: expected InitialPoints, got Tensor",
     ),
 }
@@ -130,7 +134,7 @@ def test_numbers_of_numpy_are_taken(tmp_path):
 
 
 def test_paths_may_be_text(tmp_path):
-    trainer = Trainer(SCENE, CONFIG, POINTS)
+    trainer = Trainer(SCENE, make_plan(SCENE, CONFIG), POINTS)
     trainer.train_step()
     trainer.save(str(tmp_path / "c.safetensors"))
     assert Trainer.resume(SCENE, CONFIG, str(tmp_path / "c.safetensors")).step == 1
@@ -156,4 +160,4 @@ def test_a_package_that_results_need_is_missed_before_the_training(monkeypatch, 
 
 def test_points_of_the_right_kind_are_taken():
     points = InitialPoints(POINTS.points, POINTS.colors, "mine")
-    assert Trainer(SCENE, CONFIG, points).init == {"kind": "mine", "points": len(points.points)}
+    assert Trainer(SCENE, make_plan(SCENE, CONFIG), points).init == {"kind": "mine", "points": len(points.points)}

@@ -18,7 +18,8 @@ from kgs.errors import DataError
 from kgs.fit.config import FitConfig
 from kgs.io.outputs import EXPORTS, check_folder
 from kgs.io.ownership import is_own
-from kgs.io.results_folder import fit_staging, replaced_files
+from kgs.io.results_folder import replaced_files
+from kgs.io.staging import Staging
 from kgs.json_files import read_json
 from kgs.metrics.weights import weight_files
 
@@ -85,7 +86,7 @@ def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: 
     _check_tools(device, backend, "jinja2")
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    if not fit_staging(out).finished.exists():
+    if not Staging(out).finished.exists():
         read_json(out / "config.json")
 
 

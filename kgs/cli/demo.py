@@ -13,6 +13,7 @@ from .options import Out
 
 if TYPE_CHECKING:
     from kgs.datasets.scene import Scene
+    from kgs.fit.fit import Fit
 
 
 def demo(
@@ -43,10 +44,10 @@ def demo(
     """
     from kgs.datasets import synthetic_scene
     from kgs.io.outputs import EXPORTS, check_folder
-    from kgs.machine import check_tools
+    from kgs.machine import check_packages
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    check_tools(device, backend, "matplotlib", "jinja2")
+    check_packages("matplotlib", "jinja2")
     check_folder(out, ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS])
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
@@ -71,12 +72,16 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
 
     `drops` are the rates of dropping by the name of the run; pictures show the last one beside the others.
     """
-    from kgs.fit.exports import write_exports
-    from kgs.fit.run import choose_points, measure, train
+    from kgs.app.files.exports import write_exports
+    from kgs.app.fit_folder import train
+    from kgs.fit.measure import measure
+    from kgs.fit.plan import make_plan
+    from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
     from kgs.io.figures import write_curve, write_sheet
     from kgs.io.outputs import film_in
     from kgs.io.ply import save_ply
+    from kgs.io.staging import Staging
     from kgs.json_files import write_json
     from kgs.page.fit_page import PAGE, write_fit_page
 
@@ -84,33 +89,42 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     height, width = scene.train.images.shape[-2:]
     say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
     say(f"initial points: {len(points.points)} ({points.kind})")
-    runs, renders, curves = dict[str, Any](), dict[str, Any](), dict[str, Any]()
-    drawn, measured = dict[str, Any](), dict[str, Any]()
-    Trainer(scene, config, points).train_step()  # thrown away: to compile the kernels is no part of the training
+    plan = make_plan(scene, config)
+    Trainer(scene, plan, points).train_step()  # thrown away: to compile the kernels is no part of the training
+    fits = dict[str, "Fit"]()
+    runs = dict[str, Any]()
     for name, drop in drops.items():
-        trainer, title = Trainer(scene, replace(config, drop=drop), points), f"{name} DropGaussian"
-        if signal := train(trainer, None, title=title):
+        title = f"{name} DropGaussian"
+        trainer = Trainer(scene, replace(plan, config=replace(plan.config, drop=drop)), points)
+        fit, signal = train(trainer, None, title=title)
+        if signal:
             raise SystemExit(128 + signal)
-        runs[name], curves[title] = measure(trainer), trainer.curve
-        drawn[title], measured[title] = trainer.render, runs[name]
-        renders[title] = [trainer.render(scene.test.camera(i))[0] for i in range(len(scene.test))]
-    save_ply(out / "splat.ply", trainer.shown, offset=scene.offset)
-    write_exports(trainer, out)
-    write_json(out / "metrics.json", runs)
-    write_curve(out / "curve.png", curves)
+        runs[name] = measure(fit)
+        fits[title] = replace(fit, metrics=runs[name])
+    staging = Staging(out, "demo")
+    staging.start()
+    folder = staging.unfinished
+    save_ply(folder / "splat.ply", fit.model, offset=scene.offset)
+    for note in write_exports(fit, folder):
+        say(note)
+    write_json(folder / "metrics.json", runs)
+    write_curve(folder / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
     levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs[name]["test"]["views"]]
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
-    write_sheet(out / "demo.png", scene.test, renders, sorted(worst))
-    notes = [f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else []
+    cameras = [scene.test.camera(i) for i in range(len(scene.test))]
+    renders = {title: [one.render(camera)[0] for camera in cameras] for title, one in fits.items()}
+    write_sheet(folder / "demo.png", scene.test, renders, sorted(worst))
     write_fit_page(
-        out / PAGE,
+        folder / PAGE,
         "kgs demo",
         scene,
-        trainer.shown,
-        trainer.near_plane,
-        drawn,
-        measured,
-        notes=notes,
-        film=film_in(out),
+        fit.model,
+        fit.options.near_plane,
+        {title: one.render for title, one in fits.items()},
+        {title: one.metrics for title, one in fits.items()},
+        notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
+        film=film_in(folder),
     )
+    staging.seal()
+    staging.complete()
     return runs

@@ -1,10 +1,11 @@
 """`kgs eval`: measures a fit again."""
 
+from dataclasses import replace
+
 from kgs.errors import printable
 from kgs.fit.config import Backend
 from kgs.io.console import as_line, say, say_next
 
-from .inputs import load
 from .options import Existing
 
 
@@ -23,21 +24,27 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit.
     """
-    from kgs.fit.saved import load_fit
-    from kgs.json_files import read_json, write_json
-    from kgs.machine import check_tools
+    from kgs.app.saved_fit import load_fit
+    from kgs.io.ownership import is_own, record
+    from kgs.json_files import write_json
+    from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
-    from kgs.page.fit_page import PAGE, refresh_page
+    from kgs.page.fit_page import PAGE, write_own_page
 
-    check_tools(device, backend, "jinja2")
+    check_packages("jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
-    saved, path = load_fit(out, device), out / "metrics.json"
-    saved = saved if backend == "auto" else saved._replace(backend=backend)
-    scene = saved.placed(load(saved.request, out))
-    metrics = measure_again(path, read_json(path), scene, lambda c: saved.render(c, scene.background), lpips)
+    request, fit = load_fit(out, device, backend, say)
+    path = out / "metrics.json"
+    metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
     write_json(path, metrics)
-    refresh_page(out, saved, scene, metrics)
+    written = [path.name]
+    if (out / PAGE).exists() and not is_own(out / PAGE):
+        say(f"{printable(out / PAGE)} was not written by kgs and is kept")
+    else:
+        write_own_page(out, out, replace(fit, metrics=metrics), request)
+        written.append(PAGE)
+    record(out, "fit", written)
     say(as_text(metrics))
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")

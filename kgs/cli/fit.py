@@ -12,7 +12,6 @@ from kgs.fit.config import DETAILS, PRESETS, Background, FitConfig
 from kgs.io.console import VIEWER, as_line, say, say_next
 
 from .checks import SMALLEST
-from .inputs import load
 from .options import Existing, Out
 
 
@@ -75,64 +74,66 @@ def fit(
         config: every number of the fit.
     """
     del preset  # `defaults` has read it
+    from kgs.app.fit_folder import fit_folder
+    from kgs.app.scene_request import SceneRequest
+    from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.folders import CAMERAS_REPORT
-    from kgs.fit.forecast import forecast
     from kgs.fit.prune import left_out
-    from kgs.fit.run import fit_scene
     from kgs.io.ownership import is_own
-    from kgs.io.results_folder import fit_staging, is_finished
-    from kgs.machine import check_tools
+    from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
-    from kgs.page.fit_page import write_own_page
 
-    from .unposed import announce_unposed, find_scene, is_unposed, on_ctrl_c, settle
+    from .unposed import find_scene, is_unposed, on_ctrl_c, settle
 
-    check_tools(config.device, config.backend, "matplotlib", "safetensors", "jinja2")
+    check_packages("matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
-    request = {"scene": os.path.abspath(scene), "train_views": views, "downscale": downscale, "background": background}
-    request["hold_out"] = hold_out
-    request |= {"photos": photos, "roll": roll}
-    request["points"] = config.init if config.init == "model-points" else "none"
-    place = out
+    request = SceneRequest(
+        scene=os.path.abspath(scene),
+        train_views=views,
+        downscale=downscale,
+        hold_out=hold_out,
+        background=background,
+        points=config.init if config.init == "model-points" else "none",
+        photos=photos,
+        roll=roll,
+    )
+    base = out
     unposed = is_unposed(scene)
+    stages = Stages(say, unposed)
     if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
     if unposed:
-        if not resume:
-            announce_unposed(scene, out, request, config, size)
-        request, place = find_scene(scene, out, request, config.seed, size)
+        stages.begin("cameras")
+        request, base = find_scene(scene, out, request, config.seed, size)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size is not None:
         height, width = load_scene(scene, photos=False, hold_out=hold_out).train.images.shape[-2:]
-        request["downscale"] = max(1.0, max(height, width) / size)
-    loaded = load(request, place)
+        request = replace(request, downscale=max(1.0, max(height, width) / size))
+    loaded = request.load(base, say)
     height, width = loaded.train.images.shape[-2:]
     if max(height, width) < SMALLEST:
         shrunk_by = "size" if downscale is None else "downscale"
         raise ValueError(f"{shrunk_by}: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
-    if not unposed and not resume:
-        say(str(forecast(len(loaded.train), (height, width), config)))
-    options: dict[str, Any] = {"resume": resume, "lpips": lpips, "request": request}
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
-        metrics, stopped_by = fit_scene(loaded, config, out, **options, before_publish=write_own_page)
-    kept = bool(stopped_by) and is_finished(out)  # the former fit
-    if unposed and not kept:
+        published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, stages=stages)
+    metrics = published.fit.metrics
+    if unposed and published.folder == out:
         settle(out)
     say(as_text(metrics))
     posed = out if unposed else scene
-    splat = (fit_staging(out).unfinished if kept else out) / "splat.ply"
-    renders, by = out / "renders", request["downscale"]
-    shrunk = ("--downscale", f"{by:g}") if by else ()
+    splat = published.folder / "splat.ply"
+    renders = out / "renders"
+    shrunk = ("--downscale", f"{request.downscale:g}") if request.downscale else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if what := left_out(metrics["needs"]):
         say(f"left out: {what}")
-    if stopped_by:
+    if published.signal:
         say_next("the same command with --resume goes on where it stopped")
-        return 128 + stopped_by
+        return 128 + published.signal
     say_next(
         f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
         f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",

@@ -8,17 +8,6 @@ from kgs.fit.config import Recipe
 from kgs.io.console import say
 
 
-def load(request: dict[str, Any], out: Path) -> Any:
-    """The scene; the folder "." is that of the results itself."""
-    from kgs.datasets import load_scene
-
-    names = ("train_views", "downscale", "hold_out", "background", "points")
-    scene = load_scene(out / request["scene"], **{name: request[name] for name in names})
-    for note in scene.notes:
-        say(note)
-    return scene
-
-
 def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any:
     """The scene without its photos, of which there may be hundreds; all views are training views."""
     from kgs.datasets import load_scene

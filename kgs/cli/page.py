@@ -50,6 +50,7 @@ def page(
 
     from kgs.camera import move_camera
     from kgs.datasets import load_scene
+    from kgs.io.ownership import claim, record
     from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
@@ -72,7 +73,9 @@ def page(
     title = f"{ply.stem}, {Path(cameras).resolve().name}"
     words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes, "photos": photos, "roll": roll}
     near_plane = renderer.options.near_plane
+    claim(out.parent, "page", [out.name])
     cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
+    record(out.parent, "page", [out.name])
     level = runs[""]["views"]["psnr"]
     say(
         f"{printable(out)}: {len(model)} Gaussians, {len(scene.train)} photos"

@@ -42,6 +42,7 @@ def render(
 
     from kgs.camera import move_camera
     from kgs.io.outputs import check_folder, png_names, write_png
+    from kgs.io.ownership import claim, record
     from kgs.machine import check_tools
 
     place = check_tools(device, backend)
@@ -50,6 +51,7 @@ def render(
     model, renderer = load_splat(ply, scene, place, backend)
     names = png_names(scene.train.names)
     check_folder(out, names.values(), scene.root)
+    claim(out, "renders", names.values())
     color = scene.background.to(place)
     outputs = ("image", "alpha") if is_transparent else ("image",)
     for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
@@ -59,5 +61,6 @@ def render(
         if is_transparent:  # PNG's colours are not multiplied by alpha
             image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
         write_png(out / names[name], image[0])
+    record(out, "renders", names.values())
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))

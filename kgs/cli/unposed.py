@@ -2,13 +2,16 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from kgs.datasets.folders import CAMERAS_REPORT, VIDEO_SUFFIXES, nearest_scene
-from kgs.fit.config import FitConfig
+from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
 from kgs.io.console import each, say
 from kgs.io.results_folder import locked
+
+if TYPE_CHECKING:
+    from kgs.app.scene_request import SceneRequest
 
 
 def is_unposed(scene: Path) -> bool:
@@ -18,34 +21,10 @@ def is_unposed(scene: Path) -> bool:
     return scene.is_dir() and nearest_scene(scene) is None
 
 
-def announce_unposed(photos: Path, out: Path, request: dict[str, Any], config: FitConfig, size: int | None) -> None:
-    """Say what of a folder of unposed photos is not used, and what a fit takes, from the size of the first of them.
-
-    Arguments are those of `find_scene`.
-    """
-    from kgs.datasets.image_file import read_size
-    from kgs.fit.forecast import forecast
-    from kgs.sfm.find import find_photos, notes_on
-    from kgs.sfm.read import LONGEST
-
-    for note in notes_on(photos):
-        say(note)
-    paths = find_photos(photos)
-    width, height = read_size(paths[0])
-    longest = max(width, height)
-    kept = min(1.0, LONGEST / longest)
-    wanted = longest / request["downscale"] if request["downscale"] else size or LONGEST
-    scale = min(kept, wanted / longest)
-    views = len(paths) - (len(paths) // request["hold_out"] if request["hold_out"] else 0)
-    count = 0 if (out / CAMERAS_REPORT).is_file() else len(paths)
-    fitted = (round(scale * height), round(scale * width))
-    say(str(forecast(request["train_views"] or views, fitted, config, count, kept**2 * width * height)))
-
-
 def find_scene(
-    photos: Path, out: Path, request: dict[str, Any], seed: int, size: int | None = None
-) -> tuple[dict[str, Any], Path]:
-    """Find the cameras of unposed photos; returns how the scene is to be loaded, as config.json has it, and from where.
+    photos: Path, out: Path, request: "SceneRequest", seed: int, size: int | None = None
+) -> "tuple[SceneRequest, Path]":
+    """Find the cameras of unposed photos; returns how the scene is to be loaded, and from where.
 
     That folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
 
@@ -53,7 +32,7 @@ def find_scene(
         photos: the folder of the photos.
         out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
         request: what the user asked for; None stands for what was left open. No photo is held out unless it says so.
-            Its "downscale" divides the photos as they came; that of the result the smaller copies that kgs keeps.
+            Its `downscale` divides the photos as they came; that of the result the smaller copies that kgs keeps.
         seed: of what the solvers draw.
         size: longer side of the photos in the fit, in pixels.
 
@@ -61,17 +40,26 @@ def find_scene(
         DataError: as of `pose_photos`.
     """
     from kgs.sfm import pose_photos
+    from kgs.sfm.find import notes_on
 
+    for note in notes_on(photos):
+        say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
     kept = max(report["size"])
     wanted = kept if size is None else size
-    if request["downscale"] is not None:
-        wanted = max(report["photo_size"]) / request["downscale"]
+    if request.downscale is not None:
+        wanted = max(report["photo_size"]) / request.downscale
     if wanted > kept and max(report["photo_size"]) > kept:
         say(f"the photos are fitted at {kept} pixels, the size at which kgs keeps them")
-    request = request | {"hold_out": request["hold_out"] or 0, "scene": ".", "title": photos.resolve().name}
-    return request | {"downscale": max(1.0, kept / wanted)}, Path(report["folder"])
+    loaded_as = replace(
+        request,
+        scene=".",
+        hold_out=request.hold_out or 0,
+        downscale=max(1.0, kept / wanted),
+        title=photos.resolve().name,
+    )
+    return loaded_as, Path(report["folder"])
 
 
 @contextmanager

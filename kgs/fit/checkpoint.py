@@ -7,9 +7,9 @@ under "state", next to the format and the SHA-256 of tensors and JSON. Loading m
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from functools import partial, reduce
+from functools import reduce
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,17 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError
-from kgs.io.ownership import MADE_BY
-from kgs.io.results_folder import previous
-from kgs.json_files import is_number, parse_json
+from kgs.json_files import parse_json
 
-from .config import FitConfig, timetable
+from .state import digest
 
-_FORMAT = f"checkpoint 4, {MADE_BY}"
+_FORMAT = "kgs checkpoint 5"
+
+
+def previous(path: Path) -> Path:
+    """Where the checkpoint before the one at `path` is."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
@@ -107,98 +109,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return state
 
 
-def fingerprint(scene: Scene) -> dict[str, Any]:
-    """SHA-256 sums of photos, masks, poses, intrinsics and background, to notice any change and to name it."""
-
-    def of(views: Views) -> dict[str, Any]:
-        tensors = {"photos": views.images, "masks": views.masks}
-        tensors |= {"poses": views.cameras.extrinsics, "intrinsics": views.cameras.intrinsics}
-        sums = {what: None if values is None else list(map(_digest, values)) for what, values in tensors.items()}
-        return {"names": list(views.names), **sums}
-
-    return {"training": of(scene.train), "test": of(scene.test), "background": _digest(scene.background)}
-
-
-def check_state(state: dict[str, Any], scene: dict[str, Any], config: FitConfig) -> list[str]:
-    """Raise KeyError, TypeError or ValueError unless a state has this fingerprint and configuration.
-
-    Returns notes for the user, if a finished fit goes on for more steps.
-    """
-    steps, done, notes = state["config"]["steps"], state["step"], list[str]()
-    wanted = timetable(config).steps
-    asked = config.to_dict() | {"device": state["config"].get("device")}  # a fit may continue on another device
-    asked |= {"backend": state["backend"]} if config.backend == "auto" else {}
-    if steps == done < wanted:
-        asked["steps"] = steps
-        notes.append(
-            f"trained on from step {done}, the end of a fit of {steps} steps: from here on learning rates, drop rate, "
-            f"densification and resets are those of {wanted} steps, so that the result differs from a fit of "
-            f"{wanted} steps from the start"
-        )
-    elif steps != wanted or done > steps:
-        expected = f"{steps}, as the fit was begun with," if done < steps else f"at least the {done} that are done,"
-        raise ValueError(f"steps: expected {expected} got {wanted}")
-    _compare_settings(state["config"] | {"backend": state["backend"]}, asked)
-    for part in ("training", "test"):
-        for what, values in scene[part].items():
-            before = state["scene"][part][what]
-            if before != values:
-                both = zip(scene[part]["names"], before or [], values or [], strict=False)
-                changed = ", ".join(name for name, one, other in both if one != other)
-                fault = f"{what} of the {part} views: expected those that the fit was begun with, got others"
-                raise ValueError(f"{fault} for {changed:.200}" if changed else fault)
-    if state["scene"]["background"] != scene["background"]:
-        raise ValueError("background: expected the one that the fit was begun with, got another")
-    if max(state["stack"], default=0) >= len(scene["training"]["names"]):
-        raise ValueError(f"stack: expected views of the scene, got {state['stack']!s:.80}")
-    return notes
-
-
-def check_plain(state: dict[str, Any], *names: str) -> None:
-    """Raise KeyError or ValueError if one of these plain values of a state is missing or wrong."""
-    for name in names:
-        expected, is_right = PLAIN[name]
-        if not is_right(state[name]):
-            raise ValueError(f"{name}: expected {expected}, got {str(state[name])[:80]!r}")
-
-
-def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = "") -> None:
-    for name, value in asked.items():
-        before = saved.get(name)
-        if isinstance(value, dict) and isinstance(before, dict):
-            _compare_settings(before, value, f"{path}{name}.")
-        elif before != value:
-            raise ValueError(f"{path}{name}: expected {before!r}, as the fit was begun with, got {value!r}")
-
-
-def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, dict[str, Tensor]]:
-    """Adam's step and moments of each parameter group, by its name; an empty dict if it had no gradient yet."""
-    return {group["name"]: optimizer.state.get(group["params"][0], {}) for group in optimizer.param_groups}
-
-
-def load_moments(optimizer: torch.optim.Optimizer, moments: dict[str, Any]) -> None:
-    """The inverse of `moments_of`; a ValueError if shapes or signs are wrong, which torch does not check."""
-    groups, found = optimizer.state_dict()["param_groups"], {}
-    for group, held in zip(groups, optimizer.param_groups, strict=True):
-        shape, state = held["params"][0].shape, moments[group["name"]]
-        if state:
-            shapes = {"step": (), "exp_avg": shape, "exp_avg_sq": shape}
-            negative = any(bool((state[name] < 0).any()) for name in ("step", "exp_avg_sq"))
-            if negative or {name: tuple(value.shape) for name, value in state.items()} != shapes:
-                raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
-            found[group["params"][0]] = state
-    optimizer.load_state_dict({"state": found, "param_groups": groups})
-
-
-def _digest(tensor: Tensor) -> str:
-    """SHA-256 of the type, shape and numbers of a tensor, in hexadecimal digits."""
-    checksum = hashlib.sha256(f"{tensor.dtype} {tuple(tensor.shape)} ".encode())
-    checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return checksum.hexdigest()
-
-
 def _digest_all(text: str, tensors: Mapping[str, Tensor]) -> str:
-    parts = [text, *(f"{name} {_digest(tensors[name])}" for name in sorted(tensors))]
+    parts = [text, *(f"{name} {digest(tensors[name])}" for name in sorted(tensors))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
@@ -215,30 +127,3 @@ def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
         else:
             rest[key] = _take_tensors(item, tensors, f"{path}{key}/")
     return rest
-
-
-_is_count = partial(is_number, least=0, whole=True)
-
-
-def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and all(map(is_right, value))
-
-
-def _is_point(value: Any) -> bool:
-    keys = {"step", "seconds", "test_psnr", "train_psnr"}
-    return value.keys() == keys and all(x is None or is_number(x) for x in value.values())
-
-
-# The plain values of a fit's state: what is expected of each in words, and the check.
-PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "backend": ("one of ['torch', 'numba', 'triton']", lambda v: v in ("torch", "numba", "triton")),
-    "init": ("kind and number of initial points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),
-    "step": ("a number of steps", _is_count),
-    "seconds": ("a number, not negative", lambda v: is_number(v, 0)),
-    "curve": ("a list of measurements", lambda v: _is_list(v, _is_point)),
-    "notes": ("a list of texts", lambda v: _is_list(v, lambda x: isinstance(x, str))),
-    "needs": ("what was decided", lambda v: isinstance(v, dict)),
-    "extent": ("a number above 0", lambda v: is_number(v, 1e-300)),
-    "near_plane": ("a number above 0", lambda v: is_number(v, 1e-300)),
-    "stack": ("a list of views", lambda v: _is_list(v, _is_count)),
-}

@@ -6,7 +6,6 @@ opacities, and has harmonics only if the training views need them; docs/recipe.m
 """
 
 from dataclasses import asdict, dataclass, field, fields, replace
-from itertools import pairwise
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
@@ -132,8 +131,6 @@ class FitConfig:
             of the background's colour. scene: the background of the scene, as in test views.
         max_gaussians: densification stops at this number; unless given, 10 per step and at least 1.5 times the
             number of initial points.
-        growth: share of the steps over which that limit rises linearly from the number of initial points; with 0 it
-            holds from the first step. In [0, 1].
         keep_all: keep Gaussians that no training view shows, and harmonics that change no image.
         max_bytes: bound on the working memory of a render in bytes; it changes results only by rounding.
         evaluations: how often the PSNR curve is measured, the last time at the end.
@@ -160,7 +157,6 @@ class FitConfig:
     draw: Literal["spread", "uniform"] = "spread"
     training_background: Literal["random", "scene"] = "random"
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
-    growth: _Share = 0.0
     keep_all: bool = False
     max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # the default of RasterOptions, which would import torch
     evaluations: _Steps = 8
@@ -185,78 +181,6 @@ class FitConfig:
             return cls(**{**values, "recipe": Recipe(**values.get("recipe", {}))})
         except (AttributeError, TypeError) as error:
             raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
-
-
-class Choice(NamedTuple):
-    """The two values between which probes decide for an entry of FitConfig that is None."""
-
-    cheaper: Any  # also taken where probes are not possible
-    dearer: Any
-
-
-# Measured, see docs/recipe.md.
-CHOICES = {"sh_degree": Choice(cheaper=0, dearer=3)}
-
-
-class Pace(NamedTuple):
-    """The length of a fit, and how fast opacities fade: with more views, what only some show is seen less often."""
-
-    steps: int
-    opacity_decay: float
-
-
-FEW_VIEWS = 3
-FEW, MANY = Pace(1000, 0.9925), Pace(1500, 0.995)  # of a fit to so few training views, and to more
-
-
-def with_pace(config: FitConfig, views: int) -> FitConfig:
-    """The configuration with the numbers for so many training views, where it leaves them open."""
-    few, recipe = views <= FEW_VIEWS, config.recipe
-    steps = config.steps or (FEW if few else MANY).steps
-    if recipe.opacity_decay is None:
-        pace = FEW if few and steps <= FEW.steps else MANY
-        recipe = replace(recipe, opacity_decay=pace.opacity_decay)
-    return replace(config, steps=steps, recipe=recipe)
-
-
-class Timetable(NamedTuple):
-    """The steps at which things happen in a fit of a given length."""
-
-    steps: int  # all of them
-    sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
-    densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
-    reset: tuple[int, ...]  # after these all opacities are lowered
-    evaluate: tuple[int, ...]  # after these the curve is measured (before a densification)
-    drop: int  # up to this one Gaussians are dropped
-    coarse: int  # up to this one the training views are seen at half their width
-
-
-def timetable(config: FitConfig) -> Timetable:
-    """Scale the recipe's counts by steps / 10 000.
-
-    A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
-    10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.
-    A `steps` of None counts as that of a fit to more than three views.
-    """
-    recipe, steps = config.recipe, config.steps or MANY.steps
-    scale = steps / recipe.steps
-    interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
-    spacing = max(1, round(recipe.reset_interval * scale)) if recipe.reset_interval else steps
-    resets, evaluations = [*range(spacing, steps, spacing), steps], range(1, config.evaluations + 1)
-    return Timetable(
-        steps=steps,
-        sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
-        densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
-        reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
-        evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
-        drop=steps - min(config.undropped_steps, round(0.1 * steps)),
-        coarse=round(config.coarse * steps),
-    )
-
-
-def most_gaussians(config: FitConfig, points: int) -> int:
-    """The number of Gaussians at which densification stops, in a fit from `points` initial points."""
-    return config.max_gaussians or max(10 * (config.steps or MANY.steps), 3 * points // 2)
 
 
 def _check(config: FitConfig | Recipe) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.geometry import camera_centers, degrees_between
 
-from .checkpoint import load_moments, moments_of
+from .moments import load_moments, moments_of
 
 # Roughly the sum of the learning rates of one camera over a whole fit: Adam moves no number much farther.
 REACH = 0.004
@@ -35,14 +35,15 @@ class MovingPoses:
     Args:
         given: the world-to-camera extrinsics that the fit starts from, `(V, 4, 4)`.
         steps: the number of steps of the whole fit.
+        depth: the median depth of the initial points, in world units, above 0.
 
     Attributes:
         extrinsics: the current poses, `(V, 4, 4)`, float64 on the CPU.
-        depth: the median depth of the initial points, in world units, above 0. Set it before the first step.
     """
 
-    def __init__(self, given: Tensor, steps: int) -> None:
-        self.given, self.depth = given.double().cpu(), 1.0
+    def __init__(self, given: Tensor, steps: int, depth: float) -> None:
+        self.given = given.double().cpu()
+        self.depth = depth
         self._rate = REACH * len(given) / steps * -math.log(LAST) / (1 - LAST)
         self.extrinsics = self.given.clone()
         self._motions = [torch.zeros(6, dtype=torch.float64) for _ in given]  # 0 before each step
@@ -89,19 +90,15 @@ class MovingPoses:
 
     def state_dict(self) -> dict[str, Any]:
         """All that the next steps depend on besides the arguments of the class."""
-        return {"extrinsics": self.extrinsics, "depth": self.depth, "optimizer": moments_of(self._optimizer)}
+        return {"extrinsics": self.extrinsics, "optimizer": moments_of(self._optimizer)}
 
-    def restore(self, scene: Scene, state: dict[str, Any]) -> Scene:
-        """Continue from a :meth:`state_dict`; returns the scene with its training cameras at those poses.
-
-        A KeyError, TypeError or ValueError if an entry is missing or wrong.
-        """
-        found = state["extrinsics"]
-        if found.shape != self.given.shape:
-            raise ValueError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(found.shape)}")
-        self.extrinsics, self.depth = found.double().clone(), float(state["depth"])
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`; a KeyError, TypeError or ValueError if an entry is missing or wrong."""
+        extrinsics = state["extrinsics"]
+        if extrinsics.shape != self.given.shape:
+            raise ValueError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(extrinsics.shape)}")
+        self.extrinsics = extrinsics.double().clone()
         load_moments(self._optimizer, state["optimizer"])
-        return place_cameras(scene, self.extrinsics)
 
     def _fix_gauge(self) -> None:
         """Turn, move and scale the world so that mean rotation, mean centre and spread of the centres are as given."""

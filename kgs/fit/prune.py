@@ -12,7 +12,7 @@ from kgs.metrics.evaluate import BEST
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .trainer import Trainer
+from .fit import Fit
 
 TOLERANCE = 0.01  # dB by which the PSNR of a training view may change
 # Limits on what a Gaussian contributes to all training views together, in pixels; -1 keeps all.
@@ -20,52 +20,72 @@ WEIGHTS = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.0, -1.0)
 QUANTUM = 0.5 / 255  # a smaller change of an 8-bit image is not visible
 
 
-def prune(trainer: Trainer) -> None:
-    """Show only what the training views need; the fit itself keeps everything. Does nothing with `keep_all`.
+def prune(fit: Fit) -> Fit:
+    """The fit with what the training views need and no more; the same one if its settings say `keep_all`.
 
     Takes the highest limit of `WEIGHTS` that changes the PSNR of no training view by more than `TOLERANCE`, then the
     lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
 
-    Records "gaussians" in `trainer.needs`: how many were "fitted" and "kept", the limit "weight", and "sh_degree".
+    The history's "needs" then have under "gaussians" how many were "fitted" and "kept", the limit "weight", and
+    "sh_degree".
     """
-    if trainer.config.keep_all:
-        return
-    model, views = trainer.model, trainer.scene.train
+    if fit.settings is not None and fit.settings.keep_all:
+        return fit
+    model = fit.model
     weights = contributions(
-        model, views, trainer.near_plane, max_bytes=trainer.config.max_bytes, backend=trainer.backend
+        model,
+        fit.scene.train,
+        fit.options.near_plane,
+        max_bytes=fit.options.max_bytes,
+        backend=fit.backend,
     )
-    trainer.show(weights >= WEIGHTS[-1], model.sh_degree)  # all, although an earlier call may have hidden some
-    levels = _levels(trainer)
+    levels = _levels(fit)
     for limit in WEIGHTS:
         rows = weights > limit
-        trainer.show(rows, model.sh_degree)
-        if _is_close(_levels(trainer), levels):
+        pruned = _part(fit, rows, model.sh_degree)
+        if _is_close(_levels(pruned), levels):
             break
-    degree = _fewest_harmonics(trainer, rows, levels)
-    kept = len(trainer.shown)
-    trainer.record("gaussians", {"fitted": len(model), "kept": kept, "weight": limit, "sh_degree": degree})
+    pruned = _with_fewest_harmonics(fit, pruned, levels)
+    record = {
+        "fitted": len(model),
+        "kept": len(pruned.model),
+        "weight": limit,
+        "sh_degree": pruned.part["sh_degree"],
+    }
+    needs = {**fit.history["needs"], "gaussians": record}
+    return replace(pruned, history={**fit.history, "needs": needs})
 
 
-def _fewest_harmonics(trainer: Trainer, rows: Tensor, levels: list[float]) -> int:
-    """Show the Gaussians at `rows` with the lowest degree that changes no image; returns the degree."""
-    most, views = trainer.model.sh_degree, trainer.scene.train
-    images = [trainer.render(views.camera(i)) for i in range(len(views))] if most else []
+def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
+    """The fit with only the Gaussians at `rows`, bool `(N,)`, at this degree."""
+    part = {"rows": rows.cpu(), "sh_degree": sh_degree}
+    return replace(fit, model=fit.model.select(rows, sh_degree), part=part)
+
+
+def _with_fewest_harmonics(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
+    """The pruned fit with the lowest degree that changes no image."""
+    most = fit.model.sh_degree
+    views = fit.scene.train
+    cameras = [views.camera(i) for i in range(len(views))] if most else []
+    images = [pruned.render(camera) for camera in cameras]
+    rows = pruned.part["rows"].to(fit.device)
     for degree in range(most + 1):
-        trainer.show(rows, degree)
-        renders = (trainer.render(views.camera(i)) for i in range(len(images)))
+        lower = _part(fit, rows, degree)
+        renders = map(lower.render, cameras)
         same = all(bool(((now - before).abs() <= QUANTUM).all()) for now, before in zip(renders, images, strict=True))
-        if same and _is_close(_levels(trainer), levels):
+        if same and _is_close(_levels(lower), levels):
             break
-    return degree
+    return lower
 
 
 def _is_close(levels: list[float], others: list[float]) -> bool:
     return all(abs(level - other) <= TOLERANCE for level, other in zip(levels, others, strict=True))
 
 
-def _levels(trainer: Trainer) -> list[float]:
-    views = trainer.scene.train
-    return [min(trainer.psnr(views.select([i])) or BEST, BEST) for i in range(len(views))]
+def _levels(fit: Fit) -> list[float]:
+    """The PSNR of each training view."""
+    views = fit.scene.train
+    return [min(fit.psnr(views.select([i])) or BEST, BEST) for i in range(len(views))]
 
 
 def contributions(model: GaussianModel, views: Views, near_plane: float, **options: Any) -> Tensor:
@@ -85,7 +105,9 @@ def contributions(model: GaussianModel, views: Views, near_plane: float, **optio
 
 def left_out(needs: dict[str, Any]) -> str:
     """What a fit left out, in words for the last line of its output; "" if that is nothing."""
-    parts, harmonics, gaussians = [], needs.get("sh_degree"), needs.get("gaussians")
+    parts = []
+    harmonics = needs.get("sh_degree")
+    gaussians = needs.get("gaussians")
     if harmonics and harmonics["chosen"] == 0:
         why = harmonics.get("why", "by rule")
         if harmonics["by"] == "probes":

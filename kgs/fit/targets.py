@@ -1,6 +1,6 @@
 """What a training step compares its render with: an image, its SSIM statistics, its transparency and its border."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -26,19 +26,27 @@ class Target(NamedTuple):
         image = render.masked_fill(render > 1, 1.0)  # it is never below 0
         return image if self.light is None else image * self.light
 
-    def over(self, background: Tensor) -> tuple[Tensor, TargetMoments]:
-        """The image over another background, `(3,)`, and its SSIM statistics."""
+    def over(self, background: Tensor) -> Self:
+        """The view before another background, `(3,)`."""
         if self.clear is None:
-            return self.image, self.moments
+            return self
         image = self.image + self.clear * (background - self.background)[:, None, None]
-        return image, target_moments(image)
+        return self._replace(image=image, moments=target_moments(image), background=background)
 
 
 def targets(views: Views, background: Tensor, device: torch.device) -> list[Target]:
     """One target for each view; `background`, `(3,)`, is that of the scene."""
-    images = [image[None].to(device, torch.float32) for image in views.images]
-    masks = [None] * len(views) if views.masks is None else [1.0 - mask[None].to(images[0]) for mask in views.masks]
-    cameras = [move_camera(views.camera(i), device) for i in range(len(views))]
-    parts = zip(cameras, images, map(target_moments, images), masks, strict=True)
-    light = None if views.light is None else views.light.to(images[0])
-    return [Target(*each, background.to(images[0]), light) for each in parts]
+    made = []
+    for i, photo in enumerate(views.images):
+        image = photo[None].to(device, torch.float32)
+        made.append(
+            Target(
+                camera=move_camera(views.camera(i), device),
+                image=image,
+                moments=target_moments(image),
+                clear=None if views.masks is None else 1.0 - views.masks[i][None].to(image),
+                background=background.to(image),
+                light=None if views.light is None else views.light.to(image),
+            )
+        )
+    return made

@@ -20,7 +20,7 @@ from kgs.geometry import (
     project_points,
     unproject,
 )
-from kgs.io.console import Stage, silent
+from kgs.progress import Stage, silent
 from kgs.types import check_kind
 
 from .dense import FEWEST, dense_points

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.io.console import Stage, silent
+from kgs.progress import Stage, silent
 
 from .agreement import agreed_points, average_depths
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths

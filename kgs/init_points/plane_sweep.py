@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.geometry import camera_centers, camera_matrices
-from kgs.io.console import Stage, silent
+from kgs.progress import Stage, silent
 
 from .sweep_costs import sweep_costs
 

@@ -15,7 +15,7 @@ from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.io.console import Stage, silent
+from kgs.progress import Stage, silent
 from kgs.sfm.keypoints import root_sift
 
 from .matching import match

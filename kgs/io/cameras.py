@@ -11,9 +11,6 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import common_up
-from kgs.version import __version__
-
-from .ownership import MADE_BY
 
 _OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
 _DISTANT = 10.0  # times the median distance from the middle: a sky, which the bounds leave out before
@@ -63,7 +60,6 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
                     "fx": float(k[0, 0]),
                     "fy": float(k[1, 1]),
                     **box,
-                    "generator": f"{MADE_BY} {__version__}",
                 }
             )
     return entries

@@ -2,14 +2,15 @@
 
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from kgs.errors import printable
 
+_FIRST_LINE = 2.0  # seconds
 VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a step to suggest
-Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # what `each` and `silent` are
 
 
 def say(line: str, file: TextIO | None = None) -> None:
@@ -46,8 +47,9 @@ def _quoted(word: str) -> str:
 def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
     """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a line for every tenth.
 
-    Yields `advance(note="")`, to be called after each unit; the note is shown behind the figures. `done` units are
-    already done. With a total of 0 nothing is shown.
+    Both tell the time that is left; the first line comes after two seconds at most. Yields `advance(note="")`, to be
+    called after each unit; the note is shown behind the figures. `done` units are already done. With a total of 0
+    nothing is shown.
     """
     bar: Any = None
     with suppress(OSError, ValueError, AttributeError, ImportError):  # no tqdm, or a stderr that is closed
@@ -55,17 +57,27 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
             from tqdm import tqdm
 
             bar = tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=0.5, file=sys.stderr)
+    before = done
+    begin = time.monotonic()
+    is_first = True
 
     def advance(note: str = "") -> None:
-        nonlocal done
+        nonlocal done, is_first
         done += 1
         if bar is not None:
             with suppress(OSError, ValueError):
                 bar.set_postfix_str(note, refresh=False)
                 bar.update()
-        elif done * 10 // total > (done - 1) * 10 // total:
-            behind = f", {note}" if note else ""
-            say(f"{title}: {done} of {total} {unit}s{behind}", sys.stderr)
+            return
+        seconds = time.monotonic() - begin
+        is_early = is_first and seconds > _FIRST_LINE
+        if is_early or done * 10 // total > (done - 1) * 10 // total:
+            is_first = False
+            left = seconds / (done - before) * (total - done)
+            parts = [f"{title}: {done} of {total} {unit}s"]
+            if left > 1:
+                parts.append(f"{left:.0f} s left" if left < 100 else f"{left / 60:.1f} minutes left")
+            say(", ".join([*parts, *([note] if note else [])]), sys.stderr)
 
     try:
         yield advance
@@ -81,8 +93,3 @@ def each(items: Sequence[Any], title: str, unit: str) -> Iterator[Any]:
         for item in items:
             yield item
             advance()
-
-
-def silent(items: Sequence[Any], title: str, unit: str) -> Iterable[Any]:
-    """The items, without a progress bar."""
-    return items

@@ -15,8 +15,6 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from .ownership import MARK
-
 RATE = 24  # frames per second
 BITS = 0.2  # of H.264 for each pixel: six seconds of 640x426 have 1.0 MB, and go into the page as they are
 MP4, WEBM = ".mp4", ".webm"
@@ -24,7 +22,6 @@ ASKED = "KGS_H264"  # environment variable: the encoder of FFmpeg to use
 _ENCODERS = ("libopenh264", "h264_videotoolbox", "h264_mf")  # BSD; of macOS; of Windows
 _H264 = 27  # FFmpeg's number of the codec
 _OPTIONS = {"profile": "main", **dict.fromkeys(("colorspace", "color_primaries", "color_trc"), "bt709")}
-_EBML_VOID = b"\xec"  # element ID of padding, which players skip
 Frame = NDArray[Any]  # of uint8
 
 
@@ -58,7 +55,7 @@ def h264_encoder() -> str:
 
 
 def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate: float = 0.0) -> str:
-    """Write frames as a film, MP4 or WebM by the suffix, with the mark of kgs.
+    """Write frames as a film, MP4 or WebM by the suffix.
 
     MP4 is H.264 of the main profile or below, yuv420p in BT.709, with its index in front, so that it plays on phones
     and while it is loaded. (OpenCV's VP9 encoder takes six times as long as VP8 for 0.5 dB.)
@@ -76,12 +73,6 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate: flo
     count, why = write(path, frames, size, rate)
     if not why and round(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)) != count:
         why = "it could not be written whole"
-    if not why:
-        with open(path, "ab") as file:
-            if path.suffix == MP4:
-                file.write((8 + len(MARK)).to_bytes(4, "big") + b"free" + MARK)
-            else:
-                file.write(_EBML_VOID + bytes([0x80 | len(MARK)]) + MARK)
     return why
 
 

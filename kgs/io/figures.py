@@ -10,8 +10,6 @@ from torch import Tensor
 from kgs.datasets.scene import Views
 from kgs.json_files import write_whole
 
-from .ownership import MADE_BY
-
 # One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The
 # study has more of them (kgs/study/plots.py); pages show black as the colour of their text.
 DEFAULT, WITHOUT = "#CC79A7", "#000000"
@@ -57,5 +55,5 @@ def _figure(width: float, height: float) -> Any:
 
 def _write(path: Path, figure: Any) -> None:
     content = BytesIO()
-    figure.savefig(content, format="png", dpi=120, metadata={"Software": MADE_BY})
+    figure.savefig(content, format="png", dpi=120)
     write_whole(path, content.getvalue())

@@ -22,7 +22,6 @@ from kgs.model import GaussianModel
 from kgs.types import check_kind
 from kgs.version import __version__
 
-from .ownership import MADE_BY
 from .ply import as_vector
 
 _EXTENSION = "KHR_gaussian_splatting"
@@ -77,7 +76,7 @@ def save_glb(
         "translation": translation.tolist(),
     }
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"{MADE_BY} {__version__}"},
+        "asset": {"version": "2.0", "generator": f"kgs {__version__}"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

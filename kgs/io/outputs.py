@@ -4,7 +4,6 @@ import hashlib
 import os
 import re
 import unicodedata
-import zlib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,7 +13,7 @@ from kgs.datasets.folders import CAMERAS_REPORT, list_images
 from kgs.errors import DataError
 from kgs.json_files import write_whole
 
-from .ownership import MARK, is_own
+from .ownership import is_own
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -73,7 +72,7 @@ def png_names(views: Iterable[str]) -> dict[str, str]:
 
 
 def write_png(path: Path, image: "Tensor") -> None:
-    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits, marked as one of kgs.
+    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits.
 
     Alpha is straight, as PNG has it: the colours are not multiplied by it.
     """
@@ -84,8 +83,4 @@ def write_png(path: Path, image: "Tensor") -> None:
     ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:
         raise DataError(path, "", "expected an image that can be encoded, got another")
-    text = b"Software\0" + MARK
-    chunk = b"tEXt" + text
-    mark = len(text).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
-    data, header = content.tobytes(), 33  # bytes of the signature and the first chunk
-    write_whole(path, data[:header] + mark + data[header:])
+    write_whole(path, content.tobytes())

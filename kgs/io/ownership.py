@@ -1,43 +1,82 @@
-"""Tells files of kgs from the user's: each file that kgs writes contains the mark `made by kgs`, as its format allows.
+"""Tells files of kgs from the user's by a list, `.kgs.json`, which each folder of results keeps.
 
-PNG has it as Software text, PLY as a comment, JSON under "generator", HTML and glTF as generator, WebM in a void
-element, MP4 in a free box, checkpoints in their metadata. Nothing else is ever overwritten or removed.
+The list holds name, size and modification time of each file that kgs wrote there, by kind of result. A file that is not
+in it, or that was changed since, is the user's, and kgs neither overwrites nor removes it.
 """
 
-import shutil
-from collections.abc import Collection
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from kgs.json_files import GENERATOR
+from kgs.errors import DataError
+from kgs.json_files import read_json, write_json
 
-MADE_BY = GENERATOR
-MARK = MADE_BY.encode()
-_FOLDER_MARK = ".kgs"  # an empty file in a temporary folder
-_HEAD, _TAIL = 2**20, 2**10  # bytes that are searched: the mark is at the end of films, else in the header
+LIST = ".kgs.json"
+_DEPTH = 3  # levels of folders between a file and the list that names it
+Entries = dict[str, Any]  # [size, modification time in ns] by name; None: about to be written
 
 
 def is_own(path: Path) -> bool:
-    """Whether kgs wrote this file or made this folder; an empty folder counts."""
+    """Whether kgs wrote this file, and nothing has changed it since; an own folder has a list, or is empty."""
     if path.is_dir():
-        return (path / _FOLDER_MARK).is_file() or not any(path.iterdir())
+        return (path / LIST).is_file() or not any(path.iterdir())
     if not path.is_file():
         return False
-    with open(path, "rb") as file:
-        if MARK in file.read(_HEAD):
-            return True
-        file.seek(max(0, path.stat().st_size - _TAIL))
-        return MARK in file.read()
+    for folder in path.absolute().parents[:_DEPTH]:
+        name = path.absolute().relative_to(folder).as_posix()
+        for entries in (*read_list(folder).values(), *_waiting(folder)):
+            if name in entries and entries[name] in (None, _stamp(path)):
+                return True
+    return False
 
 
-def make_own_folder(path: Path) -> None:
-    """An empty folder that `is_own` recognises, in place of a former one."""
-    shutil.rmtree(path, ignore_errors=True)
-    path.mkdir()
-    (path / _FOLDER_MARK).touch()
+def holds_only_own(folder: Path) -> bool:
+    """Whether kgs wrote all files of a folder and its subfolders; hidden files do not count."""
+    if not folder.is_dir() or folder.is_symlink():
+        return False
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name[0] != "."]
+    return all(map(is_own, files))
 
 
-def remove_own_images(folder: Path, keep: Collection[str]) -> None:
-    """Remove the PNGs of a former run, except those named in `keep`; the user's stay."""
-    for path in folder.glob("*.png"):
-        if path.name not in keep and is_own(path):
-            path.unlink()
+def read_list(folder: Path) -> dict[str, Entries]:
+    """The list of a folder: entries by kind of result; empty if there is none, or it is damaged."""
+    try:
+        kinds = read_json(folder / LIST)
+    except DataError:
+        return {}
+    return {kind: entries for kind, entries in kinds.items() if isinstance(entries, dict)}
+
+
+def claim(folder: Path, kind: str, names: Iterable[str]) -> None:
+    """Enter files that are about to be written, so that those which a kill leaves are known as well."""
+    _merge(folder, kind, dict.fromkeys(names))
+
+
+def record(folder: Path, kind: str, names: Iterable[str]) -> None:
+    """Enter files that were written, with their sizes and times."""
+    _merge(folder, kind, stamps(folder, names))
+
+
+def replace_entries(folder: Path, kind: str, entries: Entries) -> None:
+    """Put entries in place of all former ones of a kind."""
+    write_json(folder / LIST, read_list(folder) | {kind: entries})
+
+
+def stamps(folder: Path, names: Iterable[str]) -> Entries:
+    """Entries of files that are there."""
+    return {name: _stamp(folder / name) for name in names}
+
+
+def _merge(folder: Path, kind: str, entries: Entries) -> None:
+    replace_entries(folder, kind, read_list(folder).get(kind, {}) | entries)
+
+
+def _stamp(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _waiting(folder: Path) -> Iterable[Entries]:
+    """Entries of whole results that a kill kept from being moved to this folder, or from being entered in its list."""
+    for waiting in folder.glob("finished*"):
+        yield from read_list(waiting).values()

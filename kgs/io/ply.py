@@ -22,8 +22,6 @@ from kgs.json_files import write_whole
 from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
 
-from .ownership import MADE_BY
-
 MAX_HEADER = 1 << 16  # bytes
 # NumPy's codes for the formats and types of PLY files.
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -83,7 +81,7 @@ def save_ply(
     if _float32_moves(means, values["log_scales"]):
         position = "double"
         table = np.hstack([means.astype("<f8").view("<f4"), table[:, 3:]])
-    comments = [MADE_BY, f"kgs sh_degree {model.sh_degree}"]
+    comments = [f"kgs sh_degree {model.sh_degree}"]
     if model.antialiased:
         comments.append("SplatRenderMode: mip")
     lines = [

@@ -8,18 +8,12 @@ from pathlib import Path
 from kgs.errors import DataError
 from kgs.json_files import read_json
 
-from .outputs import EXPORTS, FILMS
-from .ownership import is_own
+from .outputs import EXPORTS
 from .staging import Staging
 
-CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
-RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS)
-_OPTIONAL = (PREVIOUS, *FILMS)
-
-
-def fit_staging(out: Path) -> Staging:
-    """The staging folders of a fit's results."""
-    return Staging(out, optional=_OPTIONAL, merged=("test",))
+CHECKPOINT = "checkpoint.safetensors"
+PREVIOUS = "checkpoint.previous.safetensors"
+RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS, CHECKPOINT, PREVIOUS)
 
 
 @contextmanager
@@ -54,18 +48,9 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def replaced_files(out: Path) -> list[str]:
-    """The files that a fit replaces or removes in its folder, for `check_folder`.
-
-    In the folder of a fit checkpoints are left out: a damaged one may lack the mark of kgs.
-    """
-    staging = fit_staging(out)
-    names = [*RESULTS, staging.unfinished.name, staging.finished.name]
-    return names if is_own(out / "config.json") else [*names, CHECKPOINT, *_OPTIONAL]
-
-
-def previous(path: Path) -> Path:
-    """Where the checkpoint before the one at `path` is."""
-    return path.with_name(f"{path.stem}.previous{path.suffix}")
+    """The files that a fit replaces or removes in its folder, for `check_folder`."""
+    staging = Staging(out)
+    return [*RESULTS, staging.unfinished.name, staging.finished.name]
 
 
 def is_finished(out: Path) -> bool:
@@ -78,7 +63,7 @@ def is_finished(out: Path) -> bool:
 
 def complete_stopped_move(out: Path) -> None:
     """Complete the move of a fit's results that a kill stopped, if there is one."""
-    staging = fit_staging(out)
+    staging = Staging(out)
     if staging.finished.exists():
         with locked(out):
             staging.complete()

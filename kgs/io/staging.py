@@ -1,21 +1,17 @@
 """Replaces former results by new ones all at once, whenever the process is killed.
 
 Results are written to a folder of their own, `unfinished`. When all are there, `seal` lists the files and renames the
-folder to `finished`; from then on they are whole. `complete` moves them to their places, and removes what only
-the former results had. Code that opens the folder calls `complete` first, in case a kill came in between.
+folder to `finished`; from then on they are whole. `complete` moves them to their places, removes what only the former
+results had, and keeps the list, see `kgs.io.ownership`. Code that opens the folder calls `complete` first, in case a
+kill came in between.
 """
 
 import os
 import shutil
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from kgs.errors import DataError
-from kgs.json_files import read_json, write_json
-
-from .ownership import is_own, make_own_folder, remove_own_images
-
-_LIST = "files.json"
+from .ownership import Entries, is_own, read_list, replace_entries, stamps
 
 
 @dataclass(frozen=True)
@@ -24,73 +20,79 @@ class Staging:
 
     Args:
         out: where the results belong.
-        kind: suffix of the folders' names, which tells kinds of results apart; "" for a fit.
-        optional: files of former results that are removed unless the new ones have them.
-        replaced: subfolders that are replaced as wholes.
-        merged: subfolders of images where only images that kgs wrote are removed.
+        kind: of the results, which tells them apart from others in the same folder.
     """
 
     out: Path
-    kind: str = ""
-    optional: tuple[str, ...] = ()
-    replaced: tuple[str, ...] = ()
-    merged: tuple[str, ...] = ()
+    kind: str = "fit"
 
     @property
     def unfinished(self) -> Path:
         """Where new results are written."""
-        return self.out / f"unfinished{self.kind}"
+        return self.out / f"unfinished{self._suffix}"
 
     @property
     def finished(self) -> Path:
         """Where whole results wait until they are moved to `out`."""
-        return self.out / f"finished{self.kind}"
+        return self.out / f"finished{self._suffix}"
 
     @property
     def is_waiting(self) -> bool:
         """Whether whole results wait, none of which has been moved yet."""
-        try:
-            return all((self.finished / name).exists() for name in self._listed())
-        except DataError:
-            return False
+        names = self._sealed()
+        return bool(names) and all((self.finished / name).exists() for name in names)
 
     def start(self) -> None:
         """Make an empty folder for new results."""
-        make_own_folder(self.unfinished)
+        shutil.rmtree(self.unfinished, ignore_errors=True)
+        self.unfinished.mkdir(parents=True)
+        replace_entries(self.unfinished, self.kind, {})
 
     def seal(self) -> None:
         """Declare the new results whole."""
-        write_json(self.unfinished / _LIST, {"files": _files(self.unfinished)})
+        replace_entries(self.unfinished, self.kind, stamps(self.unfinished, _files(self.unfinished)))
         shutil.rmtree(self.finished, ignore_errors=True)
         os.replace(self.unfinished, self.finished)
 
     def complete(self) -> None:
         """Move whole results to their places; does nothing if there are none."""
-        if not (is_own(self.finished) and (self.finished / _LIST).exists()):
+        new = self._sealed()
+        if not new:
             return
-        names = self._listed()  # includes files that were moved before a kill
-        for name in set(self.optional) - set(names):
-            (self.out / name).unlink(missing_ok=True)
-        for name in self.replaced:
-            if (self.finished / name).is_dir():
-                shutil.rmtree(self.out / name, ignore_errors=True)
-                os.replace(self.finished / name, self.out / name)
-        for folder in self.merged:
-            (self.out / folder).mkdir(exist_ok=True)
-            remove_own_images(self.out / folder, {PurePosixPath(name).name for name in names if "/" in name})
+        former = read_list(self.out).get(self.kind, {})
+        for name in former:
+            path = self.out / name
+            if name not in new and is_own(path):
+                path.unlink()
+                _remove_empty(path.parent, self.out)
         for name in _files(self.finished):
-            os.replace(self.finished / name, self.out / name)
+            target = self.out / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(self.finished / name, target)
+        replace_entries(self.out, self.kind, new)
         shutil.rmtree(self.finished)
 
     def discard(self) -> None:
         """Remove whole results that wait."""
         shutil.rmtree(self.finished, ignore_errors=True)
 
-    def _listed(self) -> list[str]:
-        return [str(name) for name in read_json(self.finished / _LIST).get("files", [])]
+    @property
+    def _suffix(self) -> str:
+        return "" if self.kind == "fit" else f"-{self.kind}"
+
+    def _sealed(self) -> Entries:
+        """The entries of whole results, those that were moved before a kill included."""
+        return read_list(self.finished).get(self.kind, {})
 
 
 def _files(folder: Path) -> list[str]:
     """The files of a folder and its subfolders, without those that a kill left half written."""
     whole = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
-    return [path.relative_to(folder).as_posix() for path in whole if path.name[0] != "." and path.name != _LIST]
+    return [path.relative_to(folder).as_posix() for path in whole if path.name[0] != "."]
+
+
+def _remove_empty(folder: Path, root: Path) -> None:
+    """Remove a folder below `root` that has become empty, and those above it."""
+    while folder != root and not any(folder.iterdir()):
+        folder.rmdir()
+        folder = folder.parent

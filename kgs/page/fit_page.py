@@ -9,18 +9,17 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
+from kgs.fit.fit import Fit
 from kgs.fit.prune import contributions, left_out
-from kgs.fit.run import Finished
-from kgs.fit.saved import SavedFit
 from kgs.io.cameras import rolled
-from kgs.io.console import each, say
+from kgs.io.console import each
 from kgs.io.film import film_within
 from kgs.io.outputs import film_in
-from kgs.io.ownership import is_own
 from kgs.json_files import read_json
 from kgs.model import GaussianModel
 
@@ -67,7 +66,7 @@ def write_fit_page(
         notes: sentences to show below the one that says how good the fit is.
         settings: the content of config.json.
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
-        film: an MP4 or WebM file to show; ignored if kgs did not write it.
+        film: an MP4 or WebM file to show.
         photos: whether the page shows photos, renders and their differences.
         roll: degrees by which all pictures are turned clockwise, see :func:`kgs.io.cameras.rolled`.
 
@@ -106,7 +105,7 @@ def write_fit_page(
         background=scene.background,
         pictures=pictures,
         pictures_note=_pictures_note(len(shown), len(views), word),
-        film=film_within(film, MOST_FILM_BYTES) if film is not None and is_own(film) else b"",
+        film=film_within(film, MOST_FILM_BYTES) if film is not None else b"",
         runs=runs,
         left_out=left_out(next(iter(runs.values()), {}).get("needs") or {}),
         notes=notes,
@@ -117,51 +116,22 @@ def write_fit_page(
     )
 
 
-def write_own_page(fit: Finished) -> None:
-    """Write the page of a fit into its folder, see `before_publish` of :func:`kgs.fit.fit_scene`."""
-    trainer = fit.trainer
-    _write_page_of(
-        fit.folder / PAGE,
-        fit.out,
-        trainer.scene,
-        trainer.shown,
-        trainer.near_plane,
-        trainer.render,
-        fit.metrics,
-        fit.settings,
+def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> None:
+    """Write the page of a fit into a folder that has its other files; `out` is where they belong."""
+    write_fit_page(
+        folder / PAGE,
+        request.title_of(out),
+        fit.scene,
+        fit.model,
+        fit.options.near_plane,
+        {"": fit.render},
+        {"": fit.metrics},
+        settings=read_json(folder / "config.json"),
+        report=fit.scene.root / CAMERAS_REPORT,
+        film=film_in(folder),
+        photos=request.photos,
+        roll=request.roll,
     )
-
-
-def _write_page_of(
-    path: Path,
-    out: Path,
-    scene: Scene,
-    model: GaussianModel,
-    near_plane: float,
-    render: Render,
-    metrics: Mapping[str, Any],
-    settings: Mapping[str, Any],
-) -> None:
-    """Write the page of the one fit that `out` is the folder of, as :func:`write_fit_page`."""
-    request = settings["request"]
-    title = request.get("title") or (out / request.get("scene", scene.root)).resolve().name
-    options: dict[str, Any] = {"report": scene.root / CAMERAS_REPORT, "film": film_in(path.parent)}
-    options |= {"settings": settings, "photos": request.get("photos", True), "roll": request.get("roll", 0.0)}
-    write_fit_page(path, title, scene, model, near_plane, {"": render}, {"": metrics}, **options)
-
-
-def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str, Any]) -> None:
-    """Write the page in the folder of a fit again, with other measures. A file that kgs did not write is kept."""
-    path = out / PAGE
-    if path.exists() and not is_own(path):
-        say(f"{path} was not written by kgs and is kept")
-        return
-
-    def render(camera: PinholeCamera) -> Tensor:
-        return saved.render(camera, scene.background)
-
-    settings = read_json(out / "config.json")
-    _write_page_of(path, out, saved.placed(scene), saved.model, saved.near_plane, render, metrics, settings)
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:

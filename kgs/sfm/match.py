@@ -12,7 +12,7 @@ import torch
 from kornia.feature import laf_from_center_scale_ori, match_adalam
 from torch import Tensor
 
-from kgs.io.console import Stage
+from kgs.progress import Stage
 
 from .keypoints import root_sift
 from .read import Photo

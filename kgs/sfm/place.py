@@ -10,7 +10,7 @@ from typing import Any
 
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.errors import DataError
-from kgs.io.ownership import is_own
+from kgs.io.ownership import holds_only_own, is_own
 from kgs.io.staging import Staging
 from kgs.json_files import read_json
 
@@ -19,7 +19,7 @@ REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
 
 def photo_staging(out: Path) -> Staging:
     """How photos and cameras get to their folder."""
-    return Staging(out, "-photos", replaced=(IMAGES, "sparse"))
+    return Staging(out, "photos")
 
 
 def check_place(out: Path, folder: Path) -> None:
@@ -30,20 +30,8 @@ def check_place(out: Path, folder: Path) -> None:
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
         raise DataError(out, "", f"holds the photos themselves: {advice}")
     for path in filter(os.path.lexists, replaced):
-        if not (_is_own_model(out) if path.name == "sparse" else _has_only_own_images(path)):
+        if not (is_own(path) or holds_only_own(path)):
             raise DataError(path, "", f"holds files of a scene that kgs did not write: {advice}")
-
-
-def _is_own_model(out: Path) -> bool:
-    files = [path for path in (out / "sparse").rglob("*") if path.is_file()]
-    return is_own(out / REPORT) and {path.suffix for path in files} <= {".bin"}
-
-
-def _has_only_own_images(folder: Path) -> bool:
-    """Whether kgs wrote all files of a folder; hidden files do not count."""
-    if not folder.is_dir() or folder.is_symlink():
-        return False
-    return is_own(folder) or all(is_own(path) for path in folder.iterdir() if path.name[0] != ".")
 
 
 def is_reusable(out: Path, inputs: dict[str, Any]) -> bool:

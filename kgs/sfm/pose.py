@@ -14,11 +14,12 @@ import cv2
 import torch
 
 from kgs.errors import DataError
-from kgs.io.console import Stage, say, silent
+from kgs.io.console import say
 from kgs.io.outputs import png_names
 from kgs.io.results_folder import locked
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
+from kgs.progress import Stage, silent
 
 from .aside import Aside, check_space
 from .find import find_photos

@@ -16,7 +16,7 @@ from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import ImageFile, turn
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
-from kgs.io.console import Stage
+from kgs.progress import Stage
 
 from .find import CONVERT, listed
 

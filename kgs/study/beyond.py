@@ -92,11 +92,11 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
     scene = _scene(cell["scene"], cell["views"], cell["downscale"], data)
     points = choose_points(scene, config)
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
-    trainer, metrics, stored = fit_and_measure(scene, config, points, lpips)
+    _, fit, stored = fit_and_measure(scene, config, points, lpips)
     targets = synthetic_targets(cell["scene"], scene) if cell["scene"] in WORLDS else {}
-    stored["beyond"] = {str(out): measure_target(trainer.render, target, lpips) for out, target in targets.items()}
-    stored |= {part: {name: metrics[part][name] for name in MEASURES} for part in ("test", "train")}
-    return stored | {"init": trainer.init, "protocol": metrics["protocol"]}
+    stored["beyond"] = {str(out): measure_target(fit.render, target, lpips) for out, target in targets.items()}
+    stored |= {part: {name: fit.metrics[part][name] for name in MEASURES} for part in ("test", "train")}
+    return stored | {"init": fit.history["init"], "protocol": fit.metrics["protocol"]}
 
 
 def synthetic_targets(kind: str, scene: Scene) -> dict[int, Target]:

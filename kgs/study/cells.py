@@ -15,10 +15,13 @@ from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.fit.config import CHOICES, PRESETS, FitConfig
+from kgs.fit.config import PRESETS, FitConfig
+from kgs.fit.fit import Fit
+from kgs.fit.measure import measure
+from kgs.fit.plan import make_plan
 from kgs.fit.probes import decide
 from kgs.fit.prune import prune
-from kgs.fit.run import choose_points, measure
+from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.machine import peak_rss_mb, revision
@@ -53,15 +56,15 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     settings, rival = _split(cell["fit"])
     config = fit_config(cell["start"], cell["seed"], settings)
     probed = replace(config, drop=PRESETS[preset].drop)  # methods that differ in dropping decide alike
-    trainer, metrics, result = fit_and_measure(scene, config, points, lpips, probed, rival)
+    trainer, fit, result = fit_and_measure(scene, config, points, lpips, probed, rival)
+    metrics = fit.metrics
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
-        result["pictures"] = _pictures(scene, trainer)
+        result["pictures"] = _pictures(fit)
     for part in ("test", "train"):
         result[part] = {name: metrics[part][name] for name in MEASURES}
     result["test_views"] = {view["name"]: view["psnr"] for view in metrics["test"]["views"]}
-    result["init"] = trainer.init | {"seconds": round(seconds, 2)}
-    near_plane = trainer.renderer.options.near_plane
-    result["coadaptation"] = coadaptation(trainer.model, scene.test, near_plane=near_plane)
+    result["init"] = fit.history["init"] | {"seconds": round(seconds, 2)}
+    result["coadaptation"] = coadaptation(trainer.model, scene.test, near_plane=fit.options.near_plane)
     result["thresholds"] = count_over_threshold(trainer, points.points)
     result["protocol"] = metrics["protocol"]
     if cell["start"] == FULL:
@@ -76,42 +79,41 @@ def fit_and_measure(
     lpips: Lpips | None = None,
     probed: FitConfig | None = None,
     rival: Rival | None = None,
-) -> tuple[Trainer, dict[str, Any], dict[str, Any]]:
-    """One fit, its metrics, and what every cell stores of it.
+) -> tuple[Trainer, Fit, dict[str, Any]]:
+    """One trainer, its fit with metrics, and what every cell stores of it.
 
     "cpu_seconds" are those of probes, training, curve and leaving out, "wall_seconds" those of the training alone.
     `probed`, or else `config`, is what probes decide for; `rival` replaces random dropping.
     """
     start = time.process_time()
-    decided, needs = decide(scene, probed or config, choose_points)
-    config = replace(config, **{name: getattr(decided, name) for name in CHOICES})
-    trainer = Trainer(scene, config, points, needs)
-    if rival is not None:
-        trainer = RivalTrainer(scene, config, points, needs, rival=rival)
-    trainer.fit()
-    prune(trainer)
+    decided = decide(scene, make_plan(scene, probed or config), choose_points)
+    plan = make_plan(scene, replace(config, sh_degree=decided.config.sh_degree))
+    plan = replace(plan, needs=decided.needs)
+    trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
+    fit = prune(trainer.fit())
     cpu_seconds = time.process_time() - start
-    metrics = measure(trainer, lpips)
+    fit = replace(fit, metrics=measure(fit, lpips))
     stored = {
         "cpu_seconds": round(cpu_seconds, 2),
-        "curve": trainer.curve,
-        "gaussians": len(trainer.shown),
-        "needs": trainer.needs,
-        "config": trainer.config.to_dict() | ({} if rival is None else asdict(rival)),
-        "seen": metrics["seen"],
-        "wall_seconds": round(trainer.seconds, 2),
+        "curve": fit.history["curve"],
+        "gaussians": len(fit.model),
+        "needs": fit.history["needs"],
+        "config": plan.config.to_dict() | ({} if rival is None else asdict(rival)),
+        "seen": fit.metrics["seen"],
+        "wall_seconds": fit.history["seconds"],
         "peak_rss_mb": peak_rss_mb(),
-        "versions": metrics["versions"],
+        "versions": fit.metrics["versions"],
         "revision": revision(Path(kgs.version.__file__).parent),
         "date": datetime.now(UTC).date().isoformat(),
     }
-    return trainer, metrics, stored
+    return trainer, fit, stored
 
 
-def _pictures(scene: Scene, trainer: Trainer) -> list[str]:
+def _pictures(fit: Fit) -> list[str]:
     """The first test view, its render and their difference, for the page; of other scenes none may be published."""
-    render = trainer.render(scene.test.camera(0))[0]
-    (picture,) = encoded([Picture(scene.test.names[0], scene.test.images[0], {"": render})], 2**20)
+    views = fit.scene.test
+    render = fit.render(views.camera(0))[0]
+    (picture,) = encoded([Picture(views.names[0], views.images[0], {"": render})], 2**20)
     return [picture["photo"], *picture["renders"][0][1:]]
 
 

@@ -59,7 +59,7 @@ def count_over_threshold(trainer: Trainer, initial_points: Tensor) -> dict[str, 
     final = torch.cdist(trainer.model.means.detach().cpu().double(), centers).amin(1)
     edges = torch.quantile(initial, torch.linspace(0, 1, BINS + 1, dtype=initial.dtype))
     bins = torch.bucketize(final, edges[1:-1])
-    over = trainer.densifier.mean_gradients.cpu() >= trainer.densifier.grad_threshold
+    over = trainer.state.densifier.mean_gradients.cpu() >= trainer.state.densifier.grad_threshold
     return {
         "distance": [round(float(edge / initial.median()), 4) for edge in edges],
         "gaussians": torch.bincount(bins, minlength=BINS).tolist(),

@@ -5,7 +5,7 @@ them. These are this project's readings, in both directions.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -14,11 +14,11 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
-from kgs.fit.config import FitConfig
-from kgs.fit.trainer import Start, Trainer
+from kgs.fit.plan import Plan
+from kgs.fit.targets import Target
+from kgs.fit.trainer import Trainer
 from kgs.geometry import camera_centers
 from kgs.init_points import InitialPoints
-from kgs.losses import TargetMoments
 from kgs.types import Gaussians, Rendering
 
 
@@ -41,40 +41,30 @@ class Rival:
 class RivalTrainer(Trainer):
     """A `Trainer` that drops selected Gaussians or penalises opacities, as `rival` says."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        config: FitConfig,
-        points: InitialPoints | Start,
-        needs: dict[str, Any] | None = None,
-        *,
-        rival: Rival,
-    ) -> None:
+    def __init__(self, scene: Scene, plan: Plan, points: InitialPoints, rival: Rival) -> None:
+        super().__init__(scene, plan, points)
         self.rival = rival
-        super().__init__(scene, config, points, needs)
-
-    def _build(self, start: Start) -> None:
-        """As in `Trainer`, with a layer that drops by scores where it has some."""
-        super()._build(start)
         self._penalty: Tensor | None = None
-        if self.drop is not None:
-            self.drop = SelectiveDrop(self.config.drop, self.config.drop_schedule, seed=self.drop.seed)
-            self.renderer.opacity_layer = self.drop
+        drop = self.state.drop
+        if drop is not None:
+            self.state.drop = SelectiveDrop(drop.p, drop.schedule, seed=drop.seed)
+            self.renderer.opacity_layer = self.state.drop
 
     def render_view(self, gaussians: Gaussians, camera: PinholeCamera, background: Tensor | None) -> Rendering:
         """Render with the scores of this camera; the penalty of its Gaussians is kept for the loss."""
         rival = self.rival
-        if isinstance(self.drop, SelectiveDrop) and rival.drop_by != "random":
-            self.drop.scores = gaussian_scores(rival.drop_by, self.densifier, camera)
+        densifier = self.state.densifier
+        if isinstance(self.state.drop, SelectiveDrop) and rival.drop_by != "random":
+            self.state.drop.scores = gaussian_scores(rival.drop_by, densifier, camera)
         if rival.opacity_l1:
             by = "low-gradient" if rival.opacity_l1_by == "gradient" else "far"
-            scores = gaussian_scores(by, self.densifier, camera)
+            scores = gaussian_scores(by, densifier, camera)
             self._penalty = rival.opacity_l1 * opacity_l1(gaussians.opacities, scores)
         return super().render_view(gaussians, camera, background)
 
-    def loss_of(self, image: Tensor, target: Tensor, moments: TargetMoments) -> Tensor:
+    def loss_of(self, image: Tensor, view: Target) -> Tensor:
         """The loss of the render and, where the rival has it, the weighted L1 norm of the opacities."""
-        loss = super().loss_of(image, target, moments)
+        loss = super().loss_of(image, view)
         return loss if self._penalty is None else loss + self._penalty
 
 

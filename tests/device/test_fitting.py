@@ -9,6 +9,7 @@ from factories import drop_layer, random_opacities
 import kgs
 from kgs.cli import main
 from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.losses import photometric_loss, target_moments
 
@@ -21,7 +22,7 @@ def config(device):
 
 
 def fitted(scene, points, config, steps=None):
-    trainer = Trainer(scene, config, points)
+    trainer = Trainer(scene, make_plan(scene, config), points)
     trainer.fit(lambda trainer, _: trainer.step == steps)
     return trainer
 
@@ -58,7 +59,7 @@ def test_a_fit_learns_grows_and_repeats_bit_for_bit(device, scene, points, confi
     first, second = fitted(scene, points, config), fitted(scene, points, config)
     assert first.model.means.device.type == device.type
     assert len(first.model) > len(points.points)
-    assert first.curve[-1]["train_psnr"] > Trainer(scene, config, points).psnr(scene.train) + 1
+    assert first.state.curve[-1]["train_psnr"] > Trainer(scene, make_plan(scene, config), points).psnr(scene.train) + 1
     assert all(torch.equal(value, bits(second)[name]) for name, value in bits(first).items())
 
 

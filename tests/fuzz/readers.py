@@ -33,10 +33,11 @@ from tiny_scenes import (
 )
 from torch import Tensor
 
+from kgs.app.saved_fit import read_settings
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
 from kgs.datasets.image_file import read_image
 from kgs.fit.config import FitConfig, timetable
-from kgs.fit.saved import read_settings
+from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.init_points.files import read_points
@@ -119,7 +120,9 @@ def _scene() -> Scene:
 
 def _write_checkpoint(folder: Path) -> None:
     points = torch.rand(_POINTS, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 4.0])
-    trainer = Trainer(_scene(), _CONFIG, InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random"))
+    trainer = Trainer(
+        _scene(), make_plan(_scene(), _CONFIG), InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random")
+    )
     trainer.fit(lambda trainer, _: trainer.step == 2)
     trainer.save(folder / "checkpoint.safetensors")
 
@@ -128,7 +131,7 @@ def _read_checkpoint(folder: Path) -> None:
     trainer = Trainer.resume(_scene(), _CONFIG, folder / "checkpoint.safetensors")
     for name, value in trainer.model.state_dict().items():
         check_range(name, value, -3.5e38, 3.5e38)
-    for parameter, state in trainer.optimizer.state.items():
+    for parameter, state in trainer.state.optimizer.state.items():
         for name, value in state.items():
             check_range(name, value.expand(parameter.shape), -3.5e38, 3.5e38)
 

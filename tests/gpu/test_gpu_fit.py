@@ -14,6 +14,7 @@ from kgs.backends.agreement import BOUND, disagreement
 from kgs.backends.gpu import compositing, loss, projection
 from kgs.datasets import synthetic_scene
 from kgs.fit import FitConfig, Trainer
+from kgs.fit.plan import make_plan
 from kgs.init_points import InitialPoints
 
 CPU = torch.device("cpu")
@@ -52,7 +53,7 @@ def few(points):
 
 
 def trainer(scene, points, backend, **options):
-    return Trainer(scene, FitConfig(steps=50, sh_degree=1, backend=backend, **options), points)
+    return Trainer(scene, make_plan(scene, FitConfig(steps=50, sh_degree=1, backend=backend, **options)), points)
 
 
 def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
@@ -108,7 +109,7 @@ def test_a_resumed_fit_on_another_kind_of_device_draws_anew_and_says_so(scene, f
     state |= {"drop": state["drop"][:16], "colors": state["colors"][:16]}  # what a generator of a GPU has
     other = trainer(scene, few, "torch")
     other.load_state_dict(state)
-    assert other.notes == [
+    assert other.state.notes == [
         "the checkpoint is of another kind of device: dropping and backgrounds start new random sequences"
     ]
     assert other.train_step() > 0

@@ -183,7 +183,13 @@ def fit(scene: Any, backend: str) -> dict[str, Tensor]:
     """The Gaussians after 60 steps with dropping, densification and harmonics, and the losses on the way."""
     points = initial_points(scene.train, "random", count=1500, seed=0)
     config = FitConfig(steps=60, sh_degree=1, seed=3, backend=backend, evaluations=1)
-    trainer = Trainer(scene, config, points)
+    try:
+        from kgs.fit import make_plan
+    except ImportError:
+        plan = config
+    else:
+        plan = make_plan(scene, config)
+    trainer = Trainer(scene, plan, points)
     losses = [trainer.train_step() for _ in range(config.steps)]
     return {"losses": torch.tensor(losses)} | {k: v.detach().clone() for k, v in trainer.model.named_parameters()}
 

@@ -1,0 +1,27 @@
+"""Writes a fit for other programs, besides its PLY file: cameras, glTF, a film."""
+
+from pathlib import Path
+
+from kgs.fit.fit import Fit
+from kgs.geometry import typical_depths
+from kgs.io.cameras import camera_list, rolled, upright
+from kgs.io.console import each
+from kgs.io.encoders import film_suffix
+from kgs.io.film import write_film
+from kgs.io.glb import save_glb
+from kgs.json_files import write_json
+
+
+def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
+    """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none, or no MP4.
+
+    `roll` turns the pictures of the film, and with them what is up in the glTF file, see :func:`kgs.io.cameras.rolled`.
+    """
+    scene = fit.scene
+    upright_views = rolled(scene.train, roll)
+    write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset, fit.model.means))
+    save_glb(folder / "splat.glb", fit.model, upright(upright_views.cameras.extrinsics), scene.offset)
+    depth = typical_depths(fit.model.means, scene.train.cameras)[1]
+    suffix, note = film_suffix()
+    why = write_film(folder / f"turntable{suffix}", fit.render, upright_views, depth, each)
+    return [line for line in (why, note) if line]

@@ -1,0 +1,276 @@
+"""What `kgs fit` does, in its order: scene, initial points, probes, training, files, page; then all is published."""
+
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError, printable
+from kgs.fit.checkpoint import previous
+from kgs.fit.config import FitConfig
+from kgs.fit.fit import Fit
+from kgs.fit.measure import measure
+from kgs.fit.plan import expected_memory, make_plan, most_gaussians
+from kgs.fit.probes import decide
+from kgs.fit.prune import prune
+from kgs.fit.run import choose_points
+from kgs.fit.trainer import Trainer
+from kgs.io.console import each, progress, say
+from kgs.io.figures import write_curve
+from kgs.io.outputs import check_folder, png_names, write_png
+from kgs.io.ownership import is_own
+from kgs.io.ply import save_ply
+from kgs.io.results_folder import CHECKPOINT, is_finished, locked, replaced_files
+from kgs.io.staging import Staging
+from kgs.json_files import write_json
+from kgs.machine import check_packages
+from kgs.metrics.lpips import Lpips
+from kgs.page.fit_page import write_own_page
+
+from .files.exports import write_exports
+from .scene_request import SceneRequest
+from .stages import Stages
+
+_SAVE_SECONDS = 60.0
+
+
+class Published(NamedTuple):
+    """The end of `kgs fit`."""
+
+    fit: Fit
+    signal: int  # that ended the training, or 0
+    folder: Path  # where the results are: beside those of a finished fit, if a signal ended this one
+
+
+def fit_folder(
+    scene: Scene,
+    config: FitConfig,
+    out: str | PathLike[str],
+    request: SceneRequest,
+    *,
+    resume: bool = False,
+    lpips: Lpips | None = None,
+    say: Callable[[str], None] = say,
+    stages: Stages | None = None,
+) -> Published:
+    """Fit a scene and write all results of `kgs fit`: splat, film, page, metrics, test images and checkpoints.
+
+    New results are collected in `out/unfinished`, and replace those of a former fit only when all are there. A fit that
+    a signal stopped writes its results too, but does not replace those of a finished fit.
+
+    Args:
+        scene: posed training and test views.
+        config: the settings of the fit.
+        out: the folder for the results, created if it does not exist.
+        request: how the scene was loaded, for config.json, and how the page shows it.
+        resume: continue from the folder's checkpoint, if there is one.
+        lpips: the perceptual metric, or None to leave it out.
+        say: called with each line for the user.
+        stages: names the stages as they begin.
+
+    Raises:
+        DataError: the checkpoint is damaged or belongs to another fit, images are too small, another fit is at work in
+            `out`, or `out` cannot be written to or holds files that kgs did not write and would overwrite.
+        TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
+        OSError: a result cannot be written.
+        ValueError: the device cannot be used, or the backend does not run on it.
+        ModuleNotFoundError: the backend is numba or triton, which is not installed; or a package of the extra `app` is
+            missing.
+    """
+    out = Path(out)
+    stages = Stages(say) if stages is None else stages
+    check_packages("jinja2", "matplotlib")  # even what is used only after training
+    _check_size(scene, config, lpips)
+    names = png_names([*scene.train.names, *scene.test.names])
+    _check_out(out, scene, names)
+    with locked(out):
+        staging = Staging(out)
+        staging.complete()
+        trainer, source = _trainer(scene, config, out, resume, say, stages)
+        notes = _Notes(trainer, say)
+        new = staging.unfinished
+        is_trained = False
+        try:
+            if source != new:
+                staging.start()
+                trainer.save(new / CHECKPOINT)  # initial points can take a minute
+            write_json(new / "config.json", _settings(trainer, request))
+            stages.begin("fit")
+            fit, stopped_by = train(trainer, new / CHECKPOINT)
+            is_trained = True
+            stages.begin("film")
+            fit = _write_results(fit, new, names, request, lpips)
+            for note in fit.notes:
+                trainer.state.note(note)
+            stages.begin("page")
+            write_own_page(new, out, fit, request)
+            if not trainer.is_saved:  # results and checkpoint belong together
+                trainer.save(new / CHECKPOINT, fit.part)
+        except BaseException:
+            if is_trained:
+                notes.say_new()
+                say(f"{printable(new)}: holds the results that could be written")
+            elif not trainer.saved:
+                shutil.rmtree(new, ignore_errors=True)
+            raise
+        folder = out
+        if stopped_by and is_finished(out):
+            folder = new
+            kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
+            trainer.state.note(f"{kept}, where a resumed fit goes on")
+        else:
+            staging.seal()
+            staging.complete()
+        notes.say_new()
+    return Published(fit, stopped_by, folder)
+
+
+def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
+    """A DataError where images are too small for the measures."""
+    smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
+    for views in (scene.train, scene.test):
+        height, width = views.images.shape[-2:]
+        if min(height, width) < smallest:
+            reason = f"expected at least {smallest}x{smallest} pixels, got {width}x{height}"
+            raise DataError(scene.root, "images", reason)
+
+
+def _check_out(out: Path, scene: Scene, names: dict[str, str]) -> None:
+    """Make the folder; a DataError where it cannot be written to, or a user's file is in the way."""
+    files = [*replaced_files(out), *(f"test/{names[view]}" for view in scene.test.names)]
+    try:
+        check_folder(out, files, scene.root)
+    except OSError as error:
+        raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
+
+
+def _trainer(
+    scene: Scene, config: FitConfig, out: Path, resume: bool, say: Callable[[str], None], stages: Stages
+) -> tuple[Trainer, Path]:
+    """A trainer that begins, or one that continues; and the folder of its checkpoint, `out` for one that begins."""
+    if resume:
+        for folder in (Staging(out).unfinished, out):
+            path = folder / CHECKPOINT
+            if any(file.exists() for file in (path, previous(path))):
+                trainer = Trainer.resume(scene, config, path)
+                say(f"resumed at step {trainer.step}")
+                return trainer, folder
+        say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
+    if is_own(out / "splat.ply"):
+        say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
+    plan = make_plan(scene, config)
+    stages.begin("initial points")
+    points = choose_points(scene, config, each)
+    say(f"initial points: {len(points.points)} ({points.kind})")
+    memory = expected_memory(scene, most_gaussians(plan.config, len(points.points)))
+    say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
+    return Trainer(scene, decide(scene, plan, choose_points, each), points), out
+
+
+class _Notes:
+    """Says the notes of a trainer, each once."""
+
+    def __init__(self, trainer: Trainer, say: Callable[[str], None]) -> None:
+        self._trainer = trainer
+        self._say = say
+        self._count = 0
+        self.say_new()
+
+    def say_new(self) -> None:
+        """Say the notes that are new."""
+        for note in self._trainer.state.notes[self._count :]:
+            self._say(note)
+        self._count = len(self._trainer.state.notes)
+
+
+def _settings(trainer: Trainer, request: SceneRequest) -> dict[str, Any]:
+    """The content of config.json."""
+    return {
+        "request": request.to_dict(),
+        "fit": trainer.plan.config.to_dict(),
+        "timetable": trainer.plan.times._asdict(),
+        "max_gaussians": trainer.state.densifier.max_gaussians,
+        "near_plane": trainer.state.start.near_plane,
+        "extent": trainer.state.start.extent,
+    }
+
+
+def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: SceneRequest, lpips: Lpips | None) -> Fit:
+    """Write all files but the page; returns the fit with its metrics."""
+    scene = fit.scene
+    save_ply(folder / "splat.ply", fit.model, offset=scene.offset)
+    write_curve(folder / "curve.png", {"": fit.history["curve"]})
+    notes = write_exports(fit, folder, request.roll)
+    (folder / "test").mkdir(exist_ok=True)
+    for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
+        render = fit.render(scene.test.camera(i))[0]
+        write_png(folder / "test" / names[name], scene.test.as_photo(render))
+    metrics = measure(fit, lpips)
+    write_json(folder / "metrics.json", metrics)
+    return replace(fit, metrics=metrics, notes=(*fit.notes, *notes))
+
+
+def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> tuple[Fit, int]:
+    """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
+
+    SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit and the number of that
+    signal, or 0. If a checkpoint cannot be written (a full disk), a note says so, and training goes on.
+    """
+    saved = time.monotonic()
+    times = trainer.plan.times
+
+    def save(part: dict[str, Any] | None = None) -> None:
+        nonlocal saved
+        saved = time.monotonic()
+        if checkpoint is not None:
+            try:
+                trainer.save(checkpoint, part)
+            except OSError as error:
+                trainer.state.note(f"step {trainer.step}: no checkpoint: {error}")
+
+    with _interruptible() as stopped, progress(times.steps, title, trainer.step) as advance:
+
+        def after_step(trainer: Trainer, loss: float) -> bool:
+            advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")
+            if trainer.step in times.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
+                save()
+            return bool(stopped)
+
+        fit = prune(trainer.fit(after_step))
+        save(fit.part)
+    return fit, stopped[0] if stopped else 0
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Record SIGINT, SIGTERM and SIGHUP in the list that is yielded; a second one acts as usual.
+
+    Ignored signals (nohup) stay ignored, and only the main thread can handle any.
+    """
+    received: list[int] = []
+    usual: dict[int, Any] = {}  # the handlers that are replaced
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            handler = None if number is None else signal.getsignal(number)
+            if number is not None and handler not in (None, signal.SIG_IGN):
+                usual[number] = handler
+
+    def record(number: int, _: object) -> None:
+        received.append(number)
+        signal.signal(number, usual[number])
+
+    for number in usual:
+        signal.signal(number, record)
+    try:
+        yield received
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)

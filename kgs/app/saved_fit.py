@@ -1,0 +1,95 @@
+"""Reads a fit from its folder: its settings, its scene, and its Gaussians."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError
+from kgs.fit.checkpoint import newest_checkpoint
+from kgs.fit.config import FitConfig
+from kgs.fit.fit import Fit
+from kgs.fit.poses import place_cameras
+from kgs.fit.state import check_plain
+from kgs.io.results_folder import CHECKPOINT, complete_stopped_move
+from kgs.json_files import read_json
+from kgs.model import GaussianModel
+from kgs.types import RasterOptions
+
+from .scene_request import SceneRequest
+
+
+def read_settings(path: Path) -> tuple[SceneRequest, FitConfig]:
+    """The scene and the configuration in a fit's config.json; a DataError where it is wrong."""
+    settings = read_json(path)
+    for name in ("request", "fit"):
+        if not isinstance(settings.get(name), dict):
+            raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
+    request = SceneRequest.from_dict(settings["request"], path)
+    try:
+        return request, FitConfig.from_dict(settings["fit"])
+    except ValueError as error:
+        raise DataError(path, "fit", str(error)) from error
+
+
+def load_fit(
+    out: Path,
+    device: torch.device | str = "cpu",
+    backend: str = "auto",
+    say: Callable[[str], None] | None = None,
+) -> tuple[SceneRequest, Fit]:
+    """Read a fit from its folder, and load its scene.
+
+    Args:
+        out: the folder of the results.
+        device: for the Gaussians.
+        backend: of the renderer; "auto": that of the fit, on a GPU the fastest.
+        say: gets the notes of the loader.
+
+    Raises:
+        DataError: config.json, the checkpoint or the scene is missing, damaged, or does not fit the others.
+    """
+    complete_stopped_move(out)
+    request, settings = read_settings(out / "config.json")
+    path = out / CHECKPOINT
+    values, _ = newest_checkpoint(path)
+    model = _read_model(path, values).to(device)
+    if backend == "auto" and model.means.device.type == "cpu":
+        backend = values["backend"]
+    scene = _place(request.load(out, say), path, values)
+    options = RasterOptions(near_plane=float(values["near_plane"]), max_bytes=settings.max_bytes)
+    return request, Fit(scene, model, options, backend, settings, metrics=read_json(out / "metrics.json"))
+
+
+def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:
+    """The Gaussians that a checkpoint shows."""
+    try:
+        check_plain(values, "backend", "near_plane", "step")
+    except KeyError as error:
+        raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint, got none") from error
+    except ValueError as error:
+        field, _, reason = str(error).partition(": ")
+        raise DataError(path, field, reason) from error
+    try:
+        model = GaussianModel(**values["model"])
+        part = values.get("shown")
+        return model.select(**part) if part else model
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error
+
+
+def _place(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
+    """The scene, with the training cameras where the fit left them."""
+    poses = values.get("poses")
+    if poses is None:
+        return scene
+    extrinsics = poses.get("extrinsics") if isinstance(poses, dict) else None
+    if not (isinstance(extrinsics, Tensor) and extrinsics.shape[1:] == (4, 4)):
+        raise DataError(path, "poses", "expected extrinsics (V, 4, 4), got others")
+    if len(extrinsics) != len(scene.train):
+        reason = f"has {len(scene.train)} training views, but the fit has poses of {len(extrinsics)}: fit again"
+        raise DataError(scene.root, "train", reason)
+    return place_cameras(scene, extrinsics)

@@ -1,0 +1,89 @@
+"""What a command needs to load the scene of a fit again."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+from kgs.datasets.load import load_scene
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError
+from kgs.json_files import is_number
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """The arguments of `load_scene`, and how the page and the film show the scene.
+
+    Args:
+        scene: the folder of the scene; "." is the folder of the results itself.
+        train_views: training views; None: all that are not held out.
+        downscale: factor by which the photos are reduced, at least 1, or None.
+        hold_out: every Nth photo is for testing; 0: none; None: what the scene's files say.
+        background: "black" or "white".
+        points: "none", or "model-points".
+        photos: whether the page shows photos.
+        roll: degrees by which page and film are turned clockwise.
+        title: of the page; "": the name of the folder.
+    """
+
+    scene: str
+    train_views: int | None = None
+    downscale: float | None = None
+    hold_out: int | None = None
+    background: str = "black"
+    points: str = "none"
+    photos: bool = True
+    roll: float = 0.0
+    title: str = ""
+
+    def load(self, base: Path, say: Callable[[str], None] | None = None) -> Scene:
+        """Load the scene; `base` is the folder that a relative path starts from, `say` gets the loader's notes."""
+        scene = load_scene(
+            base / self.scene,
+            self.train_views,
+            self.downscale,
+            hold_out=self.hold_out,
+            background=self.background,
+            points=self.points,
+        )
+        if say is not None:
+            for note in scene.notes:
+                say(note)
+        return scene
+
+    def title_of(self, base: Path) -> str:
+        """The title of the page."""
+        return self.title or (base / self.scene).resolve().name
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for config.json."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], path: Path) -> Self:
+        """The inverse of :meth:`to_dict`; a DataError about the file at `path` where an entry is wrong."""
+        names = {entry.name for entry in fields(cls)}
+        request = cls(**{"scene": "", **{name: value for name, value in values.items() if name in names}})
+        for name, (expected, is_right) in _EXPECTED.items():
+            value = getattr(request, name)
+            if not is_right(value):
+                got = f"{value!r}"[:60] if name in values else "none"
+                raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
+        return replace(request, roll=float(request.roll))
+
+
+_EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "scene": ("a path", lambda v: isinstance(v, str) and v != "" and "\0" not in v),
+    "train_views": ("a whole number above 0 or null", lambda v: v is None or is_number(v, 1, whole=True)),
+    "downscale": ("a number of at least 1 or null", lambda v: v is None or is_number(v, 1)),
+    "hold_out": (
+        "0, a whole number above 1 or null",
+        lambda v: v is None or (is_number(v, 0, whole=True) and v != 1),
+    ),
+    "background": ("one of ['black', 'white']", lambda v: v in ("black", "white")),
+    "points": ("one of ['none', 'model-points']", lambda v: v in ("none", "model-points")),
+    "photos": ("true or false", lambda v: isinstance(v, bool)),
+    "roll": ("a number", lambda v: is_number(v)),
+    "title": ("a text", lambda v: isinstance(v, str)),
+}

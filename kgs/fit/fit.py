@@ -1,0 +1,76 @@
+"""A fit that is done, or as far as it is: a splat with what is needed to render, measure and show it."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.camera import move_camera
+from kgs.datasets.scene import Scene, Views
+from kgs.metrics.evaluate import mean_psnr
+from kgs.model import GaussianModel
+from kgs.renderer import GaussianRenderer
+from kgs.types import RasterOptions
+
+from .config import FitConfig
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A splat of a scene, and how it came about.
+
+    Args:
+        scene: with the training cameras where the fit left them.
+        model: the Gaussians, in the frame of the scene.
+        options: of the renderer.
+        backend: of the renderer.
+        settings: of the fit; None for a splat that is not one of kgs.
+        history: plain values for metrics.json: "steps", "seconds", "curve", "init", "needs", "poses".
+        metrics: the content of metrics.json, once it is measured.
+        notes: lines that a user should read.
+        part: which of the trained Gaussians `model` has, after pruning: "rows", bool, and "sh_degree".
+    """
+
+    scene: Scene
+    model: GaussianModel
+    options: RasterOptions
+    backend: str = "auto"
+    settings: FitConfig | None = None
+    history: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    part: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the Gaussians."""
+        return self.model.means.device
+
+    @cached_property
+    def _renderer(self) -> GaussianRenderer:
+        return GaussianRenderer(options=self.options, backend=self.backend).eval()
+
+    @cached_property
+    def _background(self) -> Tensor | None:
+        background = self.scene.background
+        return background.to(self.device, torch.float32) if background.any() else None
+
+    @torch.no_grad()
+    def render(self, camera: PinholeCamera) -> Tensor:
+        """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`."""
+        image: Tensor = self._renderer(self.model(), move_camera(camera, self.device), self._background).image
+        return image
+
+    @torch.no_grad()
+    def median_depth(self, camera: PinholeCamera) -> Tensor:
+        """The median depth of the Gaussians from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
+        rendering = self._renderer(self.model(), move_camera(camera, self.device), outputs=("median_depth",))
+        depth: Tensor = rendering.median_depth[0, 0].cpu()
+        return depth
+
+    def psnr(self, views: Views) -> float | None:
+        """Mean PSNR of clamped renders over some views, in dB; None without views, or if one PSNR is infinite."""
+        return mean_psnr(self.render, views)

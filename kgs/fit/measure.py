@@ -1,0 +1,54 @@
+"""Measures a fit: the content of metrics.json."""
+
+from typing import Any
+
+from kgs.machine import peak_rss_mb, versions
+from kgs.metrics.coverage import measure_coverage
+from kgs.metrics.evaluate import evaluate
+from kgs.metrics.lpips import Lpips
+
+from .fit import Fit
+
+_INIT_NOTES = {
+    "model-points": "points seen in training views, but their positions were refined with test views",
+    "scene": "initial points that come with the layout",
+    "file": "initial points of a file",
+}
+_CONVENTIONS = {
+    "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
+    "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
+    "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
+    "test_views_used_for": "metrics and the curve only; no early stopping",
+}
+
+
+def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
+    """The content of metrics.json for one fit of kgs; None stands for what was not measured."""
+    scene = fit.scene
+    config = fit.settings
+    if config is None:
+        raise ValueError("fit: expected a fit of kgs, which has settings, got a splat alone")
+    init_note = _INIT_NOTES.get(config.init, "initial points from training views alone")
+    poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
+    if fit.history["poses"] is not None:
+        poses += ", those of the training views refined by the fit"
+    return {
+        "test": evaluate(fit.render, scene.test, lpips) if len(scene.test) else None,
+        "train": evaluate(fit.render, scene.train, lpips),
+        "seen": measure_coverage(scene, fit.render, fit.median_depth),
+        **fit.history,
+        "peak_rss_mb": peak_rss_mb() or None,
+        "gaussians": len(fit.model),
+        "seed": config.seed,
+        "drop": config.drop,
+        "backend": fit.backend,
+        "protocol": {
+            "train": list(scene.train.names),
+            "test": list(scene.test.names),
+            "image_size": list(scene.train.images.shape[-2:]),
+            "background": scene.background.tolist(),
+            "init": f"{config.init}: {init_note}; {poses}",
+            **_CONVENTIONS,
+        },
+        "versions": versions(),
+    }

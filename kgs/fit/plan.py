@@ -1,0 +1,130 @@
+"""What is settled before a fit begins: its settings, its device and backend, and the steps at which things happen."""
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, NamedTuple, Self
+
+import torch
+
+from kgs.backends import resolve
+from kgs.datasets.scene import Scene
+from kgs.machine import check_device
+
+from .config import FitConfig
+
+
+class Timetable(NamedTuple):
+    """The steps at which things happen in a fit of a given length."""
+
+    steps: int  # all of them
+    sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
+    densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
+    reset: tuple[int, ...]  # after these all opacities are lowered
+    evaluate: tuple[int, ...]  # after these the curve is measured (before a densification)
+    drop: int  # up to this one Gaussians are dropped
+    coarse: int  # up to this one the training views are seen at half their width
+
+
+class Pace(NamedTuple):
+    """The length of a fit, and how fast opacities fade: with more views, what only some show is seen less often."""
+
+    steps: int
+    opacity_decay: float
+
+
+FEW_VIEWS = 3
+FEW = Pace(1000, 0.9925)  # of a fit to so few training views
+MANY = Pace(1500, 0.995)  # of a fit to more
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is settled before a fit begins; :func:`make_plan` makes it.
+
+    Args:
+        config: the settings, with numbers for the scene where they were left open. A `sh_degree` of None counts as 0;
+            :func:`kgs.fit.probes.decide` replaces it.
+        device: of the fit.
+        backend: "numba", "triton" or "torch".
+        times: the steps at which things happen.
+        needs: what was decided about the scene, and why, for metrics.json.
+    """
+
+    config: FitConfig
+    device: torch.device
+    backend: str
+    times: Timetable
+    needs: dict[str, Any] = field(default_factory=dict)
+
+    def with_degree(self, sh_degree: int, why: dict[str, Any]) -> Self:
+        """The plan with harmonics of this degree; `why` goes into `needs`."""
+        config = replace(self.config, sh_degree=sh_degree)
+        return replace(self, config=config, times=timetable(config), needs={**self.needs, "sh_degree": why})
+
+
+def make_plan(scene: Scene, config: FitConfig) -> Plan:
+    """Settle what the configuration leaves open, but for the degree of the harmonics.
+
+    Args:
+        scene: the scene to fit.
+        config: the settings as they were asked for.
+
+    Raises:
+        ValueError: the device cannot be used, or the backend does not run on it.
+        ModuleNotFoundError: the backend is numba or triton, and it is not installed.
+    """
+    device = check_device(config.device)
+    backend = resolve(config.backend, device)
+    config = with_pace(config, len(scene.train))
+    return Plan(config, device, backend, timetable(config))
+
+
+def with_pace(config: FitConfig, views: int) -> FitConfig:
+    """The configuration with the numbers for so many training views, where it leaves them open."""
+    few = views <= FEW_VIEWS
+    steps = config.steps or (FEW if few else MANY).steps
+    recipe = config.recipe
+    if recipe.opacity_decay is None:
+        pace = FEW if few and steps <= FEW.steps else MANY
+        recipe = replace(recipe, opacity_decay=pace.opacity_decay)
+    return replace(config, steps=steps, recipe=recipe)
+
+
+def timetable(config: FitConfig) -> Timetable:
+    """Scale the recipe's counts by steps / 10 000.
+
+    A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
+    10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.
+    A `steps` of None counts as that of a fit to more than three views.
+    """
+    recipe = config.recipe
+    steps = config.steps or MANY.steps
+    scale = steps / recipe.steps
+    interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
+    spacing = max(1, round(recipe.reset_interval * scale)) if recipe.reset_interval else steps
+    resets = [*range(spacing, steps, spacing), steps]
+    evaluations = range(1, config.evaluations + 1)
+    return Timetable(
+        steps=steps,
+        sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
+        densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
+        reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
+        evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
+        drop=steps - min(config.undropped_steps, round(0.1 * steps)),
+        coarse=round(config.coarse * steps),
+    )
+
+
+def most_gaussians(config: FitConfig, points: int) -> int:
+    """The number of Gaussians at which densification stops, in a fit from `points` initial points."""
+    return config.max_gaussians or max(10 * (config.steps or MANY.steps), 3 * points // 2)
+
+
+# Bytes, fitted to runs of docs/measured.md: of the program, for each Gaussian, for each pixel of all training views.
+_MEMORY = (930 * 2.0**20, 1000.0, 115.0)
+
+
+def expected_memory(scene: Scene, gaussians: int) -> float:
+    """Bytes of the process at the peak of a fit with so many Gaussians."""
+    of_program, of_gaussian, of_pixel = _MEMORY
+    return of_program + of_gaussian * gaussians + of_pixel * scene.train.images[:, 0].numel()

@@ -1,0 +1,303 @@
+"""The state of a training: one value, which is saved and loaded whole."""
+
+import copy
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from kgs.datasets.scene import Scene, Views
+from kgs.densify import Densifier
+from kgs.drop import DropGaussian
+from kgs.geometry import camera_extent, typical_depths
+from kgs.init_points import InitialPoints
+from kgs.json_files import is_number
+from kgs.model import PARAMETERS, GaussianModel
+
+from .config import FitConfig
+from .moments import load_moments, moments_of
+from .plan import Plan, most_gaussians
+from .poses import MovingPoses
+
+# for each parameter the name of its learning rate in the recipe, without `lr_`
+_LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a training starts from, and what stays the same throughout.
+
+    Args:
+        init: kind and number of the initial points.
+        extent: of the camera rig, in world units; the learning rate of the centres is proportional to it.
+        near_plane: of the renderer, in world units.
+        depth: the median depth of the initial points, in world units.
+    """
+
+    init: dict[str, Any]
+    extent: float
+    near_plane: float
+    depth: float
+
+
+@dataclass
+class TrainState:
+    """Everything that the rest of a fit depends on, besides its scene and its plan.
+
+    Args:
+        start: what the training started from.
+        model: the Gaussians.
+        optimizer: Adam, with a group for each parameter of the model.
+        densifier: with the statistics since the last densification, and the random stream of splits.
+        drop: the layer on the opacities, with its random stream; None without dropping.
+        order: the random stream of the order of views.
+        colors: the random stream of backgrounds.
+        poses: the poses of the training cameras if the fit refines them, else None.
+        step: the steps that are done.
+        seconds: the time that they took, evaluations not counted.
+        stack: views that are still to come before `order` shuffles all again.
+        curve: dicts of step, seconds, test_psnr and train_psnr.
+        notes: lines that a user should read (a capped count, for instance).
+    """
+
+    start: Start
+    model: GaussianModel
+    optimizer: torch.optim.Adam
+    densifier: Densifier
+    drop: DropGaussian | None
+    order: torch.Generator
+    colors: torch.Generator
+    poses: MovingPoses | None
+    step: int = 0
+    seconds: float = 0.0
+    stack: list[int] = field(default_factory=list)
+    curve: list[dict[str, float | None]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @classmethod
+    def begin(cls, scene: Scene, plan: Plan, points: InitialPoints) -> Self:
+        """The state before the first step, with Gaussians at the initial points."""
+        nearest, median = typical_depths(points.points, scene.train.cameras)
+        model = GaussianModel.from_points(points.points.float(), points.colors.float(), plan.config.sh_degree or 0)
+        model.sh_degree = 0
+        start = Start(
+            init={"kind": points.kind, "points": len(points.points)},
+            extent=max(camera_extent(scene.train.cameras.extrinsics), 0.01 * median),  # a single camera has extent 0
+            near_plane=plan.config.recipe.near_plane * nearest,
+            depth=median,
+        )
+        return cls._assemble(scene, plan, model, start)
+
+    @classmethod
+    def _assemble(cls, scene: Scene, plan: Plan, model: GaussianModel, start: Start) -> Self:
+        """The parts that refer to the model, and fresh random streams."""
+        config = plan.config
+        recipe = config.recipe
+        seed = 10 * config.seed
+        model = model.to(plan.device)
+        groups = [
+            {"params": [model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
+            for name, rate in _LEARNING_RATES.items()
+        ]
+        optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
+        drop = None
+        if config.drop:
+            drop = DropGaussian(config.drop, config.drop_schedule, seed=seed + 1, device=plan.device)
+        densifier = Densifier(
+            model,
+            optimizer,
+            start.extent,
+            grad_threshold=recipe.grad_threshold,
+            absgrad=recipe.absgrad,
+            percent_dense=recipe.percent_dense,
+            prune_opacity=recipe.prune_opacity,
+            max_gaussians=most_gaussians(config, start.init["points"]),
+            generator=torch.Generator().manual_seed(seed + 2),
+        )
+        poses = None
+        if config.refine_poses:
+            poses = MovingPoses(scene.train.cameras.extrinsics, plan.times.steps, start.depth)
+        return cls(
+            start,
+            model,
+            optimizer,
+            densifier,
+            drop,
+            order=torch.Generator().manual_seed(seed + 3),
+            colors=torch.Generator(plan.device).manual_seed(seed + 4),
+            poses=poses,
+        )
+
+    def note(self, text: str) -> None:
+        """Add a line that a user should read to `notes`, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The state as nested dicts of tensors and plain values, copied."""
+        parts = {
+            "model": self.model.state_dict(),
+            "optimizer": moments_of(self.optimizer),
+            "densifier": self.densifier.state_dict(),
+            "drop": None if self.drop is None else self.drop.get_rng_state(),
+            "order": self.order.get_state(),
+            "colors": self.colors.get_state(),
+            "poses": None if self.poses is None else self.poses.state_dict(),
+            "init": self.start.init,
+            "extent": self.start.extent,
+            "near_plane": self.start.near_plane,
+            "depth": self.start.depth,
+        }
+        plain = {name: getattr(self, name) for name in ("step", "seconds", "stack", "curve", "notes")}
+        return copy.deepcopy(parts | plain)
+
+    @classmethod
+    def from_dict(cls, scene: Scene, plan: Plan, values: dict[str, Any]) -> Self:
+        """The inverse of :meth:`to_dict`; a ValueError, which begins with the entry's name, where one is wrong.
+
+        On another kind of device random numbers start a new sequence, which `notes` says.
+        """
+        with state_errors():
+            check_plain(values, *PLAIN)
+            model = GaussianModel(**copy.deepcopy(values["model"]))
+            if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
+                raise ValueError(f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got others")
+            start = Start(*(copy.deepcopy(values[name]) for name in ("init", "extent", "near_plane", "depth")))
+            state = cls._assemble(scene, plan, model, start)
+            for name in ("step", "seconds", "stack", "curve", "notes"):
+                setattr(state, name, copy.deepcopy(values[name]))
+            load_moments(state.optimizer, copy.deepcopy(values["optimizer"]))
+            state.densifier.load_state_dict(values["densifier"])
+            state.order.set_state(values["order"])
+            if state.colors.get_state().shape == values["colors"].shape:
+                state.colors.set_state(values["colors"])
+                if state.drop is not None:
+                    state.drop.set_rng_state(values["drop"])
+            else:  # their sizes are those of the kind of device
+                state.note(
+                    "the checkpoint is of another kind of device: dropping and backgrounds start new random sequences"
+                )
+            if state.poses is not None:
+                state.poses.load_state_dict(values["poses"])
+        return state
+
+
+@contextmanager
+def state_errors() -> Iterator[None]:
+    """Turn every error about an incomplete state into a ValueError that begins with the entry's name."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
+    except (AttributeError, RuntimeError, TypeError) as error:
+        raise ValueError(f"state: {error}") from error
+
+
+def fingerprint(scene: Scene) -> dict[str, Any]:
+    """SHA-256 sums of photos, masks, poses, intrinsics and background, to notice any change and to name it."""
+
+    def of(views: Views) -> dict[str, Any]:
+        tensors = {
+            "photos": views.images,
+            "masks": views.masks,
+            "poses": views.cameras.extrinsics,
+            "intrinsics": views.cameras.intrinsics,
+        }
+        sums = {what: None if values is None else list(map(digest, values)) for what, values in tensors.items()}
+        return {"names": list(views.names), **sums}
+
+    return {"training": of(scene.train), "test": of(scene.test), "background": digest(scene.background)}
+
+
+def digest(tensor: Tensor) -> str:
+    """SHA-256 of the type, shape and numbers of a tensor, in hexadecimal digits."""
+    checksum = hashlib.sha256(f"{tensor.dtype} {tuple(tensor.shape)} ".encode())
+    checksum.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return checksum.hexdigest()
+
+
+def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig, steps: int) -> list[str]:
+    """Raise KeyError, TypeError or ValueError unless a saved fit has this fingerprint and configuration.
+
+    Returns notes for the user, if a finished fit goes on for more steps.
+    """
+    planned = saved["config"]["steps"]
+    done = saved["step"]
+    notes = list[str]()
+    asked = config.to_dict() | {"device": saved["config"].get("device")}  # a fit may continue on another device
+    if config.backend == "auto":
+        asked["backend"] = saved["backend"]
+    if planned == done < steps:
+        asked["steps"] = planned
+        notes.append(
+            f"trained on from step {done}, the end of a fit of {planned} steps: from here on learning rates, drop "
+            f"rate, densification and resets are those of {steps} steps, so that the result differs from a fit of "
+            f"{steps} steps from the start"
+        )
+    elif planned != steps or done > planned:
+        expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
+        raise ValueError(f"steps: expected {expected} got {steps}")
+    _compare_settings(saved["config"] | {"backend": saved["backend"]}, asked)
+    for part in ("training", "test"):
+        for what, sums in scene[part].items():
+            before = saved["scene"][part][what]
+            if before != sums:
+                both = zip(scene[part]["names"], before or [], sums or [], strict=False)
+                changed = ", ".join(name for name, one, other in both if one != other)
+                fault = f"{what} of the {part} views: expected those that the fit was begun with, got others"
+                raise ValueError(f"{fault} for {changed:.200}" if changed else fault)
+    if saved["scene"]["background"] != scene["background"]:
+        raise ValueError("background: expected the one that the fit was begun with, got another")
+    if max(saved["stack"], default=0) >= len(scene["training"]["names"]):
+        raise ValueError(f"stack: expected views of the scene, got {saved['stack']!s:.80}")
+    return notes
+
+
+def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = "") -> None:
+    for name, value in asked.items():
+        before = saved.get(name)
+        if isinstance(value, dict) and isinstance(before, dict):
+            _compare_settings(before, value, f"{path}{name}.")
+        elif before != value:
+            raise ValueError(f"{path}{name}: expected {before!r}, as the fit was begun with, got {value!r}")
+
+
+def check_plain(values: dict[str, Any], *names: str) -> None:
+    """Raise KeyError or ValueError if one of these plain values of a saved fit is missing or wrong."""
+    for name in names:
+        expected, is_right = PLAIN[name]
+        if not is_right(values[name]):
+            raise ValueError(f"{name}: expected {expected}, got {str(values[name])[:80]!r}")
+
+
+_is_count = partial(is_number, least=0, whole=True)
+
+
+def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(map(is_right, value))
+
+
+def _is_point(value: Any) -> bool:
+    keys = {"step", "seconds", "test_psnr", "train_psnr"}
+    return value.keys() == keys and all(x is None or is_number(x) for x in value.values())
+
+
+# The plain values of a saved fit: what is expected of each in words, and the check.
+PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "backend": ("one of ['torch', 'numba', 'triton']", lambda v: v in ("torch", "numba", "triton")),
+    "init": ("kind and number of initial points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),
+    "step": ("a number of steps", _is_count),
+    "seconds": ("a number, not negative", lambda v: is_number(v, 0)),
+    "curve": ("a list of measurements", lambda v: _is_list(v, _is_point)),
+    "notes": ("a list of texts", lambda v: _is_list(v, lambda x: isinstance(x, str))),
+    "needs": ("what was decided", lambda v: isinstance(v, dict)),
+    "extent": ("a number above 0", lambda v: is_number(v, 1e-300)),
+    "near_plane": ("a number above 0", lambda v: is_number(v, 1e-300)),
+    "depth": ("a number above 0", lambda v: is_number(v, 1e-300)),
+    "stack": ("a list of views", lambda v: _is_list(v, _is_count)),
+}
