@@ -79,5 +79,5 @@ def page(
         + (f", PSNR {level:.4g}" if level else "")
     )
     if cost:
-        say(f"to keep the page small it shows {cost}; {printable(ply)} has everything")
+        say(f"the page shows {cost}; {printable(ply)} has everything")
     say_next(f"open {as_line(out)} in a browser")

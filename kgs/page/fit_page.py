@@ -1,5 +1,6 @@
 """The page of a fit, index.html: collects the content for :func:`kgs.page.write_page` from a fit and its files."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -25,10 +26,12 @@ from kgs.io.ownership import is_own
 from kgs.model import GaussianModel
 
 from . import Picture, write_page
+from .figures import psnr_of_views
 from .write import MOST_FILM_BYTES
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
+_BORDER = 0.03  # of the shorter side of a photo: the band whose mean is the ground of the viewer
 
 Render = Callable[[PinholeCamera], Tensor]
 
@@ -72,13 +75,14 @@ def write_fit_page(
         roll: degrees by which all pictures are turned clockwise, see :func:`kgs.io.cameras.rolled`.
 
     Returns:
-        What was reduced to respect the page's limit of size, in words; "" for nothing.
+        What the viewer shows less than the model, in words; "" for nothing.
     """
     views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
-    shown = rolled(shown or views.select(spread(len(views), MOST_PICTURES)), roll)
+    photographed = shown or views.select(spread(len(views), MOST_PICTURES))
+    shown = rolled(photographed, roll)
     if not photos:
         shown = shown.select([])
-    psnr = {run: _psnr_of_views(metrics) for run, metrics in runs.items()}
+    psnr = {run: psnr_of_views(metrics) for run, metrics in runs.items()}
     pictures = list[Picture]()
     for i in each(range(len(shown)), "page", "view"):
         name, camera = shown.names[i], shown.camera(i)
@@ -103,7 +107,8 @@ def write_fit_page(
         [*scene.train.names, *scene.test.names],
         [words[0]] * len(scene.train) + [words[1]] * len(scene.test),
         near_plane=near_plane,
-        background=scene.background,
+        background=_ground(photographed, scene.background),
+        antialiased=getattr(model, "antialiased", False),
         pictures=pictures,
         pictures_note=_pictures_note(len(shown), len(views), word),
         film=film_within(film, MOST_FILM_BYTES) if film is not None and is_own(film) else b"",
@@ -164,6 +169,23 @@ def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str,
     _write_page_of(path, out, saved.placed(scene), saved.model, saved.near_plane, render, metrics, settings)
 
 
+def _ground(views: Views, background: Tensor) -> Tensor:
+    """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border, or of all that they show.
+
+    Photos with transparency show a thing before `background`, which is returned.
+    """
+    if views.masks is not None or not len(views):
+        return background
+    height, width = views.images.shape[-2:]
+    band = math.ceil(_BORDER * min(height, width))
+    border = torch.ones(height, width, dtype=torch.bool)
+    border[band : height - band, band : width - band] = False
+    usable = torch.ones_like(border) if views.light is None else views.light.cpu() >= 1
+    rows = border & usable if bool((border & usable).any()) else usable
+    ground: Tensor = views.images.cpu()[:, :, rows].mean((0, 2)) if bool(rows.any()) else background
+    return ground
+
+
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """The content of config.json in one dict, without the timetable of steps."""
     rest = {name: value for name, value in config.items() if name not in ("request", "fit", "timetable")}
@@ -212,12 +234,6 @@ def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
     mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
     most = f"{poses['most_degrees']:.2f} degrees and {100 * poses['most_depths']:.2f} %"
     return [f"The fit moved the training cameras by {mean} in the mean, and by at most {most}."]
-
-
-def _psnr_of_views(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The PSNR of each view that has one, by the name of the view."""
-    parts = [metrics.get(part) or {} for part in ("test", "train", "views")]
-    return {row["name"]: row["psnr"] for part in parts for row in part.get("views", []) if row["psnr"] is not None}
 
 
 def _all_cameras(*parts: Views) -> PinholeCamera:
