@@ -50,12 +50,16 @@ def page(
 
     from kgs.camera import move_camera
     from kgs.datasets import load_scene
+    from kgs.losses.photometric import WINDOW
     from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
     place = check_tools(device, backend, "jinja2")
     scene = load_cameras(cameras, downscale, background=background)
+    height, width = scene.train.images.shape[-2:]
+    if min(height, width) < WINDOW:
+        raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     model, renderer = load_splat(ply, scene, place, backend)
     behind = scene.background.to(place)
 

@@ -32,10 +32,10 @@ def write_exports(trainer: Trainer, folder: Path, roll: float = 0.0) -> None:
     write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset, model.means))
     save_glb(folder / "splat.glb", model, upright(upright_views.cameras.extrinsics), scene.offset)
     depth = typical_depths(model.means, scene.train.cameras)[1]
-    near_plane = path_near_plane(model.means, scene.train.cameras, trainer.near_plane)
-    renderer = GaussianRenderer(
-        options=replace(trainer.renderer.options, near_plane=near_plane), backend=trainer.backend
-    ).eval()
+    options = trainer.renderer.options
+    near_plane = path_near_plane(model.means, scene.train.cameras, options.near_plane)
+    options = replace(options, near_plane=near_plane)
+    renderer = GaussianRenderer(options=options, backend=trainer.backend).eval()
 
     @torch.no_grad()
     def render(camera: PinholeCamera) -> Tensor:

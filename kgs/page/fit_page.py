@@ -170,11 +170,11 @@ def refresh_page(out: Path, saved: SavedFit, scene: Scene, metrics: Mapping[str,
 
 
 def _ground(views: Views, background: Tensor) -> Tensor:
-    """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border, or of all that they show.
+    """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border instead of black.
 
-    Photos with transparency show a thing before `background`, which is returned.
+    Photos with transparency show a thing before `background`; it is returned then, and where it was chosen: not black.
     """
-    if views.masks is not None or not len(views):
+    if views.masks is not None or not len(views) or bool(background.any()):
         return background
     height, width = views.images.shape[-2:]
     band = math.ceil(_BORDER * min(height, width))
