@@ -108,6 +108,17 @@ def test_a_stray_gaussian_costs_no_film_and_is_named(tmp_path: Path) -> None:
     assert "<video" in text
 
 
+def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
+    cameras = batch(*(random_camera(*SIZE, 0, torch.float32) for _ in range(6)))  # at one place: all are in the middle
+    names = list("abcdef")
+    rows = [{"name": name, "psnr": 20.0 + (name == "b"), "ssim": None, "lpips_vgg": None} for name in names]
+    runs = {"": {"train": {"psnr": 20.2, "ssim": None, "lpips_vgg": None, "views": rows}, "test": None}}
+    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3), "runs": runs}
+    path = tmp_path / "index.html"
+    write_page(path, "a", GAUSSIANS, cameras, names, ["training"] * 6, **options)
+    assert '"first":1,' in path.read_text(encoding="utf-8")
+
+
 def test_a_page_says_where_no_photo_was_held_out(tmp_path: Path) -> None:
     text = write(tmp_path / "index.html", runs={"": {"train": views(30.0, 31.0), "test": None}})
     assert "No photo was held out" in text
