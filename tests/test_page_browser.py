@@ -192,6 +192,22 @@ def test_an_antialiased_splat_is_drawn_as_such(browser: Browser, scene: Any, tmp
         assert level > psnr(shown, array(plain[index].clamp(0, 1))) + 6
 
 
+def test_strays_change_nothing_of_what_is_shown(browser: Browser, scene: Any, renders: Any, tmp_path: Path) -> None:
+    """Behind all cameras: one that is left out, one that is not so far away, and one with a harmonic of 1e8."""
+    gaussians, cameras = scene
+    strays = random_gaussians(3, 2, torch.float32, sh_degree=3)
+    strays.means[:] = torch.tensor([[0.0, 0.0, -1.0]]) * torch.tensor([[1e12], [2e5], [30.0]])
+    strays.colors[2, 9, 1] = 1e8
+    more = Gaussians(*map(torch.cat, zip(vars(gaussians).values(), vars(strays).values(), strict=True)))
+    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND}
+    words = write_page(tmp_path / "index.html", "a", more, cameras, list("abcd"), PARTS, **options)
+    assert words == "all but 1 stray Gaussian"
+    browser.size(1000, 800)
+    browser.open(tmp_path / "index.html", READY)
+    for index, render in enumerate(renders):
+        assert psnr(show(browser, index), array(render)) >= 50
+
+
 def camera_of(browser: Browser, lens: Any) -> Any:
     """The camera of the eye, with the intrinsics of `lens`."""
     rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
