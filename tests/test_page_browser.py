@@ -246,7 +246,7 @@ def test_roaming_ends_where_the_splat_leaves_the_stage(browser: Browser, page: P
         browser.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
         least = min(1 / 3, covered() / 2)
         browser.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
-        assert covered() >= 0.95 * least
+        assert covered() >= least - 0.01
         at_once = browser.run("viewer.eye.position")
         browser.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
         assert browser.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)

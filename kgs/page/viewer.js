@@ -86,7 +86,7 @@ class Viewer {
     this.usualDistance = distance;
     this.choice.value = index;
     this.usualCoverage = null;  // not measured yet
-    this.roamedTo = null;  // the last direction in which the splat was found to cover enough
+    this.roamedTo = null;  // the last direction in which the splat was found to cover twice what is enough
   }
 
   // Moves the eye to a camera smoothly.
@@ -183,15 +183,14 @@ class Viewer {
   // Whether the splat covers enough of the stage there, or at least not less than from `before`.
   showsEnough(eye, before) {
     const ahead = eye.rotation[2];
-    if (this.roamedTo && dot(ahead, this.roamedTo) > Math.cos(ROAMING_STEP / 2)) return true;  // nearly as before
+    if (this.roamedTo && dot(ahead, this.roamedTo) > Math.cos(ROAMING_STEP / 2)) return true;
     const coverage = (from) => this.renderer.coverage(this.withNearPlane(from), this.viewOf(from));
     this.usualCoverage ??= coverage(this.scene.cameras[this.choice.value]);
     const farther = Math.max(1, eye.distance / this.usualDistance);
     const least = Math.min(LEAST_COVERAGE, LEAST_PART * this.usualCoverage) / farther ** 2;
     const covered = coverage(eye);
-    const isEnough = covered >= least || covered >= coverage(before);
-    if (isEnough) this.roamedTo = ahead;
-    return isEnough;
+    if (covered >= 2 * least) this.roamedTo = ahead;
+    return covered >= least || covered >= coverage(before);
   }
 
   // An eye that is turned around its target.
