@@ -26,6 +26,7 @@ from kgs.fit.trainer import Trainer
 from kgs.io import film as films
 from kgs.page import Picture, write_page
 from kgs.page.fit_page import write_fit_page
+from kgs.sfm import pose_photos
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
@@ -256,13 +257,17 @@ def test_roaming_ends_where_the_splat_leaves_the_stage(browser: Browser, page: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["colmap/monstree", "nerfstudio/fox"])
+@pytest.mark.parametrize("name", ["colmap/monstree", "photos/banana", "nerfstudio/fox"])
 def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
     browser: Browser, name: str, kgs_data: Path, tmp_path: Path
 ) -> None:
     """Not more black, and not more of the ground, than a render from there before the same ground."""
-    wide = max(load_scene(kgs_data / name, 6, hold_out=0, photos=False).train.images.shape[-2:])
-    real = load_scene(kgs_data / name, 6, wide / 200, hold_out=0)
+    folder = kgs_data / name
+    if name.startswith("photos"):
+        folder = tmp_path / "posed"
+        pose_photos(kgs_data / name, folder)
+    wide = max(load_scene(folder, 6, hold_out=0, photos=False).train.images.shape[-2:])
+    real = load_scene(folder, 6, wide / 200, hold_out=0)
     config = replace(DEMO, steps=100)
     trainer = Trainer(real, config, choose_points(real, config))
     trainer.fit()
