@@ -18,6 +18,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 import kgs
 from kgs.cli.render import render
 from kgs.fit import exports
+from kgs.geometry import typical_depths
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
 from kgs.io.outputs import EXPORTS, film_in
@@ -91,13 +92,12 @@ def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> 
 
     class Fitted:
         scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        scene.background = torch.zeros(3)
         shown, notes = random_model(), list[str]()
+        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
 
         def note(self, text: str) -> None:
             self.notes.append(text)
-
-        def render(self, camera: PinholeCamera) -> torch.Tensor:
-            return torch.zeros(1, 3, int(camera.height), int(camera.width))
 
     monkeypatch.setattr(film, "FRAMES", 3)
     exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
@@ -115,13 +115,35 @@ def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> 
     ]
 
 
+def test_the_film_leaves_out_what_is_right_before_its_camera(tmp_path: Path, monkeypatch: Any) -> None:
+    class Fitted:
+        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        scene.background = torch.ones(3)
+        shown = random_model()
+        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
+
+    given: list[Any] = []
+    monkeypatch.setattr(exports, "write_film", lambda path, render, views, *_: given.extend([render, views]) or "")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    render, views = given
+    camera = views.camera(0)
+    nearest = float(typical_depths(Fitted.shown.means, views.cameras)[0])
+    camera.extrinsics[0, 2, 3] -= 0.6 * nearest  # among the Gaussians
+    with torch.no_grad():
+        images = [
+            kgs.GaussianRenderer(near_plane=near).eval()(Fitted.shown(), camera, Fitted.scene.background).image
+            for near in (0.01, nearest / 2)
+        ]
+    assert (images[0] - images[1]).abs().max() > 0.01
+    torch.testing.assert_close(render(camera), images[1])
+
+
 def test_one_film_takes_the_place_of_the_other(tmp_path: Path, monkeypatch: Any) -> None:
     class Fitted:
         scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        scene.background = torch.zeros(3)
         shown = random_model()
-
-        def render(self, camera: PinholeCamera) -> torch.Tensor:
-            return torch.zeros(1, 3, int(camera.height), int(camera.width))
+        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
 
     pytest.importorskip("av")
     monkeypatch.setattr(film, "FRAMES", 3)

@@ -14,6 +14,7 @@ import torch
 from browser import Browser
 from torch import Tensor
 
+from kgs import GaussianRenderer, Gaussians
 from kgs.datasets.scene import Views, pinholes
 from kgs.io import encoders, film
 from kgs.io.film import tour, write_film
@@ -215,6 +216,55 @@ def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: st
     small, photo = rendered[0][0, 0], render(views.camera(0))[0, 0, 0]  # of the first camera, in two sizes
     centre = [float((row * (torch.arange(len(row)) + 0.5)).sum() / row.sum()) / len(row) for row in (small, photo)]
     assert centre[0] == pytest.approx(centre[1], abs=1e-3)
+
+
+def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path, monkeypatch: Any) -> None:
+    """Three cameras side by side before a wall; between them black Gaussians, outside of their pictures."""
+    monkeypatch.setattr(film, "FRAMES", 48)
+    generator = torch.Generator().manual_seed(0)
+    count, size = 3000, (36, 48)
+    spread = torch.rand(count, 3, generator=generator) * 2 - 1
+    wall = spread * torch.tensor([8.0, 5.0, 0.1]) + torch.tensor([0.0, 0.0, 4.0])
+    between = torch.tensor([[-0.75, 0.0, 0.1], [0.75, 0.0, 0.1]])
+    means = torch.cat([wall, between])
+    n = len(means)
+    scales = torch.full((n, 3), 0.2)
+    scales[count:] = 0.1
+    colors = torch.cat([0.4 + 0.2 * torch.rand(count, 3, generator=generator), torch.zeros(2, 3)])
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    gaussians = Gaussians(means, quats, scales, torch.full((n,), 0.9), colors)
+    lens = torch.eye(4).repeat(3, 1, 1)
+    lens[:, 0, 0] = lens[:, 1, 1] = 48.0
+    lens[:, 0, 2] = 23.5
+    lens[:, 1, 2] = 17.5
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor([1.5, 0.0, -1.5])
+    views = Views(pinholes(lens, poses, size), torch.zeros(3, 3, *size), ("a", "b", "c"))
+
+    def levels(near_plane: float) -> list[float]:
+        renderer = GaussianRenderer(near_plane=near_plane).eval()
+        found = []
+
+        def render(camera: Any) -> Tensor:
+            image = renderer(gaussians, camera).image
+            found.append(float(image.mean()))
+            return image
+
+        assert write_film(tmp_path / "a.webm", render, views, 4.0) == ""
+        return found
+
+    def flashes(means: list[float]) -> int:
+        """Frames that differ from both neighbours by more than these from each other and 3 %."""
+        triples = zip(means, means[1:], means[2:], strict=False)
+        return sum(min(abs(b - a), abs(b - c)) > abs(a - c) + 0.03 for a, b, c in triples)
+
+    near_plane = film.path_near_plane(gaussians.means, views.cameras, 0.01)
+    assert near_plane == pytest.approx(0.5 * 3.9, rel=0.02)
+    dark, clear = levels(0.01), levels(near_plane)
+    assert flashes(dark) > 0
+    assert flashes(clear) == 0
+    assert min(clear) > 0.9 * max(clear)
+    assert film.path_near_plane(gaussians.means, views.cameras, 3.0) == 3.0
 
 
 def boxes(content: bytes) -> list[tuple[bytes, bytes]]:

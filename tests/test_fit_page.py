@@ -10,14 +10,16 @@ from typing import Any
 
 import pytest
 import torch
+from factories import random_views
 
 from kgs.app.saved_fit import load_fit
 from kgs.cli.evaluate import evaluate
-from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.config import FitConfig
 from kgs.init_points import InitialPoints
 from kgs.metrics.lpips import Lpips
+from kgs.page import fit_page
 from kgs.page.fit_page import refresh_page, spread, write_own_page
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
@@ -87,6 +89,25 @@ def test_measures_that_come_later_are_on_it(fitted: Any, tmp_path: Path) -> None
     refresh_page(out, load_fit(out), scene, metrics)
     assert (out / "index.html").read_text(encoding="utf-8") == "mine"
     (out / "index.html").write_bytes(own)
+
+
+def flat_views(masks: Any = None, light: Any = None) -> Views:
+    """Two photos of 20 x 30 pixels: grey inside, of two colours at the border."""
+    images = torch.full((2, 3, 20, 30), 0.5)
+    for image, colour in zip(images, ([0.2, 0.4, 0.6], [0.4, 0.4, 0.8]), strict=True):
+        image[:, [0, -1], :] = torch.tensor(colour)[:, None, None]
+        image[:, :, [0, -1]] = torch.tensor(colour)[:, None, None]
+    return replace(random_views(2, 20, 30), images=images, masks=masks, light=light)
+
+
+def test_the_ground_is_the_mean_of_the_photos_border() -> None:
+    black = torch.zeros(3)
+    torch.testing.assert_close(fit_page._ground(flat_views(), black), torch.tensor([0.3, 0.4, 0.7]))
+    assert torch.equal(fit_page._ground(flat_views(masks=torch.ones(2, 1, 20, 30)), black), black)
+    assert torch.equal(fit_page._ground(flat_views(), torch.ones(3)), torch.ones(3))
+    light = torch.zeros(20, 30)
+    light[3:-3, 3:-3] = 1.0  # a dark border that no photo shows the scene in
+    torch.testing.assert_close(fit_page._ground(flat_views(light=light), black), torch.full((3,), 0.5))
 
 
 def test_without_a_photo_held_out_training_views_are_shown(fitted: Any) -> None:

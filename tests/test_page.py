@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 import torch
-from factories import batch, random_camera, random_gaussians
+from factories import batch, random_camera, random_gaussians, replace
 
+import kgs
 from kgs.page import Picture, write_page
 from kgs.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
 
@@ -81,9 +82,41 @@ def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
     smaller = len(path.read_bytes()) - 10_000
     text = write(path, most_bytes=smaller)
     assert len(path.read_bytes()) <= smaller
-    assert "To keep this page small it shows 8-bit numbers" in text
+    assert "This page shows 8-bit numbers" in text
     with pytest.raises(ValueError, match="expected room for a Gaussian"):
         write(path, most_bytes=10_000)
+
+
+def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
+    cited = re.findall(r"@software\{kgs,(.*?)\n\}", write(tmp_path / "index.html"), re.DOTALL)
+    assert len(cited) == 1
+    assert "a title" not in cited[0]
+    assert re.findall(r"(\w+) +=", cited[0]) == ["title", "author", "version"]
+    assert cited[0].rstrip().endswith(f"version = {{{kgs.__version__}}}")
+
+
+def test_a_stray_gaussian_costs_no_film_and_is_named(tmp_path: Path) -> None:
+    means = GAUSSIANS.means.clone()
+    means[3, 0] = 1e12
+    path = tmp_path / "index.html"
+    film = bytes(20_000)
+    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3), "film": film}
+    words = write_page(path, "a", replace(GAUSSIANS, means=means), CAMERAS, NAMES, ["training"] * 3, **options)
+    assert words == "all but 1 stray Gaussian"
+    text = path.read_text(encoding="utf-8")
+    assert "This page shows all but 1 stray Gaussian" in text
+    assert "<video" in text
+
+
+def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
+    cameras = batch(*(random_camera(*SIZE, 0, torch.float32) for _ in range(6)))  # at one place: all are in the middle
+    names = list("abcdef")
+    rows = [{"name": name, "psnr": 20.0 + (name == "b"), "ssim": None, "lpips_vgg": None} for name in names]
+    runs = {"": {"train": {"psnr": 20.2, "ssim": None, "lpips_vgg": None, "views": rows}, "test": None}}
+    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3), "runs": runs}
+    path = tmp_path / "index.html"
+    write_page(path, "a", GAUSSIANS, cameras, names, ["training"] * 6, **options)
+    assert '"first":1,' in path.read_text(encoding="utf-8")
 
 
 def test_a_page_says_where_no_photo_was_held_out(tmp_path: Path) -> None:
@@ -135,7 +168,7 @@ def test_a_film_is_left_out_before_anything_of_the_splat(tmp_path: Path) -> None
     assert tag in write(path, film=film)
     text = write(path, film=film, most_bytes=bare + 20_000)  # base64 makes 27 000 of them
     assert "<video" not in text
-    assert "To keep this page small" not in text
+    assert "This page shows" not in text
     assert "<video" not in write(path, film=bytes(1_100_001))
 
 

@@ -18,26 +18,26 @@ from factories import batch, random_camera, random_gaussians, with_camera
 
 import kgs
 from kgs import Gaussians
+from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
-from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.fit.config import DEMO
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.geometry import nearest_pixels, project_points, unproject
 from kgs.io import film as films
 from kgs.page import Picture, write_page
+from kgs.page.fit_page import write_fit_page
+from kgs.sfm import pose_photos
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
 PARTS = ["training", "training", "training", "test"]
 CENTRAL = 1  # the training camera nearest the mean pose
 READY = "document.querySelector('.viewer').dataset.state === 'ready'"
-SHOW = """(index, width, height, fades = false) => {
+SHOW = """(index, width, height) => {
   const canvas = document.querySelector("canvas");
   Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
   if (index !== null) viewer.place(index);
-  viewer.isFading = fades;
   viewer.draw();
   return canvas.toDataURL();
 }"""
@@ -97,9 +97,9 @@ def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, 
     assert browser.problems == []
 
 
-def show(browser: Browser, index: int | None, width: int = SIZE[1], height: int = SIZE[0], fades: bool = False) -> Any:
+def show(browser: Browser, index: int | None, width: int = SIZE[1], height: int = SIZE[0]) -> Any:
     """The canvas in some size of pixels, at a camera of the page or, without index, where the eye is now."""
-    words = ", ".join(json.dumps(value) for value in (index, width, height, fades))
+    words = ", ".join(json.dumps(value) for value in (index, width, height))
     return browser.picture(browser.run(f"({SHOW})({words})"))
 
 
@@ -166,81 +166,132 @@ def test_what_the_photos_frame_shows_does_not_depend_on_the_canvas(
     browser.run("viewer.isRoaming = true")
     for yaw, pitch in ((0, 0), (12, 0), (25, 0), (-25, 0), (0, 20)):
         browser.run(f"viewer.place(viewer.scene.first); viewer.turn({math.radians(yaw)}, {math.radians(pitch)})")
-        rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
-        pose = torch.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
-        camera = with_camera(
-            Views(cameras, torch.zeros(4, 3, *SIZE), tuple("abcd")).camera(CENTRAL), extrinsics=pose[None]
-        )
+        lens = Views(cameras, torch.zeros(4, 3, *SIZE), tuple("abcd")).camera(CENTRAL)
+        camera = camera_of(browser, lens)
         with torch.no_grad():
             render = kgs.GaussianRenderer(backend="torch").eval()(gaussians, camera, background=BACKGROUND).image
         shown = show(browser, None, *canvas)[top : top + height, left : left + width]
         assert psnr(shown, array(render[0].clamp(0, 1))) >= 38, (yaw, pitch)
 
 
-def test_nothing_that_training_photos_show_fades(browser: Browser, page: Path) -> None:
+def test_an_antialiased_splat_is_drawn_as_such(browser: Browser, scene: Any, tmp_path: Path) -> None:
+    """Of many Gaussians that are smaller than a pixel."""
+    gaussians, cameras = scene
+    small = replace(gaussians, scales=gaussians.scales * torch.linspace(0.02, 0.2, len(gaussians))[:, None])
+    with torch.no_grad():
+        plain, fine = (
+            kgs.GaussianRenderer(antialiased=antialiased, backend="torch").eval()(small, cameras, BACKGROUND).image
+            for antialiased in (False, True)
+        )
+    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "antialiased": True}
+    write_page(tmp_path / "index.html", "a", small, cameras, list("abcd"), PARTS, **options)
     browser.size(1000, 800)
-    browser.open(page, READY)
-    for index, part in enumerate(PARTS):
-        for width, height in ((SIZE[1], SIZE[0]), (2 * SIZE[1] + 37, 2 * SIZE[0] + 28)):
-            level = psnr(show(browser, index, width, height, True), show(browser, index, width, height))
-            assert part == "test" or level >= 45, (index, width)
+    browser.open(tmp_path / "index.html", READY)
+    for index in range(4):
+        shown = show(browser, index)
+        level = psnr(shown, array(fine[index].clamp(0, 1)))
+        assert level >= 38
+        assert level > psnr(shown, array(plain[index].clamp(0, 1))) + 6
 
 
-def test_what_no_photo_shows_fades_until_it_is_switched_off(browser: Browser, page: Path) -> None:
+def test_strays_change_nothing_of_what_is_shown(browser: Browser, scene: Any, renders: Any, tmp_path: Path) -> None:
+    """Behind all cameras: one that is left out, one that is not so far away, and one with a harmonic of 1e8."""
+    gaussians, cameras = scene
+    strays = random_gaussians(3, 2, torch.float32, sh_degree=3)
+    strays.means[:] = torch.tensor([[0.0, 0.0, -1.0]]) * torch.tensor([[1e12], [2e5], [30.0]])
+    strays.colors[2, 9, 1] = 1e8
+    more = Gaussians(*map(torch.cat, zip(vars(gaussians).values(), vars(strays).values(), strict=True)))
+    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND}
+    words = write_page(tmp_path / "index.html", "a", more, cameras, list("abcd"), PARTS, **options)
+    assert words == "all but 1 stray Gaussian"
+    browser.size(1000, 800)
+    browser.open(tmp_path / "index.html", READY)
+    for index, render in enumerate(renders):
+        assert psnr(show(browser, index), array(render)) >= 50
+
+
+def camera_of(browser: Browser, lens: Any) -> Any:
+    """The camera of the eye, with the intrinsics of `lens`."""
+    rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
+    pose = torch.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ position
+    return with_camera(lens, extrinsics=pose[None])
+
+
+def drag(browser: Browser, share: float) -> None:
+    """From the middle of the stage to the right, by a share of its width, in ten moves."""
+    x, y, width = browser.run(
+        "(() => { const b = viewer.canvas.getBoundingClientRect();"
+        " return [b.x + b.width / 5, b.y + b.height / 2, b.width]; })()"
+    )
+    event: dict[str, Any] = {"y": y, "button": "left", "buttons": 1}
+    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, clickCount=1, **event)
+    for i in range(1, 11):
+        browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + share * width * i / 10, **event)
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + share * width, clickCount=1, **event)
+
+
+def test_roaming_ends_where_the_splat_leaves_the_stage(browser: Browser, page: Path) -> None:
+    """A third of the stage, measured on what the canvas shows before two grounds."""
     browser.size(1000, 800)
     browser.open(page, READY)
-    browser.run("viewer.isRoaming = true; viewer.turn(2.5, 0)")  # behind the scene
-    whole, faded = show(browser, None), show(browser, None, fades=True)
-    ground = np.rint(255 * BACKGROUND.numpy()) / 255
-    assert np.abs(faded - ground).mean() < 0.1 * np.abs(whole - ground).mean()
-    switch = "document.querySelector('.fade')"
-    assert browser.run(f"[viewer.isFading, {switch}.getAttribute('aria-pressed')]") == [True, "true"]
-    browser.run(f"{switch}.click()")
-    assert browser.run(f"[viewer.isFading, {switch}.getAttribute('aria-pressed')]") == [False, "false"]
+
+    def covered() -> float:
+        shown = []
+        for ground in ("[0, 0, 0]", "[1, 1, 1]"):
+            browser.run(f"viewer.renderer.settings.background = {ground}")
+            shown.append(show(browser, None))
+        return float(1 - (shown[1] - shown[0]).mean())
+
+    for sign in (1, -1):
+        browser.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
+        least = min(1 / 3, covered() / 2)
+        browser.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
+        assert covered() >= least - 0.01
+        at_once = browser.run("viewer.eye.position")
+        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
+        assert browser.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)
+        browser.run("viewer.place(viewer.scene.first); viewer.zoom(2.5); window.start = viewer.eye.position")
+        browser.run(f"viewer.turn({0.3 * sign}, 0)")  # from farther away it turns as well
+        assert browser.run("viewer.eye.position !== start")
 
 
 @pytest.mark.slow
-def test_surfaces_of_the_room_that_no_photo_shows_fade(browser: Browser, tmp_path: Path) -> None:
-    """In a fit of the room, whose surfaces are known, from 40 degrees beside the photos."""
-    room = synthetic_scene("room", 3, 0, (189, 252), seed=0)
-    config = replace(DEMO, steps=200)
-    trainer = Trainer(room, make_plan(room, config), choose_points(room, config))
-    trainer.fit()
-    with torch.no_grad():
-        gaussians = trainer.model()
-    path, cameras = tmp_path / "index.html", room.train.cameras
-    rules: dict[str, Any] = {"near_plane": trainer.state.start.near_plane, "background": torch.zeros(3)}
-    write_page(path, "room", gaussians, cameras, ["a", "b", "c"], ["training"] * 3, **rules)
+@pytest.mark.parametrize("name", ["colmap/monstree", "photos/banana", "nerfstudio/fox"])
+def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
+    browser: Browser, name: str, kgs_data: Path, tmp_path: Path
+) -> None:
+    """Not more black, and not more of the ground, than a render from there before the same ground."""
+    folder = kgs_data / name
+    if name.startswith("photos"):
+        folder = tmp_path / "posed"
+        pose_photos(kgs_data / name, folder)
+    wide = max(load_scene(folder, 6, hold_out=0, photos=False).train.images.shape[-2:])
+    real = load_scene(folder, 6, wide / 200, hold_out=0)
+    config = replace(DEMO, steps=100)
+    fit = Trainer(real, make_plan(real, config), choose_points(real, config)).fit()
+    path = tmp_path / "index.html"
+    near_plane = fit.options.near_plane
+    write_fit_page(path, name, {"": fit}, photos=False)
     browser.size(1000, 800)
     browser.open(path, READY)
-    browser.run("viewer.isRoaming = true")
-    for index in range(3):
-        assert psnr(show(browser, index, 252, 189, True), show(browser, index, 252, 189)) >= 45
-    true_depths = synthetic_depths(cameras, "room")[:, 0]
-    for yaw in (40, -40):
-        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({math.radians(yaw)}, 0)")
-        black, white = [
-            (browser.run(f"viewer.renderer.settings.background = {ground}"), show(browser, None, 252, 189, True))[1]
-            for ground in ([0, 0, 0], [1, 1, 1])
-        ]
-        browser.run("viewer.renderer.settings.background = [0, 0, 0]")
-        alpha = 1 - (white - black).mean(axis=2)
-        rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
-        pose = torch.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
-        eye = with_camera(room.train.camera(0), extrinsics=pose)
-        depth = synthetic_depths(eye, "room")[0, 0]
-        pixels = torch.ones_like(depth).nonzero().flip(1)
-        points = unproject(pixels, depth.flatten(), torch.zeros(len(pixels), dtype=torch.int64), eye)
-        places, distances = project_points(points, cameras)
-        shown = torch.zeros(len(pixels), dtype=torch.bool)
-        for view, there in enumerate(true_depths):
-            x, y, inside = nearest_pixels(places[:, view], distances[:, view], 252, 189)
-            shown |= inside & (distances[:, view] <= 1.02 * there[y, x])
-        hidden = ~shown.reshape(depth.shape).numpy()
-        assert alpha[hidden].mean() < 0.2
-        assert alpha[~hidden].mean() > 2 * alpha[hidden].mean()
+    ground = torch.tensor(browser.run("viewer.renderer.settings.background"))
+    assert ground.amax() > 0.05
+    height, width = real.train.images.shape[-2:]
+    show(browser, None, width, height)
+    renderer = kgs.GaussianRenderer(near_plane=near_plane).eval()
+    lens = real.train.camera(browser.run("viewer.scene.first"))
+    for share in (0.0, 0.1, 0.3, 0.6, -0.1, -0.3, -0.6):
+        browser.run("viewer.place(viewer.scene.first)")
+        drag(browser, share)
+        shown = show(browser, None, width, height)
+        with torch.no_grad():
+            image = renderer(fit.model(), camera_of(browser, lens), ground).image[0]
+        expected = array(image.clamp(0, 1))
+        for colour in (torch.zeros(3), ground):
+            shares = [np.mean(np.abs(picture - colour.numpy()).max(axis=2) < 8 / 255) for picture in (shown, expected)]
+            assert shares[0] <= shares[1] + 0.01, (share, colour)
 
 
 def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:

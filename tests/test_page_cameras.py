@@ -46,6 +46,20 @@ def test_it_opens_at_a_training_camera() -> None:
     assert first(cameras, ["photo"] * 4) == 0
 
 
+def test_it_opens_at_the_best_of_the_middle_third() -> None:
+    cameras = [camera(x) for x in (-1.0, -0.6, -0.1, 0.12, 0.5, 1.1)]
+    names = list("abcdef")
+
+    def opens_at(**psnr: float) -> str:
+        scene = viewer_scene(batch(*cameras), names, ["training"] * 6, MEANS, psnr)
+        return names[scene["first"]]
+
+    assert opens_at() == "c"
+    assert opens_at(a=40.0, c=26.6, d=32.7, e=35.0) == "d"
+    assert opens_at(a=40.0, c=26.6) == "c"  # that of d is not known
+    assert opens_at(c=30.0, d=30.0) == "c"
+
+
 def test_one_camera_and_no_gaussians() -> None:
     assert first([camera(0.0)], ["training"], MEANS[:0]) == 0
 

@@ -57,13 +57,7 @@ def test_values_come_back_within_their_bounds(cameras: Any) -> None:
     shown = gaussians_of(pack(exact, cameras, 10**7))
     assert len(shown) == 300
     exact = exact[nearest(shown, exact)]
-    for extrinsics, k in zip(cameras.extrinsics, cameras.intrinsics, strict=True):
-        pixels = []
-        for each in (exact, shown):
-            points = each.means @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-            pixels.append(points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2])
-        inside = (pixels[0] > 0).all(1) & (pixels[0] < torch.tensor(SIZE[::-1])).all(1)
-        assert (pixels[1] - pixels[0])[inside].norm(dim=1).max() < PIXEL_ERROR
+    assert largest_shift(exact, shown, cameras) < PIXEL_ERROR
     assert ((shown.scales / exact.scales).log().abs()).max() < 1e-4
     assert (shown.opacities - exact.opacities).abs().max() < 1e-5
     turned = (torch.nn.functional.normalize(exact.quats) * shown.quats).sum(1).abs()
@@ -77,6 +71,58 @@ def test_what_no_picture_shows_is_left_out(cameras: Any) -> None:
     opacities, means = exact.opacities.clone(), exact.means.clone()
     opacities[:5], means[7, 1] = 0.003, torch.nan
     assert len(gaussians_of(pack(replace(exact, opacities=opacities, means=means), cameras, 10**7))) == 44
+
+
+@pytest.mark.parametrize("places", [(1e8,), (2e7, -2e7), (1e12,), (3e5,)])
+def test_strays_move_nothing_else(cameras: Any, places: tuple[float, ...]) -> None:
+    """Beside all cameras, and before them; the last one is too near to be a stray, and is kept."""
+    exact = random_gaussians(300, 0, sh_degree=0)
+    means = exact.means.clone()
+    for i, place in enumerate(places):
+        means[i] = torch.tensor([0.3, 0.2, 1.0]).double() * place
+    exact = replace(exact, means=means)
+    packed = pack(exact, cameras, 10**7)
+    shown = gaussians_of(packed)
+    gone = 0 if max(places) < 1e6 else len(places)
+    assert len(shown) == 300 - gone
+    assert packed.left_out == ["", "all but 1 stray Gaussian", "all but 2 stray Gaussians"][gone]
+    assert not packed.is_reduced
+    rest = exact[torch.arange(len(places), 300)]
+    found = shown[nearest(rest, shown)]
+    assert largest_shift(rest, found, cameras) < PIXEL_ERROR
+
+
+def largest_shift(exact: Gaussians, shown: Gaussians, cameras: Any) -> float:
+    """Of the centres in the pictures that show them, in pixels."""
+    most = 0.0
+    for extrinsics, k in zip(cameras.extrinsics, cameras.intrinsics, strict=True):
+        pixels = []
+        for each in (exact, shown):
+            points = each.means @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+            pixels.append(points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2])
+        inside = (pixels[0] > 0).all(1) & (pixels[0] < torch.tensor(SIZE[::-1])).all(1)
+        most = max(most, float((pixels[1] - pixels[0])[inside].norm(dim=1).max()))
+    return most
+
+
+@pytest.mark.parametrize("name", ["colors", "scales"])
+def test_one_huge_value_costs_the_others_nothing(cameras: Any, name: str) -> None:
+    """Of a Gaussian that is hidden beside the frame: the pictures stay."""
+    plain = random_gaussians(300, 0, sh_degree=3)
+    means = plain.means.clone()
+    means[0] = torch.tensor([0.0, 0.0, -4.0]).double()  # behind both cameras
+    plain = replace(plain, means=means)
+    values = getattr(plain, name).clone()
+    values[0].view(-1)[-1] = 1e8 if name == "colors" else 1e-300
+    huge = replace(plain, **{name: values})
+    render = kgs.GaussianRenderer(backend="torch").eval()
+    with torch.no_grad():
+        images = [
+            render(each, cameras).image
+            for each in (plain, *(gaussians_of(pack(g, cameras, 10**7)) for g in (plain, huge)))
+        ]
+    errors = [float((image - images[0]).square().mean().sqrt()) for image in images[1:]]
+    assert errors[1] < 1.5 * errors[0]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

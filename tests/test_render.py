@@ -84,6 +84,8 @@ def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_pa
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "10 photos of 20 × 15 pixels" in text
     assert '"background":[1.0,1.0,1.0]' in text
+    with pytest.raises(ValueError, match="downscale: expected photos of at least 11 pixels a side, got 8x6"):
+        page(splat, cameras=llff, out=tmp_path / "page.html", downscale=5.0)
 
 
 @pytest.mark.parametrize("tag", [None, "SplatRenderMode: mip", "antialiased 1"])

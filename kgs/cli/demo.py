@@ -117,11 +117,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     write_fit_page(
         folder / PAGE,
         "kgs demo",
-        scene,
-        fit.model,
-        fit.options.near_plane,
-        {title: one.render for title, one in fits.items()},
-        {title: one.metrics for title, one in fits.items()},
+        fits,
         notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
         film=film_in(folder),
     )

@@ -1,14 +1,20 @@
 """What several commands load: scenes, cameras and splats."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kgs.errors import DataError, listed, printable
 from kgs.fit.config import Recipe
 from kgs.io.console import say
 
+if TYPE_CHECKING:
+    import torch
 
-def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any:
+    from kgs.datasets.scene import Scene
+    from kgs.fit.fit import Fit
+
+
+def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> "Scene":
     """The scene without its photos, of which there may be hundreds; all views are training views."""
     from kgs.datasets import load_scene
 
@@ -18,39 +24,41 @@ def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> Any:
     return scene
 
 
-def load_splat(ply: Path, scene: Any, place: Any, backend: str) -> tuple[Any, Any]:
-    """The Gaussians in the frame of the scene, and a renderer for them: its near plane, and whether it antialiases.
+def load_splat(ply: Path, scene: "Scene", place: "torch.device", backend: str) -> "Fit":
+    """A splat in the frame of a scene: its near plane follows from the cameras, antialiasing from the file.
 
-    A DataError if no camera of the scene sees one; single cameras that see none are named.
+    A DataError if no camera of the scene sees a Gaussian; single cameras that see none are named.
     """
+    from kgs.fit.fit import Fit
     from kgs.geometry import typical_depths
     from kgs.io.ply import load_ply
-    from kgs.renderer import GaussianRenderer
+    from kgs.types import RasterOptions
 
     model = load_ply(ply, origin=scene.offset)
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
-    renderer = GaussianRenderer(near_plane=near_plane, antialiased=model.antialiased, backend=backend)
-    model = model.to(place)
-    _check_seen(ply, model, scene, renderer)
-    return model, renderer.eval()
+    options = RasterOptions(near_plane=near_plane, antialiased=model.antialiased)
+    fit = Fit(scene, model.to(place), options, backend)
+    _check_seen(ply, fit)
+    return fit
 
 
-def _check_seen(ply: Path, model: Any, scene: Any, renderer: Any) -> None:
+def _check_seen(ply: Path, fit: "Fit") -> None:
     """Refuse a splat that no camera sees; name the cameras that see nothing of it."""
     import torch
 
     from kgs.camera import move_camera
     from kgs.stages import project
 
+    views = fit.scene.train
     blind = []
     with torch.no_grad():
-        gaussians = model()
-    for i, name in enumerate(scene.train.names):
-        camera = move_camera(scene.train.camera(i), model.means.device)
-        if not len(project(gaussians, camera, options=renderer.options, colors=False, backend=renderer.backend)):
+        gaussians = fit.model()
+    for i, name in enumerate(views.names):
+        camera = move_camera(views.camera(i), fit.device)
+        if not len(project(gaussians, camera, options=fit.options, colors=False, backend=fit.backend)):
             blind.append(name)
-    if len(blind) == len(scene.train):
-        reason = f"expected some that a camera of {printable(scene.root)} sees, got none of {len(model)}"
+    if len(blind) == len(views):
+        reason = f"expected some that a camera of {printable(fit.scene.root)} sees, got none of {len(fit.model)}"
         raise DataError(ply, "Gaussians", f"{reason}: are they in the frame of these cameras?")
     if blind:
         say(f"these cameras see no Gaussian of {printable(ply)}: {listed(blind)}")

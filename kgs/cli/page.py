@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from kgs.errors import printable
 from kgs.fit.config import Backend, Background
@@ -10,10 +9,6 @@ from kgs.io.console import as_line, say, say_next
 
 from .inputs import load_cameras, load_splat
 from .options import Existing, Out
-
-if TYPE_CHECKING:
-    import torch
-    from kornia.geometry.camera import PinholeCamera
 
 
 def page(
@@ -46,41 +41,38 @@ def page(
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
-    import torch
-
-    from kgs.camera import move_camera
     from kgs.datasets import load_scene
     from kgs.io.ownership import claim, record
+    from kgs.losses.photometric import WINDOW
     from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
     from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
     place = check_tools(device, backend, "jinja2")
     scene = load_cameras(cameras, downscale, background=background)
-    model, renderer = load_splat(ply, scene, place, backend)
-    behind = scene.background.to(place)
-
-    def render(camera: "PinholeCamera") -> "torch.Tensor":
-        with torch.no_grad():
-            image: torch.Tensor = renderer(model(), move_camera(camera, place), behind).image
-        return image
-
+    height, width = scene.train.images.shape[-2:]
+    if min(height, width) < WINDOW:
+        raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
+    fit = load_splat(ply, scene, place, backend)
     few = spread(len(scene.train), MOST_PICTURES)
     seen = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train  # of another offset
     shown = replace(seen, cameras=scene.train.camera(few))
-    runs = {"": {"views": evaluate(render, shown), "versions": versions()}}
-    notes = ["Whether the splat was fitted to these photos is not known here."]
-    title = f"{ply.stem}, {Path(cameras).resolve().name}"
-    words: dict[str, Any] = {"words": ("photo", "test"), "notes": notes, "photos": photos, "roll": roll}
-    near_plane = renderer.options.near_plane
+    fit = replace(fit, metrics={"views": evaluate(fit.render, shown), "versions": versions()})
     claim(out.parent, "page", [out.name])
-    cost = write_fit_page(out, title, scene, model, near_plane, {"": render}, runs, shown=shown, **words)
-    record(out.parent, "page", [out.name])
-    level = runs[""]["views"]["psnr"]
-    say(
-        f"{printable(out)}: {len(model)} Gaussians, {len(scene.train)} photos"
-        + (f", PSNR {level:.4g}" if level else "")
+    cost = write_fit_page(
+        out,
+        f"{ply.stem}, {Path(cameras).resolve().name}",
+        {"": fit},
+        shown=shown,
+        words=("photo", "test"),
+        notes=["Whether the splat was fitted to these photos is not known here."],
+        photos=photos,
+        roll=roll,
     )
+    record(out.parent, "page", [out.name])
+    level = fit.metrics["views"]["psnr"]
+    measured = f", PSNR {level:.4g}" if level else ""
+    say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos{measured}")
     if cost:
-        say(f"to keep the page small it shows {cost}; {printable(ply)} has everything")
+        say(f"the page shows {cost}; {printable(ply)} has everything")
     say_next(f"open {as_line(out)} in a browser")

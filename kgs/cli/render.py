@@ -44,11 +44,13 @@ def render(
     from kgs.io.outputs import check_folder, png_names, write_png
     from kgs.io.ownership import claim, record
     from kgs.machine import check_tools
+    from kgs.renderer import GaussianRenderer
 
     place = check_tools(device, backend)
     is_transparent = background == "transparent"
     scene = load_cameras(cameras, downscale, background="black" if is_transparent else background)
-    model, renderer = load_splat(ply, scene, place, backend)
+    fit = load_splat(ply, scene, place, backend)
+    renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
     check_folder(out, names.values(), scene.root)
     claim(out, "renders", names.values())
@@ -56,7 +58,7 @@ def render(
     outputs = ("image", "alpha") if is_transparent else ("image",)
     for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
         with torch.no_grad():
-            rendering = renderer(model(), move_camera(scene.train.camera(i), place), color, outputs)
+            rendering = renderer(fit.model(), move_camera(scene.train.camera(i), place), color, outputs)
         image = rendering.image
         if is_transparent:  # PNG's colours are not multiplied by alpha
             image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import meeting_point
+from kgs.geometry import meeting_point, typical_depths
 
 from .cameras import upright
 from .encoders import MP4, RATE, encode, film_suffix
@@ -31,6 +31,7 @@ LONGEST = 640  # pixels of the longer side
 _STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
 _LEAST_SIDE = 64  # pixels of a film that is made smaller
 _SWAY = 0.03  # radius of the path around a single camera, as a share of the scene's depth
+_CLEAR = 0.5  # of the nearest typical depth
 _SPARE = 4  # H.264: the bits for a pixel can be divided by this before there are fewer pixels
 Array = NDArray[np.float64]
 
@@ -71,6 +72,20 @@ def write_film(
     finally:
         part.unlink(missing_ok=True)
     return ""
+
+
+def path_near_plane(means: Tensor, cameras: PinholeCamera, near_plane: float) -> float:
+    """The near plane of a camera beside those of the photos, in world units: half of the nearest typical depth.
+
+    A path between the photos' cameras can lead through Gaussians that no photo has before it there. They would fill
+    the picture.
+
+    Args:
+        means: centres of the Gaussians, `(N, 3)`, in world units.
+        cameras: of the training photos.
+        near_plane: of the fit, in world units, which the result is not below.
+    """
+    return max(near_plane, _CLEAR * typical_depths(means, cameras)[0])
 
 
 def film_within(path: Path, most_bytes: int) -> bytes:

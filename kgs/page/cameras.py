@@ -1,7 +1,7 @@
 """The photos' cameras for the viewer: lenses, poses, what they see, which way is up, and how far they reach around."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,13 @@ _RING_GAP = 2 * math.pi / 3  # cameras with smaller gaps between them surround t
 _SWAY_POSES = 60
 
 
-def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[str], means: Tensor) -> dict[str, Any]:
+def viewer_scene(
+    cameras: PinholeCamera,
+    names: Sequence[str],
+    parts: Sequence[str],
+    means: Tensor,
+    psnr: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
     """The cameras, the one to open at, the upright direction and the size of the pyramids, as plain numbers for JSON.
 
     Convention:
@@ -32,11 +38,13 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
         names: the file names of their C photos.
         parts: what each photo was used for: "training", "test", or another word.
         means: centres of the Gaussians, `(N, 3)`, in world units. The viewer orbits a point at their median depth.
+        psnr: of the renders of photos, in dB, by their names, as far as it is known.
 
     Returns:
         cameras: for each camera its name, part, size (width, height), focal lengths and principal point (pixels),
             rotation, position, and the median depth of the Gaussians that it sees (distance).
-        first: index of the camera that the viewer opens at, the training camera nearest the mean pose.
+        first: index of the camera that the viewer opens at: among the third of the training cameras that are nearest
+            the mean pose the one of the highest PSNR, or the nearest where none is known.
         up: the upright direction in the world, of length 1.
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
@@ -63,7 +71,9 @@ def viewer_scene(cameras: PinholeCamera, names: Sequence[str], parts: Sequence[s
     depth = float(np.median([camera["distance"] for camera in found]))
     rotations = np.array([camera["rotation"] for camera in found])
     training = are_training(parts)
-    first = _nearest_mean_pose(rotations, positions / depth, training)
+    middle = _nearest_mean_pose(rotations, positions / depth, training)
+    known = psnr or {}
+    first = max(middle[: math.ceil(len(middle) / 3)], key=lambda i: known.get(names[i], -math.inf))
     up = common_up(cameras.extrinsics)
     path = tour(cameras.extrinsics[training], np.arange(_SWAY_POSES) / _SWAY_POSES, depth)
     return {
@@ -101,8 +111,8 @@ def visible_points(points: Array, k: Array, pose: Array, size: NDArray[np.intp],
     return inside
 
 
-def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bool]) -> int:
-    """Index of the training camera whose pose is nearest the mean of the training poses.
+def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bool]) -> list[int]:
+    """Indices of the training cameras, those first whose poses are nearest the mean of the training poses.
 
     Args:
         rotations: world to camera, `(C, 3, 3)`.
@@ -112,7 +122,8 @@ def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bo
     chosen = np.flatnonzero(training)
     # Rotation matrices that differ by a small angle have a distance of sqrt(2) times it.
     poses = np.concatenate([rotations.reshape(-1, 9), 2**0.5 * positions], axis=1)[chosen]
-    return int(chosen[np.linalg.norm(poses - poses.mean(axis=0), axis=1).argmin()])
+    distances = np.linalg.norm(poses - poses.mean(axis=0), axis=1)
+    return [int(i) for i in chosen[distances.argsort(kind="stable")]]
 
 
 def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Array) -> dict[str, Any]:

@@ -7,6 +7,9 @@ Positions are in world units, scales are natural logarithms. Quaternions w, x, y
 with the largest magnitude, which is positive and whose place is `largest`; the other three are stored in order.
 Harmonics are the signed square roots of the coefficients, so that small ones keep more digits: a coefficient is
 `value * |value|`. Their order is that of PLY files: by coefficient, then r, g, b.
+
+Foreign splats can hold values that are far from all others. A column that has some gets more bits, so that the others
+keep their digits; Gaussians that are far from everything are left out.
 """
 
 import math
@@ -20,6 +23,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs.geometry import camera_centers
 from kgs.harmonics import SH_C0
 from kgs.projection import finite_gaussians
 from kgs.types import SH_SIZES, Gaussians, RasterOptions
@@ -28,7 +32,12 @@ from .cameras import Array, lenses, visible_points
 
 PIXEL_ERROR = 0.01  # largest shift of a Gaussian's centre by rounding, in pixels of the given cameras
 FINE, COARSE = 16, 8  # bits per number
-_POSITION_BITS = 8, 32  # fewest and most bits of a coordinate
+_POSITION_BITS = 8, 48  # fewest and most bits of a coordinate
+_STRAY = 1e5  # times the median distance from the middle: no sky is so far away
+_MOST_COEFFICIENT = 1e4  # larger ones are lowered to this one, with which a colour is white or black, too
+_BULK = 0.99  # share of the values of a column whose digits are kept whatever the others are
+_MOST_SPREAD = 8.0  # times the range of these values: what the whole range may be without more bits
+_MOST_BITS = 48  # of any number: JavaScript has whole numbers of 53
 _MIN_SCALE = 1e-12  # smaller scales are raised to this one, whose logarithm is finite
 _CELL_BITS = 16  # bits per axis of the cells that sort Gaussians by their place
 _GZIP_HEADER = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # without file name, time and operating system
@@ -43,12 +52,15 @@ class Packed(NamedTuple):
         layout: what a viewer needs to decode the content: `count`, `degree` of the harmonics, and `columns` with the
             name, width, low and step of each.
         content: the planes of all columns as one gzip file.
-        left_out: what was reduced to respect the limit of size, in words; "" for nothing.
+        left_out: strays that were left out, and what was reduced to respect the limit of size, in words that follow "it
+            shows"; "" for nothing.
+        is_reduced: whether anything was reduced to respect the limit of size.
     """
 
     layout: dict[str, Any]
     content: bytes
-    left_out: str
+    left_out: str = ""
+    is_reduced: bool = False
 
 
 class Column(NamedTuple):
@@ -75,9 +87,10 @@ def pack(
 ) -> Packed:
     """Pack Gaussians into at most `most_bytes` bytes.
 
-    Invisible Gaussians are always left out: those that are not finite, or have an opacity below the alpha threshold. If
-    the rest is too large, first the numbers get fewer bits, then the harmonics a lower degree, and only then are
-    Gaussians left out.
+    Invisible Gaussians are always left out: those that are not finite, or have an opacity below the alpha threshold. So
+    are strays, which are more than 100 000 times as far from the middle as Gaussians or cameras are in the median; what
+    lies nearer may be seen when an eye turns, and stays. If the rest is too large, first the numbers get fewer bits,
+    then the harmonics a lower degree, and only then are Gaussians left out.
 
     Args:
         gaussians: with harmonics, or RGB colours `(N, 3)`.
@@ -94,13 +107,17 @@ def pack(
     if values["colors"].ndim == 2:
         values["colors"] = (values["colors"][:, None] - 0.5) / SH_C0
     finite = finite_gaussians(gaussians).cpu().numpy()
-    rows = np.flatnonzero(finite & (values["opacities"] >= RasterOptions.alpha_threshold))
+    visible = np.flatnonzero(finite & (values["opacities"] >= RasterOptions.alpha_threshold))
+    rows = visible[~_strays(values["means"][visible], cameras)]
+    strays = len(visible) - len(rows)
+    words = [f"all but {strays} stray Gaussian{'s' if strays > 1 else ''}"] if strays else []
     values = {name: value[rows] for name, value in values.items()}
+    values["colors"] = values["colors"].clip(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)
     degree = SH_SIZES.index(values["colors"].shape[1])
-    packed, reductions = Packed({}, b"", ""), list[str]()
+    packed, reductions = Packed({}, b""), list[str]()
     for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
         if len(packed.content) <= most_bytes:
-            return packed._replace(left_out=", ".join(reductions))
+            return packed._replace(left_out=", ".join(words + reductions), is_reduced=bool(reductions))
     contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
     order = np.argsort(-contributions, kind="stable")
     kept = len(rows)
@@ -110,7 +127,20 @@ def pack(
             raise ValueError(f"most_bytes: expected room for a Gaussian, got {most_bytes} bytes")
         chosen = {name: value[order[:kept]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
-    return packed._replace(left_out=", ".join([*reductions, f"{kept} of {len(rows)} Gaussians"]))
+    words += [*reductions, f"{kept} of {len(rows)} Gaussians"]
+    return packed._replace(left_out=", ".join(words), is_reduced=True)
+
+
+def _strays(means: Array, cameras: PinholeCamera) -> NDArray[np.bool_]:
+    """Which of the centres `(N, 3)` are far from all others and from the cameras, and so no part of a scene."""
+    if not len(means):
+        return np.zeros(0, bool)
+    middle = np.median(means, axis=0)
+    distances = np.linalg.norm(means - middle, axis=1)
+    to_cameras = np.linalg.norm(camera_centers(cameras.extrinsics).numpy() - middle, axis=1)
+    usual = max(np.median(distances), np.median(to_cameras))
+    found: NDArray[np.bool_] = (distances > _STRAY * usual) & (usual > 0)
+    return found
 
 
 def _with_all_gaussians(
@@ -155,7 +185,7 @@ def _gzip(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
         size += len(planes)
     blocks = b"".join(deflated for _, deflated in columns)
     trailer = struct.pack("<II", checksum, size % 2**32)
-    return Packed(layout, _GZIP_HEADER + blocks + _LAST_BLOCK + trailer, "")
+    return Packed(layout, _GZIP_HEADER + blocks + _LAST_BLOCK + trailer)
 
 
 def _columns(values: dict[str, Array], pixels_per_unit: float, bits: int, degree: int) -> Iterator[Column]:
@@ -166,7 +196,7 @@ def _columns(values: dict[str, Array], pixels_per_unit: float, bits: int, degree
     for name, column in zip("xyz", means.T, strict=True):
         span = float(np.ptp(column)) if len(column) else 0.0
         needed = math.ceil(math.log2(span / largest_step + 2))
-        yield _fixed_point(name, column, min(most_bits, max(least_bits, needed)))
+        yield _spread_out(name, column, min(most_bits, max(least_bits, needed)))
 
     for axis, column in enumerate(np.log(values["scales"].clip(_MIN_SCALE)).T):
         yield _fixed_point(f"scale{axis}", column, bits)
@@ -190,6 +220,16 @@ def _columns(values: dict[str, Array], pixels_per_unit: float, bits: int, degree
 
 
 def _fixed_point(name: str, values: Array, bits: int) -> Column:
+    """A column whose integers of `bits` bits, or more where few values are far from all others, cover the values."""
+    if not len(values):
+        return _spread_out(name, values, bits)
+    bulk = 2 * float(np.quantile(np.abs(values - np.median(values)), _BULK, method="lower"))
+    spread = float(np.ptp(values)) / (_MOST_SPREAD * bulk) if bulk > 0 else 0.0
+    more = math.ceil(math.log2(spread)) if spread > 1 else 0
+    return _spread_out(name, values, min(_MOST_BITS, bits + more))
+
+
+def _spread_out(name: str, values: Array, bits: int) -> Column:
     """A column whose integers of `bits` bits cover the range of the values."""
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     step = (high - low) / (2**bits - 1) or 1.0

@@ -174,3 +174,9 @@ def _as_text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float) else without_folders(value)
+
+
+def psnr_of_views(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The PSNR of each view that has one, in dB, by the name of the view."""
+    parts = [metrics.get(part) or {} for part in ("test", "train", "views")]
+    return {row["name"]: row["psnr"] for part in parts for row in part.get("views", []) if row["psnr"] is not None}

@@ -1,6 +1,7 @@
 """The page of a fit, index.html: collects the content for :func:`kgs.page.write_page` from a fit and its files."""
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
-from kgs.datasets.scene import Scene, Views
+from kgs.datasets.scene import Views
 from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
 from kgs.fit.fit import Fit
@@ -21,25 +22,20 @@ from kgs.io.console import each
 from kgs.io.film import film_within
 from kgs.io.outputs import film_in
 from kgs.json_files import read_json
-from kgs.model import GaussianModel
 
 from . import Picture, write_page
+from .figures import psnr_of_views
 from .write import MOST_FILM_BYTES
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
-
-Render = Callable[[PinholeCamera], Tensor]
+_BORDER = 0.03  # of the shorter side of a photo: the band whose mean is the ground of the viewer
 
 
 def write_fit_page(
     path: Path,
     title: str,
-    scene: Scene,
-    model: GaussianModel,
-    near_plane: float,
-    renders: Mapping[str, Render],
-    runs: Mapping[str, Mapping[str, Any]],
+    fits: Mapping[str, Fit],
     *,
     shown: Views | None = None,
     words: tuple[str, str] = ("training", "test"),
@@ -50,16 +46,12 @@ def write_fit_page(
     photos: bool = True,
     roll: float = 0.0,
 ) -> str:
-    """Write the page of one or more fits of a scene; the viewer shows one of them.
+    """Write the page of one or more fits of a scene; the viewer shows the last of them.
 
     Args:
         path: the file to write.
         title: of the page.
-        scene: photos and cameras.
-        model: the splat in the viewer.
-        near_plane: of the model's renderer, in world units.
-        renders: functions from a camera to an image `(1, 3, H, W)`, by the name of the run.
-        runs: the content of metrics.json, by the name of the run.
+        fits: of one scene, with metrics, by the name of the run; "" for a single one.
         shown: the views to show beside their renders; only these need pixels. None: up to `MOST_PICTURES` test views,
             or training views if there are no test views.
         words: what training and test views are called.
@@ -71,29 +63,19 @@ def write_fit_page(
         roll: degrees by which all pictures are turned clockwise, see :func:`kgs.io.cameras.rolled`.
 
     Returns:
-        What was reduced to respect the page's limit of size, in words; "" for nothing.
+        What the viewer shows less than the model, in words; "" for nothing.
     """
+    fit = list(fits.values())[-1]
+    scene = fit.scene
     views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
-    shown = rolled(shown or views.select(spread(len(views), MOST_PICTURES)), roll)
+    photographed = shown or views.select(spread(len(views), MOST_PICTURES))
+    shown = rolled(photographed, roll)
     if not photos:
         shown = shown.select([])
-    psnr = {run: _psnr_of_views(metrics) for run, metrics in runs.items()}
-    pictures = list[Picture]()
-    for i in each(range(len(shown)), "page", "view"):
-        name, camera = shown.names[i], shown.camera(i)
-        images = {run: shown.as_photo(render(camera)[0]) for run, render in renders.items()}
-        values = [f"{run} {psnr[run][name]:.2f} dB".strip() for run in renders if name in psnr.get(run, {})]
-        caption = f"{name}: {', '.join(values)}" if values else name
-        pictures.append(Picture(name, shown.images[i], images, caption))
-    found: dict[str, Any] = {}
-    if report is not None and report.is_file():
-        with suppress(DataError):
-            found = read_json(report)
     with torch.no_grad():
-        gaussians = model()
-    remarks = list[str]()
-    for run, metrics in runs.items():
-        remarks += [*_coverage_note(metrics, run), *_poses_note(metrics)]
+        gaussians = fit.model()
+    runs = {run: one.metrics for run, one in fits.items()}
+    first = next(iter(runs.values()))
     return write_page(
         path,
         title,
@@ -101,18 +83,19 @@ def write_fit_page(
         _all_cameras(rolled(scene.train, roll), rolled(scene.test, roll)),
         [*scene.train.names, *scene.test.names],
         [words[0]] * len(scene.train) + [words[1]] * len(scene.test),
-        near_plane=near_plane,
-        background=scene.background,
-        pictures=pictures,
+        near_plane=fit.options.near_plane,
+        background=_ground(photographed, scene.background),
+        antialiased=fit.options.antialiased,
+        pictures=_pictures(shown, fits),
         pictures_note=_pictures_note(len(shown), len(views), word),
-        film=film_within(film, MOST_FILM_BYTES) if film is not None else b"",
+        film=b"" if film is None else film_within(film, MOST_FILM_BYTES),
         runs=runs,
-        left_out=left_out(next(iter(runs.values()), {}).get("needs") or {}),
+        left_out=left_out(first.get("needs") or {}),
         notes=notes,
-        remarks=remarks,
+        remarks=_remarks(runs),
         settings=_settings(settings or {}),
-        report=_report_facts(found),
-        weights=lambda: contributions(model, scene.train, near_plane),
+        report=_report_facts(_read_report(report)),
+        weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
     )
 
 
@@ -121,17 +104,59 @@ def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> 
     write_fit_page(
         folder / PAGE,
         request.title_of(out),
-        fit.scene,
-        fit.model,
-        fit.options.near_plane,
-        {"": fit.render},
-        {"": fit.metrics},
+        {"": fit},
         settings=read_json(folder / "config.json"),
         report=fit.scene.root / CAMERAS_REPORT,
         film=film_in(folder),
         photos=request.photos,
         roll=request.roll,
     )
+
+
+def _pictures(views: Views, fits: Mapping[str, Fit]) -> list[Picture]:
+    """The photos of some views beside the renders of each fit."""
+    levels = {run: psnr_of_views(fit.metrics) for run, fit in fits.items()}
+    pictures = []
+    for i in each(range(len(views)), "page", "view"):
+        name = views.names[i]
+        renders = {run: views.as_photo(fit.render(views.camera(i))[0]) for run, fit in fits.items()}
+        values = [f"{run} {levels[run][name]:.2f} dB".strip() for run in fits if name in levels[run]]
+        caption = f"{name}: {', '.join(values)}" if values else name
+        pictures.append(Picture(name, views.images[i], renders, caption))
+    return pictures
+
+
+def _read_report(path: Path | None) -> dict[str, Any]:
+    """The content of a JSON file; nothing if it does not exist or cannot be read."""
+    if path is not None and path.is_file():
+        with suppress(DataError):
+            return read_json(path)
+    return {}
+
+
+def _remarks(runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Sentences about coverage and moved cameras."""
+    remarks = []
+    for run, metrics in runs.items():
+        remarks += [*_coverage_note(metrics, run), *_poses_note(metrics)]
+    return remarks
+
+
+def _ground(views: Views, background: Tensor) -> Tensor:
+    """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border instead of black.
+
+    Photos with transparency show a thing before `background`; it is returned then, and where it was chosen: not black.
+    """
+    if views.masks is not None or not len(views) or bool(background.any()):
+        return background
+    height, width = views.images.shape[-2:]
+    band = math.ceil(_BORDER * min(height, width))
+    border = torch.ones(height, width, dtype=torch.bool)
+    border[band : height - band, band : width - band] = False
+    usable = torch.ones_like(border) if views.light is None else views.light.cpu() >= 1
+    rows = border & usable if bool((border & usable).any()) else usable
+    ground: Tensor = views.images.cpu()[:, :, rows].mean((0, 2)) if bool(rows.any()) else background
+    return ground
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -182,12 +207,6 @@ def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
     mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
     most = f"{poses['most_degrees']:.2f} degrees and {100 * poses['most_depths']:.2f} %"
     return [f"The fit moved the training cameras by {mean} in the mean, and by at most {most}."]
-
-
-def _psnr_of_views(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The PSNR of each view that has one, by the name of the view."""
-    parts = [metrics.get(part) or {} for part in ("test", "train", "views")]
-    return {row["name"]: row["psnr"] for part in parts for row in part.get("views", []) if row["psnr"] is not None}
 
 
 def _all_cameras(*parts: Views) -> PinholeCamera:

@@ -1,11 +1,10 @@
 "use strict";
-// Decodes a splat (the format is described in kgs/page/data.py) and draws it with WebGL2, sorted from back to front. What
-// no photo shows fades (kgs/page/seen.py).
+// Decodes a splat (the format is described in kgs/page/data.py) and draws it with WebGL2, sorted from back to front.
 
 const TEXELS_PER_ROW = 2048;
 const FLOATS_PER_GAUSSIAN = 12;  // in the geometry texture, see splat.vert.glsl
 
-const COVERAGE_PIXELS = 4;  // of the canvas, along one side of a pixel of the coverage
+const SAMPLE_PIXELS = 64;  // of the longer side of the small image that tells how much of the canvas is covered
 
 // The bytes of a gzip file that is encoded in base64.
 async function unzipped(base64) {
@@ -95,21 +94,6 @@ function harmonicsTexels(columns, count, coefficients) {
   return harmonics;
 }
 
-// The depths that the photos show and the cameras of these photos, as the content of two textures.
-async function decodeSeen({ layout, content }, cameras) {
-  const { views, width, height } = layout;
-  const planes = await unzipped(content);
-  const count = views.length * width * height;
-  const depths = new Uint8Array(2 * count);
-  for (let i = 0; i < count; i++) depths.set([planes[i], planes[count + i]], 2 * i);
-  const lenses = views.flatMap((view) => {
-    const { rotation, position, focal, centre } = cameras[view];
-    const rows = rotation.map((row) => [...row, -row.reduce((sum, value, i) => sum + value * position[i], 0)]);
-    return [...rows.flat(), ...focal, ...centre, ...position, 0];
-  });
-  return { layout, depths, lenses: new Float32Array(lenses), photoSize: cameras[views[0]].size };
-}
-
 // Sorts Gaussians by depth, exactly: a radix sort with two passes over 16 bits each. The bits of positive floats, read
 // as integers, have the order of the floats.
 class DepthOrder {
@@ -182,12 +166,12 @@ class Program {
 
 // A texture that can be drawn to.
 class Target {
-  constructor(gl, unit, [format, channels, type], filter) {
+  constructor(gl, unit, [format, channels, type]) {
     Object.assign(this, { gl, unit, format, channels, type, texture: gl.createTexture() });
     this.framebuffer = gl.createFramebuffer();
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, filter);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
     for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
   }
 
@@ -211,33 +195,26 @@ class Target {
 }
 
 // Texture units.
-const GEOMETRY = 0, HARMONICS = 1, PICTURE = 2, DEPTH = 3, SEEN = 4, LENSES = 5, COVERAGE = 6, SMOOTH = 7;
+const GEOMETRY = 0, HARMONICS = 1, PICTURE = 2, SAMPLE = 3;
 
 class SplatRenderer {
-  // `shaders` holds the sources by name. `settings` has nearPlane (world units), lowPass (variance in square pixels of
-  // a photo), margin (share of a photo's size) and background (RGB). `seen` comes from `decodeSeen`.
-  constructor(canvas, splat, seen, shaders, settings) {
+  // `shaders` holds the sources by name. `settings` has nearPlane and farNearPlane (world units), lowPass (variance in
+  // square pixels of a photo), antialiased, margin (share of a photo's size) and background (RGB).
+  constructor(canvas, splat, shaders, settings) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
     if (!gl) throw new Error("this browser has no WebGL2");
-    Object.assign(this, { canvas, gl, splat, seen, settings });
+    Object.assign(this, { canvas, gl, splat, settings });
     this.order = new DepthOrder(splat.count);
+    this.everyGaussian = Uint32Array.from({ length: splat.count }, (_, i) => i);
     const hasFloatTargets = Boolean(gl.getExtension("EXT_color_buffer_float"));  // otherwise blending has 8 bits
-    const half = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
-    this.canFade = hasFloatTargets;
+    const bytes = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
+    const halfFloats = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
     this.splatProgram = new Program(gl, shaders.splatVertex, shaders.splatFragment);
     this.screenProgram = new Program(gl, shaders.screenVertex, shaders.screenFragment);
-    this.picture = new Target(gl, PICTURE, hasFloatTargets ? half : [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], gl.NEAREST);
-    if (this.canFade) {
-      this.depthProgram = new Program(gl, shaders.splatVertex, shaders.depthFragment);
-      this.coverageProgram = new Program(gl, shaders.screenVertex, shaders.coverageFragment);
-      this.smoothingProgram = new Program(gl, shaders.screenVertex, shaders.smoothingFragment);
-      this.depth = new Target(gl, DEPTH, half, gl.NEAREST);
-      this.coverage = new Target(gl, COVERAGE, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.NEAREST);
-      this.smooth = new Target(gl, SMOOTH, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], gl.LINEAR);
-      this.uploadSeen();
-    }
-    this.upload(GEOMETRY, gl.RGBA32F, TEXELS_PER_ROW, splat.geometry);
-    this.upload(HARMONICS, gl.RGBA16F, TEXELS_PER_ROW, splat.harmonics);
+    this.picture = new Target(gl, PICTURE, hasFloatTargets ? halfFloats : bytes);
+    this.sample = new Target(gl, SAMPLE, bytes);
+    this.upload(GEOMETRY, gl.RGBA32F, splat.geometry);
+    this.upload(HARMONICS, gl.RGBA16F, splat.harmonics);
     this.addBuffer(0);  // the corners of a quadrilateral
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
     gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
@@ -247,27 +224,14 @@ class SplatRenderer {
   }
 
   // A texture of four floats per texel.
-  upload(unit, format, width, values) {
+  upload(unit, format, values) {
     const { gl } = this;
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, values.length / 4 / width, 0, gl.RGBA, gl.FLOAT, values);
+    const rows = values.length / 4 / TEXELS_PER_ROW;
+    gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXELS_PER_ROW, rows, 0, gl.RGBA, gl.FLOAT, values);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  }
-
-  uploadSeen() {
-    const { gl } = this;
-    const { views, width, height } = this.seen.layout;
-    this.upload(LENSES, gl.RGBA32F, 5, this.seen.lenses);
-    gl.activeTexture(gl.TEXTURE0 + SEEN);
-    gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    gl.texImage3D(
-      gl.TEXTURE_2D_ARRAY, 0, gl.RG8, width, height, views.length, 0, gl.RG, gl.UNSIGNED_BYTE, this.seen.depths,
-    );
-    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   }
 
   // A buffer for the vertex attribute at this location.
@@ -279,7 +243,7 @@ class SplatRenderer {
     return buffer;
   }
 
-  // Sets the size of the canvas, and with it of all targets, in pixels.
+  // Sets the size of the canvas, and with it of both targets, in pixels.
   resize(width, height) {
     const { canvas } = this;
     if (canvas.width === width && canvas.height === height && this.hasSize) return;
@@ -287,9 +251,8 @@ class SplatRenderer {
     canvas.height = height;
     this.hasSize = true;
     this.picture.resize(width, height);
-    if (!this.canFade) return;
-    const fewer = [width, height].map((side) => Math.ceil(side / COVERAGE_PIXELS));
-    for (const target of [this.depth, this.coverage, this.smooth]) target.resize(...fewer);
+    const shrink = Math.min(1, SAMPLE_PIXELS / Math.max(width, height));
+    this.sample.resize(...[width, height].map((side) => Math.max(1, Math.round(shrink * side))));
   }
 
   // Smallest and largest x/z and y/z at which footprints are linearised: those of the photo's frame and a margin around
@@ -302,62 +265,54 @@ class SplatRenderer {
     ];
   }
 
-  // Draws what a camera sees. `camera` has rotation (rows), position, distance (to what it looks at), and size, focal
-  // and centre in pixels of the photo; `view` has focal and centre in pixels of the canvas, and scale, the number of
-  // these per pixel of the photo. With `fades`, what no photo shows fades to the background.
-  draw(camera, view, fades) {
+  // Draws what a camera sees. `camera` has rotation (rows), position, nearPlane, and size, focal and centre in pixels of
+  // the photo; `view` has focal and centre in pixels of the canvas, and scale, the number of these per pixel of the
+  // photo.
+  draw(camera, view) {
     const { gl, canvas, settings, splat } = this;
-    const { rotation, position } = camera;
-    const [leastTangent, largestTangent] = this.tangentLimits(camera);
-    const eye = {
-      rotation, position, focal: view.focal, centre: view.centre, size: [canvas.width, canvas.height],
-    };
-    const footprints = {
-      ...eye, leastTangent, largestTangent, nearPlane: settings.nearPlane,
-      // On a canvas larger than the photo, the low-pass filter is enlarged too: it shows the fitted image, enlarged.
-      lowPass: settings.lowPass * Math.max(1, view.scale ** 2),
-    };
-    const sorted = this.order.sort(splat.geometry, rotation, position, settings.nearPlane);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-    gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.DYNAMIC_DRAW);
-
+    const sorted = this.order.sort(splat.geometry, camera.rotation, camera.position, camera.nearPlane);
     this.picture.begin(...settings.background, 1);
-    this.drawGaussians(this.splatProgram, footprints, sorted.length);
-    if (fades && this.canFade) {
-      this.depth.begin(0, 0, 0, 0);
-      this.drawGaussians(this.depthProgram, { ...footprints, depthUnit: camera.distance }, sorted.length);
-      this.drawCoverage({ ...eye, depthUnit: camera.distance });
-    }
+    this.drawGaussians(camera, view, this.picture, sorted);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, canvas.width, canvas.height);
-    this.screenProgram.use({ picture: PICTURE, coverage: this.canFade ? SMOOTH : PICTURE }, {
-      ground: settings.background, fades: Number(fades && this.canFade),
-    });
+    this.screenProgram.use({ picture: PICTURE }, {});
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
 
-  drawGaussians(program, uniforms, count) {
-    const { gl } = this;
-    program.use({ geometry: GEOMETRY, harmonics: HARMONICS }, uniforms);
-    gl.uniform1i(program.location("texelsPerRow"), TEXELS_PER_ROW);
-    gl.uniform1i(program.location("coefficients"), this.splat.coefficients);
+  // The share of the canvas that the splat covers: its mean alpha, which does not depend on the order.
+  coverage(camera, view) {
+    const { gl, canvas, sample } = this;
+    const shrink = sample.width / canvas.width;
+    sample.begin(0, 0, 0, 0);
+    this.drawGaussians(camera, {
+      scale: shrink * view.scale,
+      focal: view.focal.map((value) => shrink * value),
+      centre: view.centre.map((value) => shrink * (value + 0.5) - 0.5),
+    }, sample, this.everyGaussian);
+    const pixels = new Uint8Array(4 * sample.width * sample.height);
+    gl.readPixels(0, 0, sample.width, sample.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    let sum = 0;
+    for (let i = 3; i < pixels.length; i += 4) sum += pixels[i];
+    return 4 * sum / (255 * pixels.length);
+  }
+
+  // Blends Gaussians over a target, in the order of their indices.
+  drawGaussians(camera, view, target, indices) {
+    const { gl, settings } = this;
+    const [leastTangent, largestTangent] = this.tangentLimits(camera);
+    this.splatProgram.use({ geometry: GEOMETRY, harmonics: HARMONICS }, {
+      rotation: camera.rotation, position: camera.position, nearPlane: camera.nearPlane, leastTangent, largestTangent,
+      focal: view.focal, centre: view.centre, size: [target.width, target.height],
+      // On a canvas larger than the photo, the low-pass filter is enlarged too: it shows the fitted image, enlarged.
+      lowPass: settings.lowPass * Math.max(1, view.scale ** 2), antialiased: Number(settings.antialiased),
+    });
+    gl.uniform1i(this.splatProgram.location("texelsPerRow"), TEXELS_PER_ROW);
+    gl.uniform1i(this.splatProgram.location("coefficients"), this.splat.coefficients);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
+    gl.bufferData(gl.ARRAY_BUFFER, indices, gl.DYNAMIC_DRAW);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, indices.length);
     gl.disable(gl.BLEND);
-  }
-
-  // How far the photos show what each pixel shows, with fewer pixels than the canvas.
-  drawCoverage(eye) {
-    const { gl } = this;
-    const { cell, low, step } = this.seen.layout;
-    this.coverage.begin(0, 0, 0, 0);
-    this.coverageProgram.use({ splat: DEPTH, depths: SEEN, lenses: LENSES }, {
-      ...eye, cell, depthCode: [low, step], photoSize: this.seen.photoSize,
-    });
-    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
-    this.smooth.begin(0, 0, 0, 0);
-    this.smoothingProgram.use({ coverage: COVERAGE }, {});
-    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
 }

@@ -15,13 +15,14 @@ uniform vec2 size;            // of the canvas, in pixels
 uniform vec2 leastTangent, largestTangent;  // limits of x/z and y/z at which footprints are linearised
 uniform float nearPlane;      // in world units
 uniform float lowPass;        // variance added to footprints, in square pixels
+uniform float antialiased;    // 1 or 0: whether footprints that the low-pass filter widens get fainter
 in vec2 corner;               // -1 or 1
 in uint gaussian;             // index
 out vec2 offset;              // from the centre, in standard deviations
 flat out vec4 colour;         // and opacity
-flat out float depth;         // of the centre, in world units
 
 const float ALPHA_THRESHOLD = 1.0 / 255.0;
+const float LARGEST_COLOUR = 65504.0;  // of half floats, which are blended
 
 vec4 texel(sampler2D source, int index) {
   return texelFetch(source, ivec2(index % texelsPerRow, index / texelsPerRow), 0);
@@ -49,7 +50,7 @@ vec3 colourTowards(vec3 direction) {
     sum -= 0.45704580 * (4.0 * zz - xx - yy) * (y * coefficient(11) + x * coefficient(13));
     sum += 0.37317633 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(12);
   }
-  return max(sum, 0.0);
+  return clamp(sum, 0.0, LARGEST_COLOUR);
 }
 
 void main() {
@@ -62,8 +63,7 @@ void main() {
 
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside of the clip volume: nothing is drawn
   vec3 point = rotation * (mean - position);
-  float radius = sqrt(2.0 * log(max(opacity / ALPHA_THRESHOLD, 1.0)));  // where alpha is cut, in standard deviations
-  if (point.z <= nearPlane || radius == 0.0) return;
+  if (point.z <= nearPlane) return;
 
   // The first-order footprint: the covariance in pixels of the canvas.
   vec2 tangent = clamp(point.xy / point.z, leastTangent, largestTangent);
@@ -73,6 +73,12 @@ void main() {
   float xx = footprint[0][0] + lowPass;
   float xy = footprint[0][1];
   float yy = footprint[1][1] + lowPass;
+  if (antialiased > 0.0) {
+    float sharp = footprint[0][0] * footprint[1][1] - xy * xy;
+    opacity *= sqrt(max(sharp, 0.0) / (sharp + lowPass * (footprint[0][0] + yy)));  // of both determinants
+  }
+  float radius = sqrt(2.0 * log(max(opacity / ALPHA_THRESHOLD, 1.0)));  // where alpha is cut, in standard deviations
+  if (radius == 0.0) return;
 
   // Its principal axes.
   float average = 0.5 * (xx + yy);
@@ -84,6 +90,5 @@ void main() {
   vec2 shift = offset.x * deviations.x * axis + offset.y * deviations.y * vec2(-axis.y, axis.x);
   vec2 pixel = focal * point.xy / point.z + centre + shift;
   gl_Position = vec4(vec2(2.0, -2.0) * (pixel + 0.5) / size + vec2(-1.0, 1.0), 0.0, 1.0);
-  depth = point.z;
   colour = vec4(colourTowards(normalize(mean - position)), opacity);
 }

@@ -15,6 +15,10 @@ const FLIGHT_MILLISECONDS = 700;
 const STEEPEST = 1.5;  // largest angle above or below the horizon, in radians
 const ROAMING_ARC = Math.PI;  // radians that a drag across the stage turns where the cameras set no limit
 const SOFT_END = 0.25;  // how far beyond the arc of the cameras the eye can turn, as a share of the arc
+const LEAST_COVERAGE = 1 / 3;  // of the stage, by the splat: where the eye roams to
+const LEAST_PART = 1 / 2;  // likewise, of what it covers from the photo's camera, where that is less
+const ROAMING_STEP = 0.1;  // radians: how finely this is tested
+const NEAR_CAMERA = 0.02;  // of the distance: an eye farther than this from all cameras is beside them
 const LEAST_ZOOM = 0.3, MOST_ZOOM = 3;  // of the distance at the camera that the eye was last placed at
 const SWAY_SECONDS_PER_CAMERA = 4;
 const SWAY_BEGIN_SECONDS = 2;
@@ -44,6 +48,11 @@ function softened(change, angle, [low, high]) {
   return clamped(angle + share * change, least, most) - angle;
 }
 
+// The point that an eye turns around.
+function target({ position, rotation, distance }) {
+  return add(position, rotation[2], distance);
+}
+
 class Viewer {
   // `scene` is what `viewer_scene` of kgs/page/cameras.py returns.
   constructor(frame, renderer, scene) {
@@ -58,7 +67,6 @@ class Viewer {
     this.dragged = 0;  // pixels since the pointer was pressed
     this.pyramids = scene.cameras.map((camera, index) => this.addPyramid(camera, index));
     this.quarters = 0;  // by which all pictures are turned clockwise
-    this.isFading = true;
     this.isRoaming = false;
     this.isEngaged = false;  // the last press of a pointer was on the stage
     this.isSwaying = false;
@@ -77,6 +85,8 @@ class Viewer {
     this.eye = { rotation, position, distance, size, focal, centre };
     this.usualDistance = distance;
     this.choice.value = index;
+    this.usualCoverage = null;  // not measured yet
+    this.roamedTo = null;  // the last direction in which the splat was found to cover twice what is enough
   }
 
   // Moves the eye to a camera smoothly.
@@ -151,11 +161,6 @@ class Viewer {
     this.requestDraw();
   }
 
-  // The point that the eye turns around.
-  target() {
-    return add(this.eye.position, this.eye.rotation[2], this.eye.distance);
-  }
-
   // Radians that the eye turns by for one pixel of a drag: across the stage it is the arc of the cameras.
   turnPerPixel() {
     const { yaw } = this.scene.arc;
@@ -164,7 +169,33 @@ class Viewer {
 
   // Turns the eye around its target by angles in radians: `yaw` about the upright axis, `pitch` about the horizontal.
   turn(yaw, pitch) {
-    const { rotation, distance } = this.eye;
+    const farthest = Math.max(Math.abs(yaw), Math.abs(pitch));
+    const steps = this.isRoaming ? Math.max(1, Math.ceil(farthest / ROAMING_STEP)) : 1;
+    let { eye } = this;
+    for (let i = 0; i < steps; i++) {
+      const next = this.turned(eye, yaw / steps, pitch / steps);
+      if (this.isRoaming && !this.showsEnough(next, eye)) break;
+      eye = next;
+    }
+    this.change(eye);
+  }
+
+  // Whether the splat covers enough of the stage there, or at least not less than from `before`.
+  showsEnough(eye, before) {
+    const ahead = eye.rotation[2];
+    if (this.roamedTo && dot(ahead, this.roamedTo) > Math.cos(ROAMING_STEP / 2)) return true;
+    const coverage = (from) => this.renderer.coverage(this.withNearPlane(from), this.viewOf(from));
+    this.usualCoverage ??= coverage(this.scene.cameras[this.choice.value]);
+    const farther = Math.max(1, eye.distance / this.usualDistance);
+    const least = Math.min(LEAST_COVERAGE, LEAST_PART * this.usualCoverage) / farther ** 2;
+    const covered = coverage(eye);
+    if (covered >= 2 * least) this.roamedTo = ahead;
+    return covered >= least || covered >= coverage(before);
+  }
+
+  // An eye that is turned around its target.
+  turned(eye, yaw, pitch) {
+    const { rotation, distance } = eye;
     const { up, arc } = this.scene;
     const back = rotation[2].map((value) => -value);
     const elevation = Math.asin(clamped(dot(up, back), -1, 1));
@@ -179,7 +210,7 @@ class Viewer {
     }
     raised = clamped(elevation + raised, -STEEPEST, STEEPEST) - elevation;
     const rows = rotation.map((row) => rotated(rotated(row, rotation[0], -raised), up, around));
-    this.change({ rotation: rows, position: add(this.target(), rows[2], -distance) });
+    return { ...eye, rotation: rows, position: add(target(eye), rows[2], -distance) };
   }
 
   // Multiplies the distance to the target.
@@ -187,7 +218,7 @@ class Viewer {
     const distance = clamped(
       this.eye.distance * factor, LEAST_ZOOM * this.usualDistance, MOST_ZOOM * this.usualDistance,
     );
-    this.change({ distance, position: add(this.target(), this.eye.rotation[2], -distance) });
+    this.change({ distance, position: add(target(this.eye), this.eye.rotation[2], -distance) });
   }
 
   // Moves the eye sideways so that its target follows the pointer, by pixels of the page.
@@ -223,6 +254,30 @@ class Viewer {
     return Math.min(this.canvas.clientWidth / width, this.canvas.clientHeight / height);
   }
 
+  // The lens of an eye in pixels of the canvas.
+  viewOf({ size, focal, centre }) {
+    const { canvas } = this;
+    const ratio = Math.min(2, window.devicePixelRatio || 1);  // pixels of the canvas per pixel of the page
+    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    const scale = ratio * this.scale();
+    const borders = sides.map((side, axis) => (side - scale * size[axis]) / 2);
+    return {
+      scale,
+      ratio,
+      sides,
+      focal: focal.map((value) => scale * value),
+      centre: centre.map((value, axis) => borders[axis] + scale * (value + 0.5) - 0.5),  // integer pixel centres
+    };
+  }
+
+  // An eye with its near plane: that of the fit at a photo's camera, farther away beside it.
+  withNearPlane(eye) {
+    const { nearPlane, farNearPlane } = this.renderer.settings;
+    const distances = this.scene.cameras.map(({ position }) => Math.hypot(...add(position, eye.position, -1)));
+    const share = clamped(Math.min(...distances) / (NEAR_CAMERA * eye.distance), 0, 1);
+    return { ...eye, nearPlane: nearPlane + share * (farNearPlane - nearPlane) };
+  }
+
   // Draws with the next frame of the browser, once.
   requestDraw() {
     if (this.redrawRequested) return;
@@ -234,20 +289,10 @@ class Viewer {
   }
 
   draw() {
-    const { canvas, eye } = this;
-    const ratio = Math.min(2, window.devicePixelRatio || 1);  // pixels of the canvas per pixel of the page
-    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
-    const scale = ratio * this.scale();
-    const borders = sides.map((side, axis) => (side - scale * eye.size[axis]) / 2);
-    this.view = {
-      scale,
-      ratio,
-      sides,
-      focal: eye.focal.map((value) => scale * value),
-      centre: eye.centre.map((value, axis) => borders[axis] + scale * (value + 0.5) - 0.5),  // integer pixel centres
-    };
-    this.renderer.resize(...sides);
-    this.renderer.draw(eye, this.view, this.isFading);
+    const { eye } = this;
+    this.view = this.viewOf(eye);
+    this.renderer.resize(...this.view.sides);
+    this.renderer.draw(this.withNearPlane(eye), this.view);
     this.drawPyramids();
   }
 
@@ -373,12 +418,6 @@ class Viewer {
     };
     addSwitch(".roam", () => this.isRoaming = !this.isRoaming);
     addSwitch(".pyramids", () => !this.overlay.toggleAttribute("hidden"));
-    frame.querySelector(".fade").hidden = !this.renderer.canFade;
-    addSwitch(".fade", () => {
-      this.isFading = !this.isFading;
-      this.requestDraw();
-      return this.isFading;
-    });
     const full = frame.querySelector(".full");
     full.hidden = !document.fullscreenEnabled;
     full.addEventListener("click", () => {
@@ -392,13 +431,10 @@ async function openViewer() {
   const frame = document.querySelector(".viewer");
   const canvas = frame.querySelector("canvas");
   const text = (id) => document.getElementById(id).textContent;
-  const { layout, content, seen, scene, settings } = JSON.parse(text("splat"));
+  const { layout, content, scene, settings } = JSON.parse(text("splat"));
   const shaders = {
     splatVertex: text("splat-vertex"),
     splatFragment: text("splat-fragment"),
-    depthFragment: text("depth-fragment"),
-    coverageFragment: text("coverage-fragment"),
-    smoothingFragment: text("smoothing-fragment"),
     screenVertex: text("screen-vertex"),
     screenFragment: text("screen-fragment"),
   };
@@ -414,11 +450,10 @@ async function openViewer() {
       show("failed", `The viewer cannot run here: ${error.message}.`);
     }
   };
-  let splat, photos;
-  const newRenderer = () => new SplatRenderer(canvas, splat, photos, shaders, settings);
+  let splat;
+  const newRenderer = () => new SplatRenderer(canvas, splat, shaders, settings);
   await attempt(async () => {
     splat = await decodeSplat(layout, content);
-    photos = await decodeSeen(seen, scene.cameras);
     window.viewer = new Viewer(frame, newRenderer(), scene);
   });
   // Browsers release the graphics context of pages in the background, and restore it later.

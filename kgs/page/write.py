@@ -7,19 +7,20 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.camera import MARGIN
+from kgs.io.film import path_near_plane
 from kgs.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 from kgs.version import __version__
 
 from .cameras import are_training, viewer_scene
 from .data import Packed, pack
-from .figures import facts, measure_table, psnr_plot, verdict, without_folders
+from .figures import facts, measure_table, psnr_of_views, psnr_plot, verdict, without_folders
 from .pictures import GAIN, Picture, encoded
-from .seen import seen_by
 
 MOST_BYTES = 8_000_000  # of a page
 MOST_FILM_BYTES = 1_100_000  # 1.5 MB of the page, in base64
@@ -33,9 +34,6 @@ _FILES = [
     "pictures.js",
     "splat.vert.glsl",
     "splat.frag.glsl",
-    "depth.frag.glsl",
-    "coverage.frag.glsl",
-    "smoothing.frag.glsl",
     "screen.vert.glsl",
     "screen.frag.glsl",
 ]
@@ -51,6 +49,7 @@ def write_page(
     *,
     near_plane: float,
     background: Tensor,
+    antialiased: bool = False,
     pictures: Sequence[Picture] = (),
     pictures_note: str = "",
     film: bytes = b"",
@@ -65,9 +64,9 @@ def write_page(
 ) -> str:
     """Write a page with a viewer of a splat, photos beside renders, measures and facts. The write is atomic.
 
-    The viewer opens at the training camera nearest the mean pose. File names are shown as they are given; in all other
-    texts absolute paths are shortened to their last part. The splat is packed into the bytes that the rest of the page
-    leaves, see :func:`kgs.page.data.pack`.
+    The viewer opens at one of the training cameras nearest the mean pose, see `viewer_scene`. File names are shown as
+    they are given; in all other texts absolute paths are shortened to their last part. The splat is packed into the
+    bytes that the rest of the page leaves, see :func:`kgs.page.data.pack`.
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
@@ -79,8 +78,10 @@ def write_page(
         cameras: the cameras of the photos, C >= 1 of one image size.
         names: file names of the C photos.
         parts: what each photo was used for: "training", "test", or another word.
-        near_plane: of the renderer, in world units.
+        near_plane: of the renderer, in world units. Beside the photos' cameras the viewer's is farther away, see
+            :func:`kgs.io.film.path_near_plane`.
         background: colour behind the splat, `(3,)` in [0, 1].
+        antialiased: draw the splat as with `RasterOptions.antialiased`.
         pictures: photos with renders, `kgs.page.Picture`.
         pictures_note: a sentence that says which photos these are.
         film: the content of an MP4 or WebM file; b"" for none. It is left out where it has more than `MOST_FILM_BYTES`,
@@ -95,7 +96,7 @@ def write_page(
         most_bytes: limit for the page.
 
     Returns:
-        What was reduced to respect the limit of size, in words; "" for nothing.
+        What the viewer shows less than the splat, in words, see :class:`kgs.page.data.Packed`; "" for nothing.
 
     Raises:
         ValueError: the page does not fit.
@@ -105,7 +106,7 @@ def write_page(
     from markupsafe import Markup
 
     runs = runs or {}
-    scene = viewer_scene(cameras, names, parts, gaussians.means)
+    scene = viewer_scene(cameras, names, parts, gaussians.means, psnr_of_views(list(runs.values())[-1]) if runs else {})
     width, height = scene["cameras"][0]["size"]
     first_run = next(iter(runs.values()), {})
     measures_head, measures = measure_table(runs)
@@ -136,17 +137,15 @@ def write_page(
     template = environment.get_template("page.html.jinja")
     viewer_settings = {
         "nearPlane": near_plane,
+        "farNearPlane": path_near_plane(gaussians.means, _training_cameras(cameras, parts), near_plane),
         "lowPass": RasterOptions.eps2d,
+        "antialiased": antialiased,
         "margin": MARGIN,
         "background": background.tolist(),
     }
 
-    training = [view for view, is_training in enumerate(are_training(parts)) if is_training]
-    seen = seen_by(gaussians, cameras, training, near_plane)
-    depths = {"layout": seen.layout, "content": base64.b64encode(seen.content).decode()}
-
     def page(splat: Mapping[str, Any], words: Mapping[str, str]) -> bytes:
-        data = json.dumps({"scene": scene, "settings": viewer_settings, "seen": depths, **splat}, separators=(",", ":"))
+        data = json.dumps({"scene": scene, "settings": viewer_settings, **splat}, separators=(",", ":"))
         html: str = template.render(**context, **words, data=Markup(data.replace("<", "\\u003c")))
         return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
 
@@ -158,19 +157,24 @@ def write_page(
     has_film = 0 < len(film) <= MOST_FILM_BYTES
     kind = "mp4" if film[4:8] == b"ftyp" else "webm"
     packed = packed_beside(f"data:video/{kind};base64," + base64.b64encode(film).decode() if has_film else "")
-    if has_film and packed.left_out:
+    if has_film and packed.is_reduced:
         packed = packed_beside("")
     content = base64.b64encode(packed.content).decode()
     splat = {"layout": packed.layout, "content": content}
     words = {
         "reduced": packed.left_out,
         "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
-        "seen_size": f"{len(depths['content']) / 1e3:.0f} kB",
         "page_size": _megabytes(0),  # as many characters as the true size
     }
     words["page_size"] = _megabytes(len(page(splat, words)))
     write_whole(path, page(splat, words))
     return packed.left_out
+
+
+def _training_cameras(cameras: PinholeCamera, parts: Sequence[str]) -> PinholeCamera:
+    rows = torch.tensor(are_training(parts))
+    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+    return PinholeCamera(*(value.cpu()[rows] for value in values))
 
 
 def _counts(parts: Sequence[str]) -> str:

@@ -1,5 +1,6 @@
 """Writes a fit for other programs, besides its PLY file: cameras, glTF, a film."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from kgs.fit.fit import Fit
@@ -7,7 +8,7 @@ from kgs.geometry import typical_depths
 from kgs.io.cameras import camera_list, rolled, upright
 from kgs.io.console import each
 from kgs.io.encoders import film_suffix
-from kgs.io.film import write_film
+from kgs.io.film import path_near_plane, write_film
 from kgs.io.glb import save_glb
 from kgs.json_files import write_json
 
@@ -23,5 +24,7 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     save_glb(folder / "splat.glb", fit.model, upright(upright_views.cameras.extrinsics), scene.offset)
     depth = typical_depths(fit.model.means, scene.train.cameras)[1]
     suffix, note = film_suffix()
-    why = write_film(folder / f"turntable{suffix}", fit.render, upright_views, depth, each)
+    near_plane = path_near_plane(fit.model.means, scene.train.cameras, fit.options.near_plane)
+    film_fit = replace(fit, options=replace(fit.options, near_plane=near_plane))
+    why = write_film(folder / f"turntable{suffix}", film_fit.render, upright_views, depth, each)
     return [line for line in (why, note) if line]
