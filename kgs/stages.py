@@ -88,7 +88,7 @@ def project(
 
 
 def _with_options(projected: ProjectedGaussians, options: RasterOptions) -> ProjectedGaussians:
-    """Without what lies behind the far plane or is too small, and antialiased: what few renders ask for."""
+    """Apply far_plane, radius_clip and antialiased, which most renders leave off."""
     if options.far_plane < math.inf or options.radius_clip > 0:
         kept = projected.depths < options.far_plane
         if options.radius_clip > 0:

@@ -36,11 +36,11 @@ class RasterOptions:
             An image that needs more is rendered in row slices, which the backward pass computes again.
         frame: (left, top, right, bottom) in pixels of the image; None for the whole image. Footprints are linearised no
             farther than 15 % of the frame's size beyond its borders. A render that is wider than the images which the
-            Gaussians were fitted to shows the same inside their frame if it is given: else Gaussians that lie far
-            beside it cover it like a veil.
+            Gaussians were fitted to shows the same inside their frame if it is given: else off-frame Gaussians get
+            huge footprints that fog the image.
         absgrad: `backward` also sets `projected.means2d.absgrad`, `(M, 2)` in units of `means2d.grad`: the sums, over
-            pixels, of the absolute values of what each pixel says of a centre. Where pixels pull a Gaussian apart the
-            gradient vanishes, and these sums do not (AbsGS, Ye et al., ACM MM 2024).
+            pixels, of the absolute values of each pixel's contribution to the gradient of a centre. Where pixels pull a
+            Gaussian apart the gradient vanishes, and these sums do not (AbsGS, Ye et al., ACM MM 2024).
         far_plane: Gaussians with z >= far_plane are left out; in world units, beyond the near plane.
         radius_clip: Gaussians whose footprint reaches no farther than this along x and along y, in pixels, are left
             out; >= 0. It reaches 3.33 standard deviations, rounded up.

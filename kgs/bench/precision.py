@@ -95,8 +95,8 @@ class Measured:
         )
         with torch.set_grad_enabled(grad):
             projected = project(*self.inputs[s.dtype], options=options, backend=s.backend)
-            chosen = {"chunk_size": s.chunk_size, "backend": s.backend}
-            return composite(projected, projected.colors, options=options, **chosen).features
+            drawn = composite(projected, projected.colors, options=options, chunk_size=s.chunk_size, backend=s.backend)
+            return drawn.features
 
     def backward(self, s: Setting) -> dict[str, Tensor]:
         """The gradients of the image."""
