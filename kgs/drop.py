@@ -94,7 +94,7 @@ class DropGaussian(nn.Module):
         super().__init__()
         if schedule not in ("linear", "constant") and not callable(schedule):
             raise ValueError(f"schedule: expected 'linear', 'constant' or a callable, got {schedule!r}")
-        is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
+        is_integer = isinstance(seed, int | Integral) and not isinstance(seed, bool)
         if seed is not None and not (is_integer and -(2**63) <= seed < 2**64):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
@@ -127,7 +127,8 @@ class DropGaussian(nn.Module):
         if not self.training:
             return opacities
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(self._drop)(opacities)
+            dropped: Tensor = torch.compiler.disable(self._drop)(opacities)
+            return dropped
         return self._drop(opacities)
 
     def _drop(self, opacities: Tensor) -> Tensor:

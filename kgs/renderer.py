@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
-from typing import Unpack
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from .backends import check_backend
 from .camera import Cameras
 from .projection import normals
 from .stages import composite, project
-from .types import Gaussians, RasterFields, RasterOptions, Rendering, check_kind, check_tensor, raster_options
+from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor, raster_options
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 
@@ -71,7 +71,7 @@ class GaussianRenderer(nn.Module):
         *,
         options: RasterOptions | None = None,
         backend: str = "auto",
-        **fields: Unpack[RasterFields],
+        **fields: Any,
     ) -> None:
         super().__init__()
         check_backend(backend)

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar, Unpack
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from .types import (
     Composited,
     Gaussians,
     ProjectedGaussians,
-    RasterFields,
     RasterOptions,
     check_kind,
     check_tensor,
@@ -48,7 +47,6 @@ def project(
     options: RasterOptions | None = None,
     colors: bool = True,
     backend: str = "auto",
-    **fields: Unpack[RasterFields],
 ) -> ProjectedGaussians:
     """Project Gaussians into every camera of a batch.
 
@@ -65,19 +63,17 @@ def project(
             alpha_threshold matter here (at a threshold of 0 all Gaussians in front of the camera are visible).
         colors: whether colours are computed.
         backend: "auto", or the name of one, see `kgs.backends`.
-        fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Returns:
         The visible pairs (camera, Gaussian): those that would touch the image with an opacity of 2, or with the largest
         of all opacities if that is more. (Their own opacity is ignored, so that a dropped Gaussian counts as visible.)
 
     Raises:
-        TypeError: `gaussians` or `cameras` are of another type, dtype or device, or both `options` and fields of them
-            are given.
+        TypeError: `gaussians`, `cameras` or `options` are of another type, dtype or device.
         ValueError: an option is out of range, cameras of different image sizes, intrinsics whose third row is not
             (0, 0, 1), or opacities `(C, N)` for another number of cameras.
     """
-    options = raster_options(options, fields)
+    options = raster_options(options, {})
     check_kind("gaussians", gaussians, Gaussians)
     size = image_size(cameras)
     for matrix in (cameras.extrinsics, intrinsics(cameras)):
@@ -121,7 +117,6 @@ def composite(
     median_depth: bool = False,
     chunk_size: int | None = None,
     backend: str = "auto",
-    **fields: Unpack[RasterFields],
 ) -> Composited:
     """Composite features of projected Gaussians over all pixels of all cameras.
 
@@ -136,13 +131,12 @@ def composite(
         median_depth: also find the depth at which T falls below one half.
         chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
-        fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Returns:
         Features `(C, F, H, W)` without background, transmittance and median depth (or None), each `(C, 1, H, W)`.
 
     Raises:
-        TypeError: an argument has another type, dtype or device, or both `options` and fields of them are given.
+        TypeError: an argument has another type, dtype or device.
         ValueError: an option is out of range, shapes do not fit, or one row of tiles alone exceeds `max_bytes`.
 
     Examples:
@@ -155,7 +149,7 @@ def composite(
         >>> kgs.composite(projected, torch.rand(len(projected), 8)).features.shape
         torch.Size([1, 8, 24, 32])
     """
-    options = raster_options(options, fields)
+    options = raster_options(options, {})
     if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
         raise ValueError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
     if not isinstance(projected, ProjectedGaussians):

@@ -4,10 +4,12 @@ Shapes, dtypes and devices are checked when the user creates an object; numbers 
 synchronise with the device. Two objects are equal only if they are the same object.
 """
 
+import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
-from typing import Any, Self, TypedDict
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -34,11 +36,11 @@ class RasterOptions:
             An image that needs more is rendered in row slices, which the backward pass computes again.
         frame: (left, top, right, bottom) in pixels of the image; None for the whole image. Footprints are linearised no
             farther than 15 % of the frame's size beyond its borders. A render that is wider than the images which the
-            Gaussians were fitted to shows the same inside their frame if it is given: else Gaussians that lie far
-            beside it cover it like a veil.
+            Gaussians were fitted to shows the same inside their frame if it is given: else off-frame Gaussians get
+            huge footprints that fog the image.
         absgrad: `backward` also sets `projected.means2d.absgrad`, `(M, 2)` in units of `means2d.grad`: the sums, over
-            pixels, of the absolute values of what each pixel says of a centre. Where pixels pull a Gaussian apart the
-            gradient vanishes, and these sums do not (AbsGS, Ye et al., ACM MM 2024).
+            pixels, of the absolute values of each pixel's contribution to the gradient of a centre. Where pixels pull a
+            Gaussian apart the gradient vanishes, and these sums do not (AbsGS, Ye et al., ACM MM 2024).
         far_plane: Gaussians with z >= far_plane are left out; in world units, beyond the near plane.
         radius_clip: Gaussians whose footprint reaches no farther than this along x and along y, in pixels, are left
             out; >= 0. It reaches 3.33 standard deviations, rounded up.
@@ -98,33 +100,18 @@ def _is_frame(frame: Any) -> bool:
     return bool(frame[0] < frame[2] and frame[1] < frame[3])
 
 
-class RasterFields(TypedDict, total=False):
-    """The fields of `RasterOptions` as keyword arguments."""
-
-    tile_size: int | None
-    near_plane: float
-    eps2d: float
-    alpha_threshold: float
-    transmittance_stop: float
-    max_bytes: int
-    frame: tuple[float, float, float, float] | None
-    absgrad: bool
-    far_plane: float
-    radius_clip: float
-    antialiased: bool
-
-
-def raster_options(options: RasterOptions | None, fields: RasterFields) -> RasterOptions:
+def raster_options(options: RasterOptions | None, fields: Mapping[str, Any]) -> RasterOptions:
     """The options of a call, given whole or field by field.
 
     Raises:
         TypeError: both are given, `options` is of another type, or a field does not exist.
         ValueError: a field is out of range.
     """
-    unknown = sorted(fields.keys() - RasterFields.__annotations__.keys())
+    known = [field.name for field in dataclasses.fields(RasterOptions)]
+    unknown = sorted(fields.keys() - set(known))
     if unknown:
-        known = ", ".join(RasterFields.__annotations__)
-        raise TypeError(f"{unknown[0]}: unexpected keyword argument, expected options of the rasteriser ({known})")
+        listed = ", ".join(known)
+        raise TypeError(f"{unknown[0]}: unexpected keyword argument, expected options of the rasteriser ({listed})")
     if options is None:
         return RasterOptions(**fields)
     check_kind("options", options, RasterOptions)

@@ -5,10 +5,10 @@ import dataclasses
 import factories
 import pytest
 import torch
-from factories import random_camera, random_gaussians
+from factories import random_camera, random_gaussians, staged
 from oracles import near_threshold
 
-from kgs import composite, project
+from kgs import RasterOptions, composite, project
 
 TH, STOP = 1 / 255, 1e-4
 
@@ -27,7 +27,7 @@ def drawn(n=300, size=(40, 56)):
     gaussians = random_gaussians(n, 1, torch.float32, None, max(size), (0.05, 1.3))
     camera = random_camera(*size, 1, torch.float32)
     with torch.no_grad():
-        return project(gaussians, camera, alpha_threshold=0.0), gaussians, camera
+        return project(gaussians, camera, options=RasterOptions(alpha_threshold=0.0)), gaussians, camera
 
 
 def footprints(opacities, centres=None, factors=None, depths=None, size=(3, 4), dtype=torch.float64, eps2d=0.0):
@@ -52,7 +52,9 @@ def scene_footprints(n, seed, dtype, size=(40, 56), **kwargs):
     """Footprints and colours of an ordinary scene, and two fixed weights for a loss."""
     with torch.no_grad():
         projected = project(
-            random_gaussians(n, seed, dtype, **kwargs), random_camera(*size, seed, dtype), alpha_threshold=0.0
+            random_gaussians(n, seed, dtype, **kwargs),
+            random_camera(*size, seed, dtype),
+            options=RasterOptions(alpha_threshold=0.0),
         )
     generator = torch.Generator().manual_seed(seed)
     weights = torch.randn(1, 4, *size, generator=generator, dtype=torch.float64).to(dtype)
@@ -81,7 +83,7 @@ def outcome(projected, features, certain, dtype=torch.float64, wanted=(True,) * 
     projected, inputs = leaves(dataclasses.replace(projected, **values), features.to(dtype))
     for x, needed in zip(inputs, wanted, strict=True):
         x.requires_grad_(needed)
-    out = composite(projected, inputs[-1], **options)
+    out = composite(projected, inputs[-1], **staged(**options))
     image = torch.cat([out.features, out.transmittance], 1)
     loss = (image * (random(*image.shape) * certain).to(dtype)).sum()
     gradients = torch.autograd.grad(loss, [x for x in inputs if x.requires_grad])

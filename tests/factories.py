@@ -12,12 +12,21 @@ from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
-from kgs import DropGaussian, GaussianModel, Gaussians, PosedCamera, ProjectedGaussians
+from kgs import DropGaussian, GaussianModel, Gaussians, PosedCamera, ProjectedGaussians, RasterOptions
 from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
 __all__ += ["pinhole", "posed", "random_camera", "random_cloud", "random_gaussians", "random_model", "random_opacities"]
-__all__ += ["random_scene", "random_views", "replace", "select", "splat_columns", "whole_matrices", "with_camera"]
+__all__ += [
+    "random_scene",
+    "random_views",
+    "replace",
+    "select",
+    "splat_columns",
+    "staged",
+    "whole_matrices",
+    "with_camera",
+]
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
@@ -70,6 +79,13 @@ def batch(*cameras: PinholeCamera) -> PinholeCamera:
     """One batch of all of them."""
     parts = ("intrinsics", "extrinsics", "height", "width")
     return PinholeCamera(*(torch.cat([getattr(camera, part) for camera in cameras]) for part in parts))
+
+
+def staged(**given: Any) -> dict[str, Any]:
+    """Arguments of `project` and `composite`: the fields of `RasterOptions` among these, gathered into one."""
+    fields = {field.name for field in dataclasses.fields(RasterOptions)}
+    options = RasterOptions(**{name: value for name, value in given.items() if name in fields})
+    return {"options": options} | {name: value for name, value in given.items() if name not in fields}
 
 
 def whole_matrices(rows: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """What tests of projection have in common."""
 
 import torch
-from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace
+from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace, staged
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 
@@ -95,7 +95,7 @@ def list_and_gradients(gaussians, cameras, backend, dtype=torch.float32, **optio
     cameras = type(cameras)(
         *(x.to(dtype) for x in (cameras.intrinsics, cameras.extrinsics)), cameras.height, cameras.width
     )
-    got = project(gaussians, cameras, backend=backend, **options)
+    got = project(gaussians, cameras, backend=backend, **staged(**options))
     fields = [getattr(got, name) for name in DIFFERENTIABLE]
     generator = torch.Generator().manual_seed(1)
     weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from factories import batch, random_camera, random_gaussians
+from factories import batch, random_camera, random_gaussians, staged
 
 import kgs
 
@@ -14,7 +14,7 @@ HEIGHT, WIDTH = 18, 13  # tiles that are not full
 def drawn(projected, features, backend, **options):
     """The image and transmittance of one render, the centres as a leaf."""
     centres = projected.means2d.detach().requires_grad_()
-    out = kgs.composite(replace(projected, means2d=centres), features, backend=backend, **options)
+    out = kgs.composite(replace(projected, means2d=centres), features, backend=backend, **staged(**options))
     return centres, torch.cat([out.features, out.transmittance], 1)
 
 

@@ -5,12 +5,12 @@ import math
 
 import pytest
 import torch
-from factories import batch, footprints, leaves, pinhole, random_camera, random_gaussians
+from factories import batch, footprints, leaves, pinhole, random_camera, random_gaussians, staged
 from oracles import theta_mass
 from reference_checks import one
 
 import kgs.reference
-from kgs import GaussianRenderer, project
+from kgs import GaussianRenderer, RasterOptions, project
 from kgs.covariance import compensations, conics, variances
 
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
@@ -25,7 +25,9 @@ def test_a_footprint_keeps_its_sum(sigma, exactly):
     size, eps2d = (61, 61), 0.3
     given = footprints(torch.tensor([[30.3, 29.8]], dtype=dtype), factors, torch.tensor([0.5]).to(dtype), size, eps2d)
     opacities = given.opacities * compensations(factors, eps2d)
-    image = kgs.composite(dataclasses.replace(given, opacities=opacities), torch.ones(1, 1, dtype=dtype), **EXACT)
+    image = kgs.composite(
+        dataclasses.replace(given, opacities=opacities), torch.ones(1, 1, dtype=dtype), **staged(**EXACT)
+    )
     widths = [sigma**2 + eps2d, 4 * sigma**2 + eps2d]
     sums = [theta_mass(width, centre) for width, centre in zip(widths, (30.3, 29.8), strict=True)]
     expected = 0.5 * 2 * sigma**2 / math.sqrt(widths[0] * widths[1]) * sums[0] * sums[1]
@@ -42,7 +44,7 @@ def test_renders_are_those_of_multiplied_opacities(exactly):
     image = GaussianRenderer(antialiased=True, **EXACT)(gaussians, cameras).image
     for c in range(2):
         camera = random_camera(24, 32, c, dtype)
-        plain = project(gaussians, camera, **EXACT)
+        plain = project(gaussians, camera, **staged(**EXACT))
         wide = torch.linalg.inv(
             plain.factors.double() @ plain.factors.double().mT + 0.3 * torch.eye(2, dtype=torch.float64)
         )
@@ -81,12 +83,12 @@ def test_gradients_of_an_antialiased_render(exactly):
     scene.scales[::2] *= 0.1
 
     def by_hand(gaussians):
-        plain = project(gaussians, random_camera(16, 20, 0), backend="torch", **EXACT)
+        plain = project(gaussians, random_camera(16, 20, 0), backend="torch", **staged(**EXACT))
         narrow = plain.factors @ plain.factors.mT
         a, b, c = conics(*variances(plain.factors, 0.3)).unbind(1)
         factor = (torch.linalg.det(narrow) * (a * c - b * b)).clamp_min(0).sqrt()
         given = dataclasses.replace(plain, opacities=plain.opacities * factor)
-        return kgs.composite(given, plain.colors, backend="torch", **EXACT).features
+        return kgs.composite(given, plain.colors, backend="torch", **staged(**EXACT)).features
 
     own, inputs = leaves(dataclasses.replace(scene, **{k: v.to(dtype) for k, v in vars(scene).items()}))
     image = GaussianRenderer(antialiased=True, **EXACT)(own, camera).image
@@ -148,6 +150,6 @@ def test_what_is_left_out_is_as_if_it_were_not_there(options):
 @pytest.mark.usefixtures("torch_alone")
 def test_a_single_gaussian_before_and_behind_the_far_plane():
     gaussian, camera = one([0, 0, 2], [0.1] * 3), pinhole(15, 17, 50)
-    assert len(project(gaussian, camera, far_plane=2.0)) == 0
-    assert len(project(gaussian, camera, far_plane=2.01)) == 1
+    assert len(project(gaussian, camera, options=RasterOptions(far_plane=2.0))) == 0
+    assert len(project(gaussian, camera, options=RasterOptions(far_plane=2.01))) == 1
     assert GaussianRenderer(far_plane=1.0)(gaussian, camera).image.abs().sum() == 0

@@ -5,7 +5,7 @@ import torch
 from factories import random_camera, random_gaussians
 
 import kgs
-from kgs import backends
+from kgs import RasterOptions, backends
 
 
 class Half(backends.TorchBackend):
@@ -52,7 +52,7 @@ def test_auto_takes_what_covers_the_call_and_torch_takes_the_rest(half):
 def test_the_tile_size_is_the_backends_own_unless_it_is_given(half, backend, own):
     projected = kgs.project(random_gaussians(30, 0, sh_degree=None), random_camera(8, 12, 0))
     for given, used in ((None, own), (5, 5)):
-        out = kgs.composite(projected, projected.colors, tile_size=given, backend=backend)
+        out = kgs.composite(projected, projected.colors, options=RasterOptions(tile_size=given), backend=backend)
         assert out.tile_size == used
 
 

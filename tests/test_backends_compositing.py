@@ -14,7 +14,7 @@ from tile_checks import scene
 
 import kgs
 import kgs.reference
-from kgs import GaussianRenderer, composite
+from kgs import GaussianRenderer, RasterOptions, composite
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_row_slices_change_nothing(kernel_backend, run, width):
         assert all(torch.equal(a, b) for a, b in zip(sliced[0], whole[0], strict=True))
         assert_close(sliced, whole, certain, 2e-6)
     with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 3000 for it"):
-        composite(projected, features, max_bytes=3000, backend=kernel_backend)
+        composite(projected, features, options=RasterOptions(max_bytes=3000), backend=kernel_backend)
 
 
 # -- differentiation -----------------------------------------------------------------------------------------------

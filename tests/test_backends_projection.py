@@ -9,7 +9,7 @@ from factories import FIELDS, leaves, pinhole, random_gaussians, replace, with_c
 from projection_checks import DIFFERENTIABLE, assert_alike, assert_camera_gradients, list_and_gradients, wide_scene
 
 import kgs
-from kgs import GaussianRenderer, project
+from kgs import GaussianRenderer, RasterOptions, project
 from kgs.backends import BACKENDS
 
 
@@ -62,7 +62,10 @@ def test_large_opacities_widen_what_is_seen_unless_they_belong_to_one_that_is_no
     means = gaussians.means.clone()
     means[3, 0] = torch.inf
     broken = replace(gaussians, opacities=opacities, means=means)
-    plain, count = project(gaussians, cameras, alpha_threshold=threshold), len(project(broken, cameras))
+    plain, count = (
+        project(gaussians, cameras, options=RasterOptions(alpha_threshold=threshold)),
+        len(project(broken, cameras)),
+    )
     assert len(got) >= len(plain) - 1
     assert count == len(project(broken, cameras, backend="torch"))
 
@@ -178,7 +181,7 @@ def test_cameras_of_another_form_go_to_torch(kernel_backend, handed_over):
     flat[0, 2, :3] = 0.0
     with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
         project(gaussians, with_camera(cameras, extrinsics=flat), backend=kernel_backend)
-    project(gaussians, cameras, near_plane=0.0, backend=kernel_backend)
+    project(gaussians, cameras, options=RasterOptions(near_plane=0.0), backend=kernel_backend)
     assert len(handed_over) == 2
 
 

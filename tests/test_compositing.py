@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import pinhole, random_camera, random_gaussians
+from factories import pinhole, random_camera, random_gaussians, staged
 from kornia.geometry.camera import PinholeCamera
 from oracles import near_threshold, theta_mass
 
 import kgs
 import kgs.reference
-from kgs import GaussianRenderer, composite
+from kgs import GaussianRenderer, RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -49,7 +49,9 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
     pixels = torch.cartesian_prod(torch.arange(37), torch.arange(43)).flip(1).double()
     for factor, centre in zip(factors.to(dtype), centres.to(dtype), strict=True):
         alone = footprints([0.7], centre[None], factor[None], size=(37, 43), dtype=dtype, eps2d=0.3)
-        got = composite(alone, alone.colors, alpha_threshold=0.0, transmittance_stop=0.0).transmittance
+        got = composite(
+            alone, alone.colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
+        ).transmittance
         inverse = torch.linalg.inv(factor.double() @ factor.double().T + 0.3 * torch.eye(2, dtype=torch.float64))
         d = pixels - centre.double()
         expected = 1 - 0.7 * torch.exp(-0.5 * torch.einsum("pi,ij,pj->p", d, inverse, d))
@@ -61,7 +63,12 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
 def test_mass_is_the_theta_function(variance, centre):
     sigma = math.sqrt(variance)
     alone = footprints([0.5], [centre], [[[sigma, 0, 0], [0, sigma, 0]]], size=(41, 41))
-    mass = 1 - composite(alone, alone.colors, alpha_threshold=0.0, transmittance_stop=0.0).transmittance
+    mass = (
+        1
+        - composite(
+            alone, alone.colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
+        ).transmittance
+    )
     assert mass.sum().item() == pytest.approx(
         0.5 * theta_mass(variance, centre[0]) * theta_mass(variance, centre[1]), rel=1e-9
     )
@@ -83,7 +90,9 @@ def test_three_layers_by_hand(dtype):
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 40])
 def test_equal_layers_are_a_geometric_series_and_weights_partition_unity(dtype, n):
     color = torch.tensor([0.3, 0.6, 0.9], dtype=dtype)
-    out = composite(footprints([0.1] * n, dtype=dtype), color.expand(n, 3), transmittance_stop=0.0)
+    out = composite(
+        footprints([0.1] * n, dtype=dtype), color.expand(n, 3), options=RasterOptions(transmittance_stop=0.0)
+    )
     assert (out.transmittance - 0.9**n).abs().max() <= 1e-6
     # sum of weights and transmittance is 1, to 4 eps a layer
     total = out.features + out.transmittance * color[:, None, None]
@@ -217,4 +226,4 @@ def test_features_of_any_width(dtype):
 def test_options_out_of_range_are_named(option, value):
     layers = footprints([0.5])
     with pytest.raises(ValueError, match=option):
-        composite(layers, layers.colors, **{option: value})
+        composite(layers, layers.colors, **staged(**{option: value}))

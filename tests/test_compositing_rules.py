@@ -6,11 +6,11 @@ import itertools
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import random_camera, random_gaussians
+from factories import random_camera, random_gaussians, staged
 
 import kgs
 import kgs.reference
-from kgs import GaussianRenderer, composite, project
+from kgs import GaussianRenderer, RasterOptions, composite, project
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -30,7 +30,9 @@ def test_stop_is_inclusive():
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_nothing_counts_behind_the_stop(dtype):
     opacities = [0.9, 0.9, 0.9, 0.9, 0.9]  # T: 1, .1, .01, .001, 1e-4 (just above or below), ...
-    out = composite(footprints(opacities, dtype=dtype), torch.eye(5, dtype=dtype), transmittance_stop=0.005)
+    out = composite(
+        footprints(opacities, dtype=dtype), torch.eye(5, dtype=dtype), options=RasterOptions(transmittance_stop=0.005)
+    )
     expected = torch.tensor([0.9, 0.09, 0.009, 0.0, 0.0], dtype=dtype)
     assert (out.features[0, :, 0, 0] - expected).abs().max() <= 1e-7
     assert not out.transmittance.any()
@@ -40,7 +42,11 @@ def test_nothing_counts_behind_the_stop(dtype):
 @pytest.mark.parametrize("stop", [0.02, 0.05, 0.5])
 def test_light_of_exactly_the_stop_is_the_border(stop, dtype):
     for left, counts in ((stop * (1 - 1e-4), False), (stop * (1 + 1e-4), True)):
-        out = composite(footprints([1 - left, 0.5], dtype=dtype), torch.eye(2, dtype=dtype), transmittance_stop=stop)
+        out = composite(
+            footprints([1 - left, 0.5], dtype=dtype),
+            torch.eye(2, dtype=dtype),
+            options=RasterOptions(transmittance_stop=stop),
+        )
         assert (out.features[0, 1] - 0.5 * left * counts).abs().max() <= 1e-6
         assert not out.transmittance.any()
 
@@ -49,8 +55,8 @@ def test_light_of_exactly_the_stop_is_the_border(stop, dtype):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_error_of_the_stop_is_at_most_the_stop(seed, stop):
     projected, colors, _ = scene_footprints(300, seed, torch.float64, image_size=20, opacities=(0.3, 0.95))
-    exact = composite(projected, colors, alpha_threshold=0.0, transmittance_stop=0.0)
-    got = composite(projected, colors, alpha_threshold=0.0, transmittance_stop=stop)
+    exact = composite(projected, colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0))
+    got = composite(projected, colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=stop))
     scale = colors.max()
     assert (got.transmittance == 0).double().mean() > 0.1  # otherwise there is nothing to test
     assert (got.features - exact.features).abs().max() <= stop * scale
@@ -75,7 +81,9 @@ def test_light_grows_with_the_threshold_and_falls_with_the_stop():
     projected, colors, _ = scene_footprints(200, 4, torch.float64, image_size=30)
 
     def light(threshold, stop):
-        return composite(projected, colors, alpha_threshold=threshold, transmittance_stop=stop).transmittance
+        return composite(
+            projected, colors, options=RasterOptions(alpha_threshold=threshold, transmittance_stop=stop)
+        ).transmittance
 
     by_threshold = [light(threshold, 0.0) for threshold in (0.0, 1e-4, 1 / 1024, 1 / 255, 1 / 64, 0.3)]
     by_stop = [light(0.0, stop) for stop in (0.0, 1e-6, 1e-4, 1e-2, 0.5)]
@@ -121,7 +129,7 @@ def test_clamp_holds_pixel_by_pixel_in_the_gradient(opacity):
 
     def image(means2d, factors, opacities, features):
         made = dataclasses.replace(start, means2d=means2d, factors=factors, opacities=opacities)
-        out = composite(made, features, alpha_threshold=0.0, transmittance_stop=0.0)
+        out = composite(made, features, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0))
         return torch.cat([out.features, out.transmittance], 1)
 
     weights = torch.randn(1, 4, 9, 12, generator=generator, dtype=torch.float64)
@@ -140,7 +148,7 @@ def test_twenty_thousand_layers(alpha):
     opacities = alpha * (1 + torch.rand(n, generator=generator))
     colors = torch.rand(n, 3, generator=generator)
     projected, inputs = leaves(footprints(opacities, size=(2, 2), dtype=torch.float32), colors)
-    out = composite(projected, inputs[-1], tile_size=2, transmittance_stop=0.0)
+    out = composite(projected, inputs[-1], options=RasterOptions(tile_size=2, transmittance_stop=0.0))
     got = torch.autograd.grad(out.features.mean((2, 3)).sum() + out.transmittance.mean(), inputs)
 
     a, c = (x.double().requires_grad_() for x in (opacities, colors))
@@ -160,7 +168,11 @@ def test_twenty_thousand_layers(alpha):
 
 @pytest.mark.parametrize("n", [1000, 20000])
 def test_transmittance_of_many_layers_is_accurate(n):
-    out = composite(footprints([1 / 250] * n, size=(2, 2), dtype=torch.float32), torch.ones(n, 1), tile_size=2)
+    out = composite(
+        footprints([1 / 250] * n, size=(2, 2), dtype=torch.float32),
+        torch.ones(n, 1),
+        options=RasterOptions(tile_size=2),
+    )
     exact = (1 - 1 / 250) ** n
     if exact > 1e-4:
         assert ((out.transmittance - exact) / exact).abs().max() <= 1e-5
@@ -189,11 +201,11 @@ def test_other_types_and_dtypes_are_named(name):
     given = {"projected": layers, "features": layers.colors}
     if name in given:
         with pytest.raises(TypeError, match=f"^{name}: expected"):
-            composite(**given | {name: [1.0]})
+            composite(**staged(**given | {name: [1.0]}))
     else:
         given["projected"] = dataclasses.replace(layers, **{name: getattr(layers, name).float()})
         with pytest.raises(TypeError, match=f"^{name}: expected torch.float64"):
-            composite(**given)
+            composite(**staged(**given))
     with pytest.raises(TypeError, match="^features: expected torch.float64"):
         composite(layers, layers.colors.float())
 
@@ -203,7 +215,7 @@ def test_projection_checks_its_options():
     gaussians, camera = random_gaussians(3, 0), random_camera(8, 8, 0)
     for name, value in (("alpha_threshold", -1.0), ("near_plane", -0.1), ("eps2d", float("nan")), ("backend", "cuda")):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
-            project(gaussians, camera, **{name: value})
+            project(gaussians, camera, **staged(**{name: value}))
     with pytest.raises(TypeError, match="^gaussians: expected Gaussians, got list"):
         project([gaussians], camera)
 

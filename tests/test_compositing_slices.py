@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import random_camera, random_gaussians
+from factories import random_camera, random_gaussians, staged
 from oracles import near_threshold
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kgs import GaussianRenderer, backends, composite, project
+from kgs import GaussianRenderer, RasterOptions, backends, composite, project
 from kgs.backends.torch import compositing
 from kgs.backends.torch.binning import bin_to_tiles
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("each_backend")
 
 def loss_and_gradients(projected, features, weights, **options):
     projected, inputs = leaves(projected, features)
-    result = composite(projected, inputs[-1], **options)
+    result = composite(projected, inputs[-1], **staged(**options))
     image = torch.cat([result.features, result.transmittance], 1)
     return image.detach(), torch.autograd.grad((image * weights).sum(), inputs)
 
@@ -44,7 +44,7 @@ def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds, siz
     camera = random_camera(40, 56, 5, dtype)
     certain = ~near_threshold(gaussians, camera, *thresholds)
     with torch.no_grad():
-        projected = project(gaussians, camera, alpha_threshold=thresholds[0])
+        projected = project(gaussians, camera, options=RasterOptions(alpha_threshold=thresholds[0]))
     weights = torch.randn(1, 4, 40, 56, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weights = (weights * certain).to(dtype)
     first, first_gradients = loss_and_gradients(
@@ -127,7 +127,7 @@ def tightest(projected, features, threshold=TH, **options):
         middle = (low + high) // 2 if high < 4 * low else int((low * high) ** 0.5)
         try:
             with torch.no_grad():
-                composite(projected, features, alpha_threshold=threshold, max_bytes=middle, **options)
+                composite(projected, features, **staged(alpha_threshold=threshold, max_bytes=middle, **options))
             high = middle
         except ValueError:
             low = middle
@@ -175,7 +175,7 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, composited
     opacities = projected.opacities.sqrt()  # some tiles get dark before the last layer
     projected = dataclasses.replace(projected, opacities=opacities)
     image, gradients = loss_and_gradients(projected, colors, weights, **options)
-    median = composite(projected, colors, median_depth=True, **options).median_depth
+    median = composite(projected, colors, **staged(median_depth=True, **options)).median_depth
     if tight:  # and in row slices
         options["max_bytes"] = tightest(projected, colors, thresholds[0])
     composited.clear()
@@ -189,7 +189,7 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, composited
         assert sum(entries) < 0.9 * (2 if tight else 1) * len(bin_to_tiles(projected).entries)
     assert (layered - image).abs().max() <= bound
     assert_gradients_close(layered_gradients, gradients, bound)
-    assert torch.equal(composite(projected, colors, median_depth=True, **options).median_depth, median)
+    assert torch.equal(composite(projected, colors, **staged(median_depth=True, **options)).median_depth, median)
 
 
 @pytest.fixture
@@ -282,7 +282,7 @@ def test_incoming_gradients_are_left_alone(size):
 def test_too_small_a_budget_is_an_error_with_the_numbers():
     projected, colors, _ = scene_footprints(50, 1, torch.float32)
     with pytest.raises(ValueError, match=r"max_bytes.*\d+ bytes"):
-        composite(projected, colors, max_bytes=160)
+        composite(projected, colors, options=RasterOptions(max_bytes=160))
 
 
 @pytest.mark.slow

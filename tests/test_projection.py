@@ -12,7 +12,7 @@ from oracles import real_harmonic
 from projection_checks import HEIGHT, LENGTHS, PACKED, WIDTH, covariances, posed, scene, sigma_route
 
 import kgs
-from kgs import Gaussians, project
+from kgs import Gaussians, RasterOptions, project
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -30,7 +30,7 @@ def symmetric(abc):
 def test_values_are_those_of_the_covariance_route(dtype, tolerance, skew, eps2d):
     gaussians, cameras = scene(dtype=dtype)
     cameras.intrinsics[:, 0, 1] = skew
-    got = project(gaussians, cameras, eps2d=eps2d)
+    got = project(gaussians, cameras, options=RasterOptions(eps2d=eps2d))
     pixels, sigma, depths = (x.index_select(0, got.gaussian_ids) for x in sigma_route(gaussians, cameras, eps2d))
     assert len(got) > 40
     assert all(getattr(got, name).dtype == dtype for name in PACKED)

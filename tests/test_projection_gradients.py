@@ -7,7 +7,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
 from projection_checks import HEIGHT, LENGTHS, PACKED, WIDTH, assert_same, posed, scene, values_and_gradients
 
-from kgs import Gaussians, project
+from kgs import Gaussians, RasterOptions, project
 
 # -- batches -------------------------------------------------------------------------------------------------------
 
@@ -84,7 +84,7 @@ def test_the_unit_of_length_does_not_matter(unit):
     extrinsics[:, :3, 3] *= unit
     first = project(gaussians, cameras)
     moved = PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
-    second = project(scaled, moved, near_plane=0.01 * unit)
+    second = project(scaled, moved, options=RasterOptions(near_plane=0.01 * unit))
     assert torch.equal(first.gaussian_ids, second.gaussian_ids)
     torch.testing.assert_close(first.depths, second.depths / unit, rtol=1e-12, atol=1e-12)
     for name in ("means2d", "factors", "radii", "opacities", "colors"):

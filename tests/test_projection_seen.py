@@ -7,7 +7,7 @@ import torch
 from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
 from projection_checks import HEIGHT, PACKED, WIDTH, assert_same, scene, sigma_route, values_and_gradients
 
-from kgs import DropGaussian, Gaussians, project
+from kgs import DropGaussian, Gaussians, RasterOptions, project
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -96,8 +96,10 @@ def test_dropped_gaussians_stay_listed_and_only_the_opacities_tell_them(threshol
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     opacities = DropGaussian(p=0.45, schedule="constant", seed=0)(gaussians.opacities)
     assert opacities.max() > 1
-    full = project(gaussians, cameras, alpha_threshold=threshold)
-    dropped = project(replace(gaussians, opacities=opacities), cameras, alpha_threshold=threshold)
+    full = project(gaussians, cameras, options=RasterOptions(alpha_threshold=threshold))
+    dropped = project(
+        replace(gaussians, opacities=opacities), cameras, options=RasterOptions(alpha_threshold=threshold)
+    )
     assert (dropped.opacities == 0).sum() > 20
     for name in ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "colors"):
         assert torch.equal(getattr(full, name), getattr(dropped, name))
@@ -106,7 +108,7 @@ def test_dropped_gaussians_stay_listed_and_only_the_opacities_tell_them(threshol
 def test_with_threshold_0_every_gaussian_in_front_is_listed():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     depths = sigma_route(gaussians, cameras)[2]
-    listed = project(gaussians, cameras, alpha_threshold=0.0).gaussian_ids
+    listed = project(gaussians, cameras, options=RasterOptions(alpha_threshold=0.0)).gaussian_ids
     assert torch.equal(listed, (depths > 0.01).nonzero()[:, 0])
 
 
@@ -117,7 +119,8 @@ def test_visibility_is_free_of_opacity(beyond, listed):
     one = Gaussians(mean, torch.eye(4)[:1].double(), torch.full((1, 3), 1e-9).double(), torch.ones(1).double(), mean)
     camera = pinhole(HEIGHT, WIDTH, 4.0, centre=(-0.5 - beyond, 24.0))
     seen = [
-        len(project(replace(one, opacities=torch.tensor([opacity]).double()), camera, eps2d=1.0)) == 1
+        len(project(replace(one, opacities=torch.tensor([opacity]).double()), camera, options=RasterOptions(eps2d=1.0)))
+        == 1
         for opacity in (0.0, 0.2, 1.0, 1.25, 4.0)
     ]
     assert seen == listed
@@ -134,7 +137,9 @@ def test_near_plane_is_exclusive_and_nothing_behind_it_has_a_gradient(near, dtyp
         leaves = {name: getattr(base, name).clone().requires_grad_() for name in FIELDS} | {
             "means": mean.requires_grad_()
         }
-        got = project(Gaussians(**leaves), pinhole(HEIGHT, WIDTH, 50.0, dtype=dtype), near_plane=plane)
+        got = project(
+            Gaussians(**leaves), pinhole(HEIGHT, WIDTH, 50.0, dtype=dtype), options=RasterOptions(near_plane=plane)
+        )
         assert len(got) == int(z == above)
         sum(getattr(got, name).sum() for name in PACKED).backward()
         for leaf in leaves.values():

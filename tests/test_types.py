@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from kornia.sensors.camera import CameraModel, CameraModelType
 import kgs
 from kgs import Gaussians, PosedCamera
 from kgs.harmonics import evaluate_harmonics
-from kgs.types import RasterFields
 
 PARAMS = {
     CameraModelType.PINHOLE: 4,
@@ -224,7 +222,3 @@ def test_every_default_is_that_of_the_options():
                     name, getattr(kgs.RasterOptions, name)
                 )  # gsplat's is as good as none
                 assert parameter.default == expected, (function, name)
-
-
-def test_the_fields_of_the_options_may_be_keyword_arguments():
-    assert get_type_hints(RasterFields) == get_type_hints(kgs.RasterOptions)

@@ -90,11 +90,16 @@ class Measured:
 
     def image(self, s: Setting, grad: bool = False) -> Tensor:
         """The image alone, with or without its graph."""
-        options = {name: value for name, value in asdict(s).items() if name != "dtype"}
+        options = RasterOptions(
+            tile_size=s.tile_size,
+            near_plane=self.near_plane,
+            alpha_threshold=s.alpha_threshold,
+            transmittance_stop=s.transmittance_stop,
+        )
         with torch.set_grad_enabled(grad):
-            rules: dict[str, Any] = {"alpha_threshold": s.alpha_threshold, "backend": s.backend}
-            projected = project(*self.inputs[s.dtype], near_plane=self.near_plane, **rules)
-            return composite(projected, projected.colors, **options).features
+            projected = project(*self.inputs[s.dtype], options=options, backend=s.backend)
+            drawn = composite(projected, projected.colors, options=options, chunk_size=s.chunk_size, backend=s.backend)
+            return drawn.features
 
     def backward(self, s: Setting) -> dict[str, Tensor]:
         """The gradients of the image."""

@@ -10,7 +10,7 @@ import torch
 from compositing_checks import STOP, TH, THRESHOLDS, assert_close, footprints, leaves, outcome, random, sample
 from factories import batch, random_camera, random_gaussians
 
-from kgs import composite, project
+from kgs import RasterOptions, composite, project
 from kgs.backends.gpu import compositing
 
 SIZE = (12, 13)  # tiles that the picture ends in
@@ -51,7 +51,7 @@ def test_several_cameras_in_row_slices():
         got = run(projected, features, torch.ones(()), **exact, max_bytes=max_bytes)
         assert_close(got, expected, torch.ones(()))
     with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 500 for it"):
-        composite(projected, features, max_bytes=500, backend="triton")
+        composite(projected, features, options=RasterOptions(max_bytes=500), backend="triton")
 
 
 def test_a_row_slice_is_freed_before_the_next_is_made(monkeypatch):
@@ -103,7 +103,9 @@ def test_sums_of_absolute_values_are_those_of_torch():
     for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
         values = {k: getattr(projected, k).to(dtype) for k in ("means2d", "factors", "opacities", "depths")}
         moved, inputs = leaves(dataclasses.replace(projected, **values), projected.colors.to(dtype))
-        composite(moved, inputs[-1], backend=backend, absgrad=True).features.square().sum().backward()
+        composite(
+            moved, inputs[-1], backend=backend, options=RasterOptions(absgrad=True)
+        ).features.square().sum().backward()
         found.append(inputs[0].absgrad)
     assert (found[0] - found[1]).abs().max() <= 1e-5 * found[1].abs().max()
 

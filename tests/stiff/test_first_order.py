@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kgs import Gaussians, project
+from kgs import Gaussians, RasterOptions, project
 from kgs.bench.scenes import centred_camera
 
 SIGMAS, ANGLES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.3), (0, 20, 40, 55)
@@ -38,7 +38,11 @@ def errors() -> list[dict[str, float]]:
     centres = torch.tensor([[math.tan(math.radians(angle)), 0, 1] for angle, _ in cases], dtype=torch.float64)
     scales = torch.tensor([[sigma] * 3 for _, sigma in cases], dtype=torch.float64)
     quats, ones = torch.eye(4).double()[:1].expand(n, 4), torch.ones(n, 3).double()
-    drawn = project(Gaussians(centres, quats, scales, ones[:, 0], ones), centred_camera((size, size), focal), eps2d=0.0)
+    drawn = project(
+        Gaussians(centres, quats, scales, ones[:, 0], ones),
+        centred_camera((size, size), focal),
+        options=RasterOptions(eps2d=0.0),
+    )
     rows = []
     for k, (angle, sigma) in enumerate(cases):
         first_order = drawn.factors[k] @ drawn.factors[k].mT / focal**2
