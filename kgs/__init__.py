@@ -36,7 +36,7 @@ __getattr__, __dir__ = lazy_names(
         "kgs.drop": ("DropGaussian", "drop_gaussian"),
         "kgs.geometry": ("camera_extent",),
         "kgs.gsplat": ("rasterization",),
-        "kgs.io.ply": ("load_ply", "save_ply"),
+        "kgs.ply": ("load_ply", "save_ply"),
         "kgs.model": ("GaussianModel",),
         "kgs.renderer": ("GaussianRenderer",),
         "kgs.stages": ("composite", "project"),

@@ -18,7 +18,7 @@ from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  
 from kgs import backends
 from kgs.datasets import synthetic_scene
 from kgs.init_points import InitialPoints
-from kgs.io import film
+from kgs.app.files import film
 
 if not torch.cuda.is_available():  # before kernels are imported
     os.environ.setdefault("TRITON_INTERPRET", "1")

@@ -56,8 +56,8 @@ import kgs
 assert "torch" not in sys.modules
 assert set(kgs.__all__) <= set(dir(kgs))
 assert not hasattr(kgs, "nonsense")
-import kgs.datasets, kgs.fit, kgs.sfm
-assert all(set(package.__all__) <= set(dir(package)) for package in (kgs.datasets, kgs.fit, kgs.sfm))
+import kgs.datasets, kgs.fit, kgs.app.sfm
+assert all(set(package.__all__) <= set(dir(package)) for package in (kgs.datasets, kgs.fit, kgs.app.sfm))
 assert not hasattr(kgs.fit, "nonsense")
 assert "torch" not in sys.modules
 assert kgs.renderer.GaussianRenderer is kgs.GaussianRenderer

@@ -11,7 +11,7 @@ from kgs.app.fit_folder import fit_folder
 from kgs.app.saved_fit import load_fit
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.plan import make_plan
-from kgs.io.results_folder import CHECKPOINT
+from kgs.app.files.results_folder import CHECKPOINT
 from kgs.json_files import read_json
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)

@@ -15,11 +15,11 @@ import pytest
 import tyro
 
 import kgs
-import kgs.cli.run
+import kgs.app.cli.run
 from kgs import cli
 from kgs.fit.config import DETAILS, PAPER, FitConfig
-from kgs.io.outputs import FILMS
-from kgs.io.results_folder import RESULTS
+from kgs.app.files.outputs import FILMS
+from kgs.app.files.results_folder import RESULTS
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)

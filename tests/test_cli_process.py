@@ -12,9 +12,9 @@ from importlib.machinery import PathFinder
 
 import pytest
 
-from kgs.cli import checks, main
+from kgs.app.cli import checks, main
 
-MAIN = "import kgs.cli; kgs.cli.main()"
+MAIN = "import kgs.app.cli; kgs.app.cli.main()"
 
 
 def kgs_process(*arguments, shell):
@@ -96,8 +96,8 @@ class NoTorch:
         pass
 
 sys.meta_path.insert(0, NoTorch)
-import kgs.cli
-kgs.cli.main()
+import kgs.app.cli
+kgs.app.cli.main()
 """
 
 
@@ -155,7 +155,7 @@ for name, words in json.load(sys.stdin).items():
     sys.modules |= {package: None} if package in ("numba", "pycolmap", "matplotlib", "pi_heif") else {}
     folders.has_heic.cache_clear()
     try:
-        kgs.cli.main(words.split())
+        kgs.app.cli.main(words.split())
     except SystemExit as stop:
         print(name, stop.code, file=sys.stderr)
     sys.modules.pop(package, None)
@@ -171,8 +171,8 @@ def test_what_folders_and_options_show_is_told_before_torch_is_loaded(tmp_path):
     for name in ("heic/a.heic", "poses/sparse/0/images.bin", "taken/splat.ply"):
         (tmp_path / name).touch()
     before = sorted(tmp_path.rglob("*"))
-    imports = "import json\nimport kgs.cli\nfrom kgs.datasets import folders\n"
-    code = WITHOUT_TORCH.replace("import kgs.cli\nkgs.cli.main()", imports + RUN_ALL)
+    imports = "import json\nimport kgs.app.cli\nfrom kgs.datasets import folders\n"
+    code = WITHOUT_TORCH.replace("import kgs.app.cli\nkgs.cli.main()", imports + RUN_ALL)
     words = json.dumps({name: words for name, (words, _) in MISTAKES.items()})
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, input=words, capture_output=True, text=True, timeout=60
@@ -219,8 +219,8 @@ class SlowTorch:
                 pass  # as code does that is called while modules are imported
 
 sys.meta_path.insert(0, SlowTorch)
-import kgs.cli
-kgs.cli.main()
+import kgs.app.cli
+kgs.app.cli.main()
 """
 
 

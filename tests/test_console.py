@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from kgs.errors import DataError
-from kgs.io.console import as_line, progress, say
+from kgs.app.console import as_line, progress, say
 
 
 class Terminal(io.StringIO):

@@ -16,13 +16,13 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
-from kgs.cli.render import render
+from kgs.app.cli.render import render
 from kgs.fit import exports
 from kgs.geometry import typical_depths
-from kgs.io import film
-from kgs.io.cameras import camera_list, upright
-from kgs.io.outputs import EXPORTS, film_in
-from kgs.io.ownership import is_own
+from kgs.app.files import film
+from kgs.app.files.cameras import camera_list, upright
+from kgs.app.files.outputs import EXPORTS, film_in
+from kgs.app.files.ownership import is_own
 from kgs.json_files import write_json
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))

@@ -13,7 +13,7 @@ import torch
 from factories import random_views
 
 from kgs.datasets.scene import Views
-from kgs.io.figures import DEFAULT, WITHOUT, write_curve, write_sheet
+from kgs.app.files.figures import DEFAULT, WITHOUT, write_curve, write_sheet
 from kgs.machine import check_device, peak_rss_mb, revision, versions
 from kgs.study.plots import STYLES
 from kgs.study.presets import AUTO, OFF
@@ -44,7 +44,7 @@ def test_each_method_has_one_colour_in_every_figure(tmp_path):
     pixels = cv2.imread(str(tmp_path / "curve.png")).reshape(-1, 3)
     counts = [int((pixels == color).all(1).sum()) for color in ((167, 121, 204), (0, 0, 0))]  # blue first
     assert min(counts) > 50
-    style = files("kgs.page").joinpath("viewer.css").read_text()
+    style = files("kgs.app.page").joinpath("viewer.css").read_text()
     assert f".default {{ stroke: {DEFAULT.lower()}" in style
     assert (STYLES[AUTO][0], STYLES[OFF][0]) == (DEFAULT, WITHOUT)
 

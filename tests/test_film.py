@@ -16,9 +16,9 @@ from torch import Tensor
 
 from kgs import GaussianRenderer, Gaussians
 from kgs.datasets.scene import Views, pinholes
-from kgs.io import encoders, film
-from kgs.io.film import tour, write_film
-from kgs.io.ownership import is_own
+from kgs.app.files import encoders, film
+from kgs.app.files.film import tour, write_film
+from kgs.app.files.ownership import is_own
 
 
 def looking_at(target: Tensor, places: Tensor) -> Tensor:

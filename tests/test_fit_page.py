@@ -13,14 +13,14 @@ import torch
 from factories import random_views
 
 from kgs.app.saved_fit import load_fit
-from kgs.cli.evaluate import evaluate
+from kgs.app.cli.evaluate import evaluate
 from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.fit import run
 from kgs.fit.config import FitConfig
 from kgs.init_points import InitialPoints
 from kgs.metrics.lpips import Lpips
-from kgs.page import fit_page
-from kgs.page.fit_page import refresh_page, spread, write_own_page
+from kgs.app.page import fit_page
+from kgs.app.page.fit_page import refresh_page, spread, write_own_page
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
 REQUEST = {"train_views": 3, "downscale": None, "background": "black"}
@@ -134,7 +134,7 @@ def test_a_page_without_photos_shows_none(folder: Path, tmp_path: Path) -> None:
 
 
 def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None:
-    from kgs.cli import main
+    from kgs.app.cli import main
 
     with pytest.raises(SystemExit) as stop:
         main(["fit", str(folder), "-o", str(tmp_path), "--init", "random", "--init-points", "50", "--steps", "3"])

@@ -15,7 +15,7 @@ from factories import random_model
 from trimesh.exchange import gltf
 
 import kgs
-from kgs.io.glb import save_glb
+from kgs.app.files.glb import save_glb
 
 EXTENSION = "KHR_gaussian_splatting"
 OFFSET = torch.tensor([4e6, -2e6, 10.0]).double()

@@ -110,7 +110,7 @@ def test_imports_go_one_way():
 
 def test_the_command_alone_imports_the_study():
     clients = {name for name in SOURCES for other in imported_modules(name) if floor(other) == "study"}
-    assert {name for name in clients if floor(name) != "study"} == {"kgs.cli.study"}
+    assert {name for name in clients if floor(name) != "study"} == {"kgs.app.cli.study"}
 
 
 def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
@@ -123,7 +123,7 @@ def imported():
     """What one process finds after importing more and more, three lines. Torch itself imports tqdm where that is."""
     code = """
 import sys
-import kgs, kgs.cli.run, kgs.fit.config
+import kgs, kgs.app.cli.run, kgs.fit.config
 print("heavy:", *{"torch", "numpy", "cv2", "PIL", "trimesh", "matplotlib", "tyro"} & set(sys.modules))
 import torch
 before = set(sys.modules)

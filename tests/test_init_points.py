@@ -26,7 +26,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.geometry import typical_depths
 from kgs.init_points import InitialPoints, initial_points
-from kgs.io.console import each
+from kgs.app.console import each
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudi
 
 from kgs.datasets import image_file, load_scene
 from kgs.errors import DataError
-from kgs.sfm import pose, pose_photos
+from kgs.app.sfm import pose, pose_photos
 
 IMAGES = {".png", ".jpg"}
 

@@ -10,9 +10,9 @@ import torch
 
 import kgs
 from kgs.errors import DataError
-from kgs.io.figures import write_curve
-from kgs.io.outputs import check_folder, png_names, write_png
-from kgs.io.ownership import is_own, remove_own_images
+from kgs.app.files.figures import write_curve
+from kgs.app.files.outputs import check_folder, png_names, write_png
+from kgs.app.files.ownership import is_own, remove_own_images
 from kgs.json_files import write_json, write_whole
 
 CURVE = [{"step": 1, "seconds": 0.1, "test_psnr": 20.0, "train_psnr": None}]

@@ -12,8 +12,8 @@ import torch
 from factories import batch, random_camera, random_gaussians, replace
 
 import kgs
-from kgs.page import Picture, write_page
-from kgs.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
+from kgs.app.page import Picture, write_page
+from kgs.app.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
 
 SIZE = (24, 32)
 GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)

@@ -24,10 +24,10 @@ from kgs.fit.config import DEMO
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.io import film as films
-from kgs.page import Picture, write_page
-from kgs.page.fit_page import write_fit_page
-from kgs.sfm import pose_photos
+from kgs.app.files import film as films
+from kgs.app.page import Picture, write_page
+from kgs.app.page.fit_page import write_fit_page
+from kgs.app.sfm import pose_photos
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])

@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kgs.page.cameras import viewer_scene
+from kgs.app.page.cameras import viewer_scene
 
 MEANS = torch.tensor([[0.0, 0.0, 4.0]])
 

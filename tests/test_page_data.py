@@ -12,7 +12,7 @@ from factories import batch, random_camera, random_gaussians, replace
 
 import kgs
 from kgs import Gaussians
-from kgs.page.data import PIXEL_ERROR, Packed, pack
+from kgs.app.page.data import PIXEL_ERROR, Packed, pack
 
 SIZE = (90, 120)
 

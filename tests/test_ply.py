@@ -15,10 +15,10 @@ from hypothesis.extra import numpy as arrays
 from kgs import Densifier, GaussianRenderer
 from kgs.datasets import Views
 from kgs.fit.prune import contributions
-from kgs.io.glb import save_glb
-from kgs.io.ply import load_ply, save_ply
+from kgs.app.files.glb import save_glb
+from kgs.ply import load_ply, save_ply
 from kgs.model import GaussianModel
-from kgs.page.data import pack
+from kgs.app.page.data import pack
 
 
 def same(one, two):

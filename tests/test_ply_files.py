@@ -10,7 +10,7 @@ import torch
 from factories import random_model, splat_columns
 
 from kgs.errors import DataError
-from kgs.io.ply import load_ply, save_ply
+from kgs.ply import load_ply, save_ply
 
 SIZES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
 ALIASES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}

@@ -10,7 +10,7 @@ from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
 from kgs.app.saved_fit import SavedFit, load_fit
-from kgs.cli.evaluate import evaluate
+from kgs.app.cli.evaluate import evaluate
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.errors import DataError
 from kgs.fit import FitConfig, Trainer, fit_scene
@@ -18,7 +18,7 @@ from kgs.fit.plan import make_plan
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
 from kgs.geometry import camera_centers
-from kgs.page.fit_page import write_own_page
+from kgs.app.page.fit_page import write_own_page
 
 CONFIG = FitConfig(steps=6, seed=5, init="random", init_points=200, sh_degree=0, evaluations=1, refine_poses=True)
 

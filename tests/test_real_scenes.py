@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from kgs.cli import main
+from kgs.app.cli import main
 from kgs.datasets import synthetic_scene
 from kgs.fit import Trainer, initial_points
 from kgs.fit.config import PAPER

@@ -10,9 +10,9 @@ from factories import random_model
 
 import kgs
 from kgs import GaussianRenderer, save_ply
-from kgs.cli.checks import check_page
-from kgs.cli.page import page
-from kgs.cli.render import render
+from kgs.app.cli.page import check_page
+from kgs.app.cli.page import page
+from kgs.app.cli.render import render
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.image_file import ImageFile
 from kgs.errors import DataError

@@ -26,9 +26,9 @@ from kgs.fit.config import FitConfig, Recipe, with_pace
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
-from kgs.io import staging
-from kgs.io.ownership import make_own_folder
-from kgs.io.results_folder import CHECKPOINT, locked
+from kgs.app.files import staging
+from kgs.app.files.ownership import make_own_folder
+from kgs.app.files.results_folder import CHECKPOINT, locked
 
 CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))
 OTHER = replace(CONFIG, seed=1)

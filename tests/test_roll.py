@@ -8,7 +8,7 @@ from factories import pinhole, random_gaussians
 
 import kgs
 from kgs.datasets.scene import Views
-from kgs.io.cameras import rolled
+from kgs.app.files.cameras import rolled
 
 SIZE = (12, 20)
 

@@ -14,8 +14,8 @@ from photo_folders import NAMES, close, planes, poses, write_photos, write_plane
 
 from kgs.datasets import load_scene
 from kgs.errors import DataError
-from kgs.sfm import pose_photos
-from kgs.sfm.write import write_model
+from kgs.app.sfm import pose_photos
+from kgs.app.sfm.write import write_model
 
 pycolmap = pytest.importorskip("pycolmap")
 

@@ -12,8 +12,8 @@ import pytest
 from limits import limited
 from photo_folders import NAMES, write_planes
 
-from kgs.sfm import aside
-from kgs.sfm.aside import Aside, check_space
+from kgs.app.sfm import aside
+from kgs.app.sfm.aside import Aside, check_space
 
 pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits and signals of POSIX")

@@ -13,17 +13,17 @@ from init_point_scenes import cameras, texture
 from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
-from kgs.cli import main
-from kgs.cli.unposed import settle
+from kgs.app.cli import main
+from kgs.app.cli.unposed import settle
 from kgs.errors import DataError
-from kgs.io.console import silent
-from kgs.io.outputs import write_png
-from kgs.io.ownership import MARK
+from kgs.app.console import silent
+from kgs.app.files.outputs import write_png
+from kgs.app.files.ownership import MARK
 from kgs.json_files import write_json
-from kgs.sfm import pose, pose_photos
-from kgs.sfm.find import find_photos, notes_on
-from kgs.sfm.place import photo_staging
-from kgs.sfm.read import blurred, open_photos, read_photos
+from kgs.app.sfm import pose, pose_photos
+from kgs.app.sfm.find import find_photos, notes_on
+from kgs.app.sfm.place import photo_staging
+from kgs.app.sfm.read import blurred, open_photos, read_photos
 
 pytest.importorskip("pycolmap")
 
@@ -344,7 +344,7 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
     def fail(*arguments):
         raise error
 
-    monkeypatch.setattr(f"kgs.sfm.{stage}", fail)
+    monkeypatch.setattr(f"kgs.app.sfm.{stage}", fail)
     refused(write_planes(folder), said, code=code)
     assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
 
@@ -364,7 +364,15 @@ def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
 @pytest.mark.slow
 def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
     save(folder, [cv2.resize(image, (1600, 1200)) for image in planes()])
-    command = [sys.executable, "-c", "import kgs.cli; kgs.cli.main()", "fit", str(folder), "-o", str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        "-c",
+        "import kgs.app.cli; kgs.app.cli.main()",
+        "fit",
+        str(folder),
+        "-o",
+        str(tmp_path / "out"),
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         lines = iter(process.stderr.readline, "")
         assert any(line.startswith("keypoints: ") for line in lines)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kgs.errors import DataError
-from kgs.sfm import map as mapping
-from kgs.sfm.gates import (
+from kgs.app.sfm import map as mapping
+from kgs.app.sfm.gates import (
     disagreement,
     groups_of,
     is_forward,
@@ -18,7 +18,7 @@ from kgs.sfm.gates import (
     weakest_link,
     why_no_cameras,
 )
-from kgs.sfm.map import Cameras, PairGeometry
+from kgs.app.sfm.map import Cameras, PairGeometry
 
 NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}

@@ -9,7 +9,7 @@ import pytest
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from kgs import cli, sfm
-from kgs.cli.unposed import is_unposed
+from kgs.app.cli.unposed import is_unposed
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
 from kgs.json_files import write_json
@@ -75,7 +75,7 @@ def asked(truth, monkeypatch):
         return report | {"folder": str(out)}
 
     monkeypatch.setattr(sfm, "pose_photos", true_cameras)
-    monkeypatch.setattr("kgs.sfm.place.check_place", lambda *_: None)  # what is written here bears no mark of kgs
+    monkeypatch.setattr("kgs.app.sfm.place.check_place", lambda *_: None)  # what is written here bears no mark of kgs
     return calls
 
 

@@ -19,10 +19,10 @@ from kgs.densify import Densifier
 from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
 from kgs.fit.plan import make_plan
 from kgs.geometry import camera_extent
-from kgs.io.film import write_film
-from kgs.io.glb import save_glb
+from kgs.app.files.film import write_film
+from kgs.app.files.glb import save_glb
 from kgs.losses import photometric_loss, target_moments
-from kgs.page.fit_page import write_own_page
+from kgs.app.page.fit_page import write_own_page
 
 UPRIGHT = torch.eye(3)
 SCENE = synthetic_scene(train_views=2, test_views=1, size=(16, 16))

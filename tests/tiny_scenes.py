@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from kgs.fit.config import FitConfig
-from kgs.io.ply import save_ply
+from kgs.ply import save_ply
 from kgs.json_files import write_json
 from kgs.metrics import lpips
 from kgs.metrics.lpips import Lpips

@@ -27,7 +27,7 @@ with suppress(ImportError):  # the extra heic
 
     register_heif_opener()
 
-KGS = (sys.executable, "-P", "-c", "from kgs.cli import main; main()", "fit")  # -P: no module from a job's folder
+KGS = (sys.executable, "-P", "-c", "from kgs.app.cli import main; main()", "fit")  # -P: no module from a job's folder
 KINDS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "HEIF": ".heic"}  # by Pillow's names
 RESULTS = ("index.html", "splat.ply", "turntable.mp4", "turntable.webm")
 FEWEST, MOST = 3, 12  # photos

@@ -11,6 +11,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from kgs.app.console import each, progress, say
+from kgs.app.files.figures import write_curve
+from kgs.app.files.outputs import check_folder, png_names, write_png
+from kgs.app.files.ownership import is_own
+from kgs.app.files.results_folder import CHECKPOINT, is_finished, locked, replaced_files
+from kgs.app.files.staging import Staging
+from kgs.app.page.fit_page import write_own_page
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
 from kgs.fit.checkpoint import previous
@@ -22,17 +29,10 @@ from kgs.fit.probes import decide
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.io.console import each, progress, say
-from kgs.io.figures import write_curve
-from kgs.io.outputs import check_folder, png_names, write_png
-from kgs.io.ownership import is_own
-from kgs.io.ply import save_ply
-from kgs.io.results_folder import CHECKPOINT, is_finished, locked, replaced_files
-from kgs.io.staging import Staging
 from kgs.json_files import write_json
 from kgs.machine import check_packages
 from kgs.metrics.lpips import Lpips
-from kgs.page.fit_page import write_own_page
+from kgs.ply import save_ply
 
 from .files.exports import write_exports
 from .scene_request import SceneRequest

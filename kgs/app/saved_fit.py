@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs.app.files.results_folder import CHECKPOINT, complete_stopped_move
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.checkpoint import newest_checkpoint
@@ -14,7 +15,6 @@ from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.poses import place_cameras
 from kgs.fit.state import check_plain
-from kgs.io.results_folder import CHECKPOINT, complete_stopped_move
 from kgs.json_files import read_json
 from kgs.model import GaussianModel
 from kgs.types import RasterOptions

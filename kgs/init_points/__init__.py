@@ -84,7 +84,7 @@ def initial_points(
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world
             coordinates.
-        stage: shows the progress: :func:`kgs.io.console.each`, or nothing.
+        stage: shows the progress: :func:`kgs.app.console.each`, or nothing.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
         draw: how "dense" points are drawn: "uniform", or "spread" evenly over the images.
 

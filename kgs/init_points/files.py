@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kgs.errors import DataError
 from kgs.harmonics import SH_C0
-from kgs.io.ply import load_ply
+from kgs.ply import load_ply
 
 _MAX_BYTES = 2**30
 _MAX_TEXT_BYTES = 2**26  # trimesh needs about 75 times the size of a text in memory

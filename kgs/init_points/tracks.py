@@ -15,8 +15,8 @@ from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.init_points.keypoints import root_sift
 from kgs.progress import Stage, silent
-from kgs.sfm.keypoints import root_sift
 
 from .matching import match
 

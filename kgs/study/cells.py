@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 import kgs.version
+from kgs.app.page.pictures import Picture, encoded
 from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Scene
@@ -27,7 +28,6 @@ from kgs.init_points import InitialPoints
 from kgs.machine import peak_rss_mb, revision
 from kgs.metrics.evaluate import MEASURES
 from kgs.metrics.lpips import Lpips
-from kgs.page.pictures import Picture, encoded
 
 from .overfitting import coadaptation, count_over_threshold
 from .rivals import Rival, RivalTrainer

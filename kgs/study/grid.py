@@ -14,7 +14,7 @@ from typing import Any
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.core import rpc
 
-from kgs.io.results_folder import held
+from kgs.app.files.results_folder import held
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]

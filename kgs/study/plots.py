@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from kgs.io.figures import DEFAULT, WITHOUT
+from kgs.app.files.figures import DEFAULT, WITHOUT
 
 from .pairs import KEYS, STARTS, difference, grouped, main_cells
 from .presets import AUTO, FAMILIES, FIXED, MAIN, OFF, PAPER

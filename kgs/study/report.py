@@ -44,7 +44,7 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     plots = write_plots(told, out)
     conclusions = findings(told)
     origin = _origin(rows, frame, out, command, planned)
-    folders = ChoiceLoader([PackageLoader("kgs.study", ""), PackageLoader("kgs.page", "")])
+    folders = ChoiceLoader([PackageLoader("kgs.study", ""), PackageLoader("kgs.app.page", "")])
     templates = Environment(loader=folders, autoescape=True, trim_blocks=True)
     templates.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
     notes = templates.get_template("notes.txt").render().splitlines()

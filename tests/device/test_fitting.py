@@ -7,7 +7,7 @@ import torch
 from factories import drop_layer, random_opacities
 
 import kgs
-from kgs.cli import main
+from kgs.app.cli import main
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer

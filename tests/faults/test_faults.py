@@ -22,7 +22,7 @@ from fits import PATIENCE, Fit, memory_of
 
 from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
-from kgs.io.results_folder import CHECKPOINT
+from kgs.app.files.results_folder import CHECKPOINT
 
 SHORT, LONG = 24, 450  # steps
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 from study_rows import tiny_cell
 
-from kgs.cli import main
+from kgs.app.cli import main
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.study import cells as cells_module

@@ -70,7 +70,7 @@ def write_scene(root: Path) -> None:
 
 def main() -> None:
     """Fit, and print the table."""
-    from kgs.cli import main as command
+    from kgs.app.cli import main as command
 
     walk = Walk()
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere:

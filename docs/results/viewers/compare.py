@@ -9,7 +9,7 @@ import cv2
 import torch
 
 import kgs
-from kgs.io.images import eight_bits
+from kgs.app.files.images import eight_bits
 
 out, pictures = map(Path, sys.argv[1:])
 WIDTH, HEIGHT = 640, 480

@@ -3,20 +3,20 @@
 from dataclasses import replace
 from pathlib import Path
 
+from kgs.app.console import each
+from kgs.app.files.cameras import camera_list, rolled, upright
+from kgs.app.files.encoders import film_suffix
+from kgs.app.files.film import path_near_plane, write_film
+from kgs.app.files.glb import save_glb
 from kgs.fit.fit import Fit
 from kgs.geometry import typical_depths
-from kgs.io.cameras import camera_list, rolled, upright
-from kgs.io.console import each
-from kgs.io.encoders import film_suffix
-from kgs.io.film import path_near_plane, write_film
-from kgs.io.glb import save_glb
 from kgs.json_files import write_json
 
 
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none, or no MP4.
 
-    `roll` turns the pictures of the film, and with them what is up in the glTF file, see :func:`kgs.io.cameras.rolled`.
+    `roll` turns the pictures of the film, and with them what is up in the glTF file, see :func:`kgs.app.files.cameras.rolled`.
     """
     scene = fit.scene
     upright_views = rolled(scene.train, roll)

@@ -1,5 +1,5 @@
 "use strict";
-// Decodes a splat (the format is described in kgs/page/data.py) and draws it with WebGL2, sorted from back to front.
+// Decodes a splat (the format is described in kgs/app/page/data.py) and draws it with WebGL2, sorted from back to front.
 
 const TEXELS_PER_ROW = 2048;
 const FLOATS_PER_GAUSSIAN = 12;  // in the geometry texture, see splat.vert.glsl

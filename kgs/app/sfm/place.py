@@ -1,6 +1,6 @@
 """Where photos and cameras go: `images`, `sparse/0` and `photos.json` in a folder, all three or none.
 
-New ones go through `unfinished-photos` and `finished-photos`, see `kgs.io.staging`. Beside a fit, which belongs to the
+New ones go through `unfinished-photos` and `finished-photos`, see `kgs.app.files.staging`. Beside a fit, which belongs to the
 former cameras, they wait in the second folder until the new fit is there.
 """
 
@@ -8,10 +8,10 @@ import os
 from pathlib import Path
 from typing import Any
 
+from kgs.app.files.ownership import holds_only_own, is_own
+from kgs.app.files.staging import Staging
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.errors import DataError
-from kgs.io.ownership import holds_only_own, is_own
-from kgs.io.staging import Staging
 from kgs.json_files import read_json
 
 REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"

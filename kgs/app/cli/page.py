@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from kgs.errors import printable
+from kgs.app.console import as_line, say, say_next
+from kgs.errors import DataError, printable
 from kgs.fit.config import Backend, Background
-from kgs.io.console import as_line, say, say_next
 
 from .inputs import load_cameras, load_splat
 from .options import Existing, Out
@@ -41,12 +42,12 @@ def page(
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
+    from kgs.app.files.ownership import claim, record
+    from kgs.app.page.fit_page import MOST_PICTURES, spread, write_fit_page
     from kgs.datasets import load_scene
-    from kgs.io.ownership import claim, record
     from kgs.losses.photometric import WINDOW
     from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
-    from kgs.page.fit_page import MOST_PICTURES, spread, write_fit_page
 
     place = check_tools(device, backend, "jinja2")
     scene = load_cameras(cameras, downscale, background=background)
@@ -76,3 +77,24 @@ def page(
     if cost:
         say(f"the page shows {cost}; {printable(ply)} has everything")
     say_next(f"open {as_line(out)} in a browser")
+
+
+def check_page(
+    cameras: Path, out: Path, downscale: float | None, roll: float, device: str, backend: str, **_: Any
+) -> None:
+    """Check the arguments of `kgs page`."""
+    from kgs.app.files.ownership import is_own
+    from kgs.datasets.options import check_options
+
+    from .checks import check_installed, check_roll, check_scene
+
+    check_roll(roll)
+    check_options(downscale, None)
+    check_installed(device, backend, "jinja2")
+    if out.suffix != ".html":
+        raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
+    if out.exists() and not is_own(out):
+        raise DataError(out, "", "was not written by kgs and would be overwritten: choose another file")
+    if not out.absolute().parent.is_dir():
+        raise DataError(out, "", "expected a file in a folder that is there")
+    check_scene(cameras)

@@ -1,7 +1,7 @@
 """Finds the cameras of unposed photos. `pose` runs the parts: find, read, keypoints, match, map, gates, write.
 
 The input is a folder of photos as a phone wrote them, the output a scene that kgs and other programs read. Two solvers
-have to agree, and gates refuse cameras that cannot be trusted: see :mod:`kgs.sfm.gates`.
+have to agree, and gates refuse cameras that cannot be trusted: see :mod:`kgs.app.sfm.gates`.
 """
 
 from typing import TYPE_CHECKING
@@ -15,4 +15,4 @@ __all__ = ["pose_photos"]
 
 
 # folders are looked at without torch
-__getattr__, __dir__ = lazy_names(__name__, {"kgs.sfm.pose": ("pose_photos",)})
+__getattr__, __dir__ = lazy_names(__name__, {"kgs.app.sfm.pose": ("pose_photos",)})

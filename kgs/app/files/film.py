@@ -49,11 +49,11 @@ def write_film(
     the views, reduced to at most `LONGEST` pixels and rounded to even numbers.
 
     Args:
-        path: the file to write, in an existing folder; see :func:`kgs.io.encoders.film_suffix`.
+        path: the file to write, in an existing folder; see :func:`kgs.app.files.encoders.film_suffix`.
         render: from a camera to an image `(1, 3, H, W)`.
         views: the views whose cameras the path passes.
         depth: distance from the cameras to the scene, in world units.
-        stage: wraps the poses to show progress, such as :func:`kgs.io.console.each`.
+        stage: wraps the poses to show progress, such as :func:`kgs.app.console.each`.
 
     Returns:
         "", or the reason why no film was written: there is no encoder for it here.

@@ -1,8 +1,9 @@
 """`kgs study`: what DropGaussian is worth."""
 
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
-from .options import Existing, Out
+from kgs.app.cli.options import Existing, Out
 
 
 def study(
@@ -47,3 +48,13 @@ def study(
         lpips_weights=lpips_weights,
         report_only=report_only,
     )
+
+
+def check_study(lpips_weights: Path | None, **_: Any) -> None:
+    """Check the arguments of `kgs study`."""
+    from kgs.app.cli.checks import check_installed
+    from kgs.metrics.weights import weight_files
+
+    check_installed("cpu", "auto", "pandas", "scipy", "distributed", "matplotlib", "jinja2")
+    if lpips_weights is not None:
+        weight_files(lpips_weights)

@@ -11,8 +11,8 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.app.files.film import path_near_plane
 from kgs.camera import MARGIN
-from kgs.io.film import path_near_plane
 from kgs.json_files import write_whole
 from kgs.types import Gaussians, RasterOptions
 from kgs.version import __version__
@@ -66,7 +66,7 @@ def write_page(
 
     The viewer opens at one of the training cameras nearest the mean pose, see `viewer_scene`. File names are shown as
     they are given; in all other texts absolute paths are shortened to their last part. The splat is packed into the
-    bytes that the rest of the page leaves, see :func:`kgs.page.data.pack`.
+    bytes that the rest of the page leaves, see :func:`kgs.app.page.data.pack`.
 
     Convention:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
@@ -79,10 +79,10 @@ def write_page(
         names: file names of the C photos.
         parts: what each photo was used for: "training", "test", or another word.
         near_plane: of the renderer, in world units. Beside the photos' cameras the viewer's is farther away, see
-            :func:`kgs.io.film.path_near_plane`.
+            :func:`kgs.app.files.film.path_near_plane`.
         background: colour behind the splat, `(3,)` in [0, 1].
         antialiased: draw the splat as with `RasterOptions.antialiased`.
-        pictures: photos with renders, `kgs.page.Picture`.
+        pictures: photos with renders, `kgs.app.page.Picture`.
         pictures_note: a sentence that says which photos these are.
         film: the content of an MP4 or WebM file; b"" for none. It is left out where it has more than `MOST_FILM_BYTES`,
             or where anything of the splat would have to be left out for it.
@@ -96,7 +96,7 @@ def write_page(
         most_bytes: limit for the page.
 
     Returns:
-        What the viewer shows less than the splat, in words, see :class:`kgs.page.data.Packed`; "" for nothing.
+        What the viewer shows less than the splat, in words, see :class:`kgs.app.page.data.Packed`; "" for nothing.
 
     Raises:
         ValueError: the page does not fit.
@@ -110,7 +110,7 @@ def write_page(
     width, height = scene["cameras"][0]["size"]
     first_run = next(iter(runs.values()), {})
     measures_head, measures = measure_table(runs)
-    folder = resources.files("kgs.page")
+    folder = resources.files("kgs.app.page")
     context: dict[str, Any] = {
         "title": without_folders(title),
         "summary": f"{len(gaussians)} Gaussians; {_counts(parts)} photos of {width} × {height} pixels.",
@@ -133,7 +133,9 @@ def write_page(
         "versions": facts(first_run.get("versions") or {"kgs": __version__}),
         "files": {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES},
     }
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("kgs.page", "."), autoescape=True, trim_blocks=True)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("kgs.app.page", "."), autoescape=True, trim_blocks=True
+    )
     template = environment.get_template("page.html.jinja")
     viewer_settings = {
         "nearPlane": near_plane,

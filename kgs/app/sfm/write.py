@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs.app.files.outputs import write_png
 from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
 from kgs.errors import DataError
-from kgs.io.outputs import write_png
 
 from .aside import check_space
 from .map import Cameras, quiet_pycolmap

@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.errors import printable
 from kgs.fit.config import DEMO, DEMO_STEPS, Backend, FitConfig
-from kgs.io.console import VIEWER, as_line, each, say, say_next
 
 from .options import Out
 
@@ -42,13 +42,13 @@ def demo(
         device: cpu, cuda, ...
         backend: as of kgs fit.
     """
+    from kgs.app.files.outputs import check_folder
     from kgs.datasets import synthetic_scene
-    from kgs.io.outputs import EXPORTS, check_folder
     from kgs.machine import check_packages
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     check_packages("matplotlib", "jinja2")
-    check_folder(out, ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS])
+    check_folder(out, _files())
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
@@ -73,17 +73,17 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     `drops` are the rates of dropping by the name of the run; pictures show the last one beside the others.
     """
     from kgs.app.files.exports import write_exports
+    from kgs.app.files.figures import write_curve, write_sheet
+    from kgs.app.files.outputs import film_in
+    from kgs.app.files.staging import Staging
     from kgs.app.fit_folder import train
+    from kgs.app.page.fit_page import PAGE, write_fit_page
     from kgs.fit.measure import measure
     from kgs.fit.plan import make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
-    from kgs.io.figures import write_curve, write_sheet
-    from kgs.io.outputs import film_in
-    from kgs.io.ply import save_ply
-    from kgs.io.staging import Staging
     from kgs.json_files import write_json
-    from kgs.page.fit_page import PAGE, write_fit_page
+    from kgs.ply import save_ply
 
     points = choose_points(scene, config, each)
     height, width = scene.train.images.shape[-2:]
@@ -124,3 +124,23 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     staging.seal()
     staging.complete()
     return runs
+
+
+def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:
+    """Check the arguments of `kgs demo`."""
+    from kgs.app.files.outputs import check_folder
+
+    from .checks import check_installed
+
+    FitConfig(steps=steps)
+    if min(size) < 12:  # the window of SSIM
+        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
+    check_installed(device, backend, "matplotlib", "jinja2")
+    check_folder(out, _files(), make=False)
+
+
+def _files() -> list[str]:
+    """The files that the demo writes."""
+    from kgs.app.files.outputs import EXPORTS
+
+    return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS]

@@ -10,8 +10,8 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs.app.files.film import tour
 from kgs.geometry import camera_centers, common_up
-from kgs.io.film import tour
 
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # depth of a pyramid, as a share of the median distance between neighbouring cameras
@@ -49,7 +49,7 @@ def viewer_scene(
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
         turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
-        sway: rotations and positions of a closed path through the training cameras, see :func:`kgs.io.film.tour`.
+        sway: rotations and positions of a closed path through the training cameras, see :func:`kgs.app.files.film.tour`.
     """
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs.app.console import say
 from kgs.errors import DataError, listed, printable
 from kgs.fit.config import Recipe
-from kgs.io.console import say
 
 if TYPE_CHECKING:
     import torch
@@ -31,7 +31,7 @@ def load_splat(ply: Path, scene: "Scene", place: "torch.device", backend: str) -
     """
     from kgs.fit.fit import Fit
     from kgs.geometry import typical_depths
-    from kgs.io.ply import load_ply
+    from kgs.ply import load_ply
     from kgs.types import RasterOptions
 
     model = load_ply(ply, origin=scene.offset)

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kgs.app.console import each, say
+from kgs.app.files.results_folder import locked
 from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
-from kgs.io.console import each, say
-from kgs.io.results_folder import locked
 
 if TYPE_CHECKING:
     from kgs.app.scene_request import SceneRequest
@@ -39,8 +39,8 @@ def find_scene(
     Raises:
         DataError: as of `pose_photos`.
     """
-    from kgs.sfm import pose_photos
-    from kgs.sfm.find import notes_on
+    from kgs.app.sfm import pose_photos
+    from kgs.app.sfm.find import notes_on
 
     for note in notes_on(photos):
         say(note)
@@ -73,7 +73,7 @@ def on_ctrl_c(kept: str) -> Iterator[None]:
 
 def settle(out: Path) -> None:
     """Put cameras that waited for a fit in their place, beside its results."""
-    from kgs.sfm.place import photo_staging
+    from kgs.app.sfm.place import photo_staging
 
     with locked(out):
         photo_staging(out).complete()

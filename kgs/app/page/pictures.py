@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from kgs.io.images import eight_bits
+from kgs.app.files.images import eight_bits
 
 GAIN = 4  # factor by which differences are amplified
 _LONGER_SIDES = (1008, 756, 504, 378, 252)  # pixels; the first one with which all images fit is used

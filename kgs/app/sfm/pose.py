@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import torch
 
+from kgs.app.console import say
+from kgs.app.files.outputs import png_names
+from kgs.app.files.results_folder import locked
 from kgs.errors import DataError
-from kgs.io.console import say
-from kgs.io.outputs import png_names
-from kgs.io.results_folder import locked
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 from kgs.progress import Stage, silent
@@ -69,7 +69,7 @@ def pose_photos(
         out: the folder for the results, created if it does not exist.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         wait: leave new files in `out/finished-photos` if `out` holds a fit, which belongs to the former cameras.
-        stage: shows how far each part is, as `kgs.io.console.each` does.
+        stage: shows how far each part is, as `kgs.app.console.each` does.
         say: called with each line for the user.
 
     Returns:

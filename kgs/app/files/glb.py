@@ -19,10 +19,9 @@ from torch import Tensor
 from kgs.harmonics import SH_C0
 from kgs.json_files import write_whole
 from kgs.model import GaussianModel
+from kgs.ply import as_vector
 from kgs.types import check_kind
 from kgs.version import __version__
-
-from .ply import as_vector
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # types of accessors, by the count of numbers per Gaussian
@@ -49,7 +48,7 @@ def save_glb(
     Args:
         path: the file to write, in an existing folder.
         model: the Gaussians.
-        rotation: from the model's world to glTF's, `(3, 3)`, as :func:`kgs.io.cameras.upright` gives.
+        rotation: from the model's world to glTF's, `(3, 3)`, as :func:`kgs.app.files.cameras.upright` gives.
         offset: the origin of the model's frame in its world, `(3,)`: the `offset` of a Scene. It becomes the node's
             translation. None: zero.
 

@@ -1,5 +1,7 @@
 """`kgs bench`: what rendering costs on this machine, and how exact it is."""
 
+from typing import Any
+
 from .options import Out
 
 
@@ -55,3 +57,10 @@ def extremes(*, out: Out) -> int:
     from kgs.bench.extremes import extremes
 
     return extremes(out=out)
+
+
+def check_speed(device: str, **_: Any) -> None:
+    """Check the arguments of `kgs bench speed`."""
+    from .checks import check_installed
+
+    check_installed(device, "auto", "matplotlib")

@@ -2,7 +2,7 @@
 
 Results are written to a folder of their own, `unfinished`. When all are there, `seal` lists the files and renames the
 folder to `finished`; from then on they are whole. `complete` moves them to their places, removes what only the former
-results had, and keeps the list, see `kgs.io.ownership`. Code that opens the folder calls `complete` first, in case a
+results had, and keeps the list, see `kgs.app.files.ownership`. Code that opens the folder calls `complete` first, in case a
 kill came in between.
 """
 

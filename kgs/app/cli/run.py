@@ -13,24 +13,24 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
+from kgs.app.console import as_line, say
 from kgs.errors import DataError, TrainingDiverged, printable
 from kgs.fit.config import FitConfig, Recipe
-from kgs.io.console import as_line, say
 
 from .interrupts import interrupt_as_usual
 
-# The module of this package and the function in it that are a command.
+# The module and the function in it that are a command.
 _COMMANDS = {
-    "demo": ("demo", "demo"),
-    "fit": ("fit", "fit"),
-    "render": ("render", "render"),
-    "eval": ("evaluate", "evaluate"),
-    "page": ("page", "page"),
-    "check": ("check", "check"),
-    "bench speed": ("bench", "speed"),
-    "bench precision": ("bench", "precision"),
-    "bench extremes": ("bench", "extremes"),
-    "study": ("study", "study"),
+    "demo": ("kgs.app.cli.demo", "demo"),
+    "fit": ("kgs.app.cli.fit", "fit"),
+    "render": ("kgs.app.cli.render", "render"),
+    "eval": ("kgs.app.cli.evaluate", "evaluate"),
+    "page": ("kgs.app.cli.page", "page"),
+    "check": ("kgs.app.cli.check", "check"),
+    "bench speed": ("kgs.app.cli.bench", "speed"),
+    "bench precision": ("kgs.app.cli.bench", "precision"),
+    "bench extremes": ("kgs.app.cli.bench", "extremes"),
+    "study": ("kgs.study.command", "study"),
 }
 _HEAVY = ("torch", "kornia", "cv2", "numba")
 _EXTRAS = {
@@ -41,7 +41,7 @@ _EXTRAS = {
     "pandas": "study",
     "scipy": "study",
 }
-_OF_THE_USER = {
+USER_ERRORS = {
     errno.EACCES,
     errno.EEXIST,
     errno.EISDIR,
@@ -85,7 +85,7 @@ def exit_code(words: list[str]) -> int:
         code = 0  # the reader has what it wanted
     except OSError as error:
         place = f"{printable(error.filename)}: " if error.filename else ""
-        message, code = f"{place}{error.strerror}", 2 if error.errno in _OF_THE_USER else 1
+        message, code = f"{place}{error.strerror}", 2 if error.errno in USER_ERRORS else 1
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not any(cause in str(error) for cause in ("allocate", "of memory")):
             raise
@@ -113,7 +113,7 @@ def _of_a_missing_package(error: ModuleNotFoundError) -> str:
 
 
 def _import(module: str) -> None:
-    """Import a large package ahead; a missing one the command tells, and a broken one unless it can do without it."""
+    """Import a large package. A missing one is reported by the command that needs it; a broken one here, but numba."""
     try:
         import_module(module)
     except ModuleNotFoundError:
@@ -124,7 +124,7 @@ def _import(module: str) -> None:
 
 
 def _of_a_broken_package(error: ImportError) -> str:
-    """Of one that is there and cannot be imported: a shared library that it lacks, a NumPy that does not fit it."""
+    """Message for an installed package that fails to import."""
     names = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
     tops = [name.partition(".")[0] for name in [error.name or "", *names]]
     package = next((top for top in tops if top not in ("", "kgs", *sys.stdlib_module_names)), "")
@@ -181,18 +181,18 @@ def _say_commands(prefix: str) -> None:
 def _load(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], dict[str, Any]]]:
     """The function of a command, and that of the defaults which follow from its words."""
     module, function = _COMMANDS[name]
-    home = import_module(f"kgs.cli.{module}")
+    home = import_module(module)
     return getattr(home, function), getattr(home, "defaults", lambda _: {})
 
 
 def _check(name: str, call: partial[Any]) -> None:
-    """Tell a mistake that can be told before torch is loaded."""
-    from .checks import CHECKS  # after tyro has read the words: a misspelt option is told without them
-
-    if name in CHECKS:
+    """Report mistakes that need no torch."""
+    module, function = _COMMANDS[name]
+    check = getattr(import_module(module), f"check_{function}", None)
+    if check is not None:
         bound = inspect.signature(call.func).bind(*call.args, **call.keywords)
         bound.apply_defaults()
-        CHECKS[name](**bound.arguments)
+        check(**bound.arguments)
 
 
 def _flags_of(command: Callable[..., Any]) -> dict[str, str]:

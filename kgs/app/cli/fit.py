@@ -3,15 +3,15 @@
 import os
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.errors import DataError, printable
 from kgs.fit.config import DETAILS, PRESETS, Background, FitConfig
-from kgs.io.console import VIEWER, as_line, say, say_next
 
-from .checks import SMALLEST
 from .options import Existing, Out
 
 
@@ -74,17 +74,18 @@ def fit(
         config: every number of the fit.
     """
     del preset  # `defaults` has read it
+    from kgs.app.files.ownership import is_own
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
-    from kgs.io.ownership import is_own
     from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
 
+    from .checks import SMALLEST
     from .unposed import find_scene, is_unposed, on_ctrl_c, settle
 
     check_packages("matplotlib", "safetensors", "jinja2")
@@ -141,3 +142,44 @@ def fit(
         VIEWER.format(as_line(splat)),
     )
     return 0
+
+
+def check_fit(
+    scene: Path,
+    out: Path,
+    views: int | None,
+    hold_out: int | None,
+    size: int | None,
+    downscale: float | None,
+    roll: float,
+    lpips_weights: Path | None,
+    config: FitConfig,
+    **_: Any,
+) -> None:
+    """Check the arguments of `kgs fit`."""
+    from kgs.app.files.outputs import check_folder
+    from kgs.app.files.results_folder import replaced_files
+    from kgs.datasets.options import check_options
+    from kgs.metrics.weights import weight_files
+
+    from .checks import SMALLEST, check_installed, check_photos, check_roll, check_scene
+    from .unposed import is_unposed
+
+    check_roll(roll)
+    if size is not None and downscale is not None:
+        raise ValueError("size: expected either a size or a downscale factor, got both")
+    if size is not None and size < SMALLEST:
+        raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
+    if views is not None and views < 1:
+        raise ValueError(f"views: expected a whole number of at least 1, got {views}")
+    check_options(downscale, hold_out)
+    unposed = is_unposed(scene)
+    solver = ["pycolmap"] if unposed else []
+    check_installed(config.device, config.backend, "matplotlib", "safetensors", "jinja2", *solver)
+    if lpips_weights is not None:
+        weight_files(lpips_weights)
+    check_folder(out, replaced_files(out), scene, make=False)
+    if unposed:
+        check_photos(scene, out, views, hold_out, downscale)
+    else:
+        check_scene(scene)

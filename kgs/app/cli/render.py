@@ -1,10 +1,11 @@
 """`kgs render`: pictures of a splat."""
 
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.errors import printable
 from kgs.fit.config import Backend, Background
-from kgs.io.console import VIEWER, as_line, each, say, say_next
 
 from .inputs import load_cameras, load_splat
 from .options import Existing, Out
@@ -40,9 +41,9 @@ def render(
     """
     import torch
 
+    from kgs.app.files.outputs import check_folder, png_names, write_png
+    from kgs.app.files.ownership import claim, record
     from kgs.camera import move_camera
-    from kgs.io.outputs import check_folder, png_names, write_png
-    from kgs.io.ownership import claim, record
     from kgs.machine import check_tools
     from kgs.renderer import GaussianRenderer
 
@@ -66,3 +67,16 @@ def render(
     record(out, "renders", names.values())
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))
+
+
+def check_render(cameras: Path, out: Path, downscale: float | None, device: str, backend: str, **_: Any) -> None:
+    """Check the arguments of `kgs render`."""
+    from kgs.app.files.outputs import check_folder
+    from kgs.datasets.options import check_options
+
+    from .checks import check_installed, check_layout
+
+    check_options(downscale, None)
+    check_installed(device, backend)
+    check_folder(out, (), cameras, make=False)
+    check_layout(cameras)

@@ -54,7 +54,7 @@ function target({ position, rotation, distance }) {
 }
 
 class Viewer {
-  // `scene` is what `viewer_scene` of kgs/page/cameras.py returns.
+  // `scene` is what `viewer_scene` of kgs/app/page/cameras.py returns.
   constructor(frame, renderer, scene) {
     this.frame = frame;
     this.canvas = frame.querySelector("canvas");
@@ -126,7 +126,7 @@ class Viewer {
   // Moves the eye along the path through the training cameras until something else moves it.
   sway() {
     const { cameras, first, sway: path } = this.scene;
-    const stops = Math.min(12, cameras.filter((camera) => camera.part !== "test").length);  // as in kgs/io/film.py
+    const stops = Math.min(12, cameras.filter((camera) => camera.part !== "test").length);  // as in kgs/app/files/film.py
     const posesPerSecond = path.length / (SWAY_SECONDS_PER_CAMERA * Math.max(2, stops));
     const begin = this.eye;
     let isVisible = true, seconds = 0, before = null;

@@ -1,4 +1,4 @@
-"""The page of a fit, index.html: collects the content for :func:`kgs.page.write_page` from a fit and its files."""
+"""The page of a fit, index.html: collects the content for :func:`kgs.app.page.write_page` from a fit and its files."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,6 +10,10 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs.app.console import each
+from kgs.app.files.cameras import rolled
+from kgs.app.files.film import film_within
+from kgs.app.files.outputs import film_in
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.scene import Views
@@ -17,10 +21,6 @@ from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
 from kgs.fit.fit import Fit
 from kgs.fit.prune import contributions, left_out
-from kgs.io.cameras import rolled
-from kgs.io.console import each
-from kgs.io.film import film_within
-from kgs.io.outputs import film_in
 from kgs.json_files import read_json
 
 from . import Picture, write_page
@@ -60,7 +60,7 @@ def write_fit_page(
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
         film: an MP4 or WebM file to show.
         photos: whether the page shows photos, renders and their differences.
-        roll: degrees by which all pictures are turned clockwise, see :func:`kgs.io.cameras.rolled`.
+        roll: degrees by which all pictures are turned clockwise, see :func:`kgs.app.files.cameras.rolled`.
 
     Returns:
         What the viewer shows less than the model, in words; "" for nothing.

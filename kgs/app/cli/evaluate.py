@@ -1,10 +1,12 @@
 """`kgs eval`: measures a fit again."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+from kgs.app.console import as_line, say, say_next
 from kgs.errors import printable
 from kgs.fit.config import Backend
-from kgs.io.console import as_line, say, say_next
 
 from .options import Existing
 
@@ -24,13 +26,13 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit.
     """
+    from kgs.app.files.ownership import is_own, record
+    from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
-    from kgs.io.ownership import is_own, record
     from kgs.json_files import write_json
     from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
-    from kgs.page.fit_page import PAGE, write_own_page
 
     check_packages("jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
@@ -48,3 +50,18 @@ def evaluate(
     say(as_text(metrics))
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")
+
+
+def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: str, **_: Any) -> None:
+    """Check the arguments of `kgs eval`."""
+    from kgs.app.files.staging import Staging
+    from kgs.json_files import read_json
+    from kgs.metrics.weights import weight_files
+
+    from .checks import check_installed
+
+    check_installed(device, backend, "jinja2")
+    if lpips_weights is not None:
+        weight_files(lpips_weights)
+    if not Staging(out).finished.exists():
+        read_json(out / "config.json")

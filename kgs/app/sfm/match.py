@@ -12,9 +12,9 @@ import torch
 from kornia.feature import laf_from_center_scale_ori, match_adalam
 from torch import Tensor
 
+from kgs.init_points.keypoints import root_sift
 from kgs.progress import Stage
 
-from .keypoints import root_sift
 from .read import Photo
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size

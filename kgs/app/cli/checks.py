@@ -1,0 +1,86 @@
+"""Mistakes in a command's options that can be reported without torch, which takes seconds to load.
+
+The check of a command is beside it: `check_fit` in `fit.py`. `kgs.app.cli.run` calls it with all arguments of the
+command before anything heavy is loaded; the command itself checks what needs more.
+"""
+
+import ctypes
+import sys
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+
+from kgs.datasets import folders
+from kgs.errors import DataError
+
+SMALLEST = 32  # pixels of the longer side of a fit's photos
+_ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
+# Kinds of devices of torch; a plugin (entry point "torch.backends") may bring others.
+_DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "maia", "lazy", "vulkan", "meta")
+
+
+def check_roll(roll: float) -> None:
+    """A ValueError unless this is an angle by which pictures can be turned."""
+    if not -360 <= roll <= 360:
+        raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
+
+
+def check_installed(device: str, backend: str, *packages: str) -> None:
+    """A ModuleNotFoundError where a package is not installed, a ValueError where a device cannot be used."""
+    for package in (*_ALWAYS, *packages, *(["numba"] if backend == "numba" else [])):
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(f"{package} is not installed", name=package)
+    if reason := _why_no_device(device.partition(":")[0]):
+        raise ValueError(f"device: expected cpu or a GPU of this machine, got {device!r} ({reason})")
+
+
+def _why_no_device(kind: str) -> str:
+    """Why torch cannot use a device of this kind, as far as that is sure before it is loaded; "" where it may."""
+    if kind not in _DEVICES and not entry_points(group="torch.backends"):
+        return "torch knows cpu, cuda, mps, xpu and others"
+    if kind != "cuda":
+        return ""
+    spec = find_spec("torch")
+    build = Path(spec.origin).with_name("version.py") if spec and spec.origin else None
+    lines = build.read_text(encoding="utf-8").splitlines() if build and build.is_file() else []
+    made_for = {line.partition(":")[0].partition(" ")[0]: line.rpartition("= ")[2].strip() for line in lines}
+    if made_for.get("cuda") == "None" and made_for.get("hip", "None") == "None":
+        return "torch is installed without CUDA"
+    if sys.platform == "linux" and made_for.get("hip", "None") == "None":
+        try:
+            ctypes.CDLL("libcuda.so.1")
+        except OSError:
+            return "there is no driver of NVIDIA"
+    return ""
+
+
+def check_layout(scene: Path) -> None:
+    """Raise a DataError unless this is a scene."""
+    if folders.layout_of(scene) is None:
+        raise DataError(scene, "", folders.why_no_scene(scene))
+
+
+def check_scene(scene: Path) -> None:
+    """Raise a DataError unless this is a scene with at least one photo."""
+    check_layout(scene)
+    if not folders.has_photos(scene):
+        raise DataError(scene, "", "has camera poses but no photos: expected them in images/, or where its files say")
+
+
+def check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
+    """Check a folder of unposed photos and what is asked of it; reads their headers only where `downscale` is given."""
+    from kgs.app.sfm.find import find_photos
+    from kgs.app.sfm.place import check_place
+
+    paths = find_photos(folder)
+    check_place(out, folder)
+    most = len(paths) - (1 if hold_out else 0)
+    if views is not None and views > most:
+        raise ValueError(f"views: expected at most {most} of {len(paths)} photos, got {views}")
+    if downscale is not None:
+        from kgs.datasets.image_file import read_size
+
+        width, height = min(read_size(path) for path in paths)
+        if max(width, height) / downscale < SMALLEST:
+            shrunk = f"{max(1, round(width / downscale))}x{max(1, round(height / downscale))} of {width}x{height}"
+            raise ValueError(f"downscale: expected {SMALLEST} pixels or more of the longer side, got {shrunk}")
