@@ -16,7 +16,8 @@ from kgs.json_files import write_json
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none, or no MP4.
 
-    `roll` turns the pictures of the film, and with them what is up in the glTF file, see :func:`kgs.app.files.cameras.rolled`.
+    `roll` turns the pictures of the film, and with them what is up in the glTF file, see
+    :func:`kgs.app.files.cameras.rolled`.
     """
     scene = fit.scene
     upright_views = rolled(scene.train, roll)

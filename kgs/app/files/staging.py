@@ -2,8 +2,8 @@
 
 Results are written to a folder of their own, `unfinished`. When all are there, `seal` lists the files and renames the
 folder to `finished`; from then on they are whole. `complete` moves them to their places, removes what only the former
-results had, and keeps the list, see `kgs.app.files.ownership`. Code that opens the folder calls `complete` first, in case a
-kill came in between.
+results had, and keeps the list, see `ownership.py`. Code that opens the folder calls `complete` first, in case a kill
+came in between.
 """
 
 import os

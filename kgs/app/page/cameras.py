@@ -49,7 +49,7 @@ def viewer_scene(
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
         turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
-        sway: rotations and positions of a closed path through the training cameras, see :func:`kgs.app.files.film.tour`.
+        sway: rotations and positions of a closed path through the training cameras, see :func:`tour`.
     """
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()

@@ -1,7 +1,7 @@
 """Where photos and cameras go: `images`, `sparse/0` and `photos.json` in a folder, all three or none.
 
-New ones go through `unfinished-photos` and `finished-photos`, see `kgs.app.files.staging`. Beside a fit, which belongs to the
-former cameras, they wait in the second folder until the new fit is there.
+New ones go through `unfinished-photos` and `finished-photos`, see `Staging`. Beside a fit, which belongs to the former
+cameras, they wait in the second folder until the new fit is there.
 """
 
 import os
