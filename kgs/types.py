@@ -4,7 +4,6 @@ Shapes, dtypes and devices are checked when the user creates an object; numbers 
 synchronise with the device. Two objects are equal only if they are the same object.
 """
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -107,8 +106,8 @@ def raster_options(options: RasterOptions | None, fields: Mapping[str, Any]) -> 
         TypeError: both are given, `options` is of another type, or a field does not exist.
         ValueError: a field is out of range.
     """
-    known = [field.name for field in dataclasses.fields(RasterOptions)]
-    unknown = sorted(fields.keys() - set(known))
+    known = RasterOptions.__annotations__
+    unknown = sorted(fields.keys() - known.keys())
     if unknown:
         listed = ", ".join(known)
         raise TypeError(f"{unknown[0]}: unexpected keyword argument, expected options of the rasteriser ({listed})")
