@@ -16,9 +16,9 @@ from init_point_scenes import painted_planes
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
 from kgs import backends
+from kgs.app.files import film
 from kgs.datasets import synthetic_scene
 from kgs.init_points import InitialPoints
-from kgs.app.files import film
 
 if not torch.cuda.is_available():  # before kernels are imported
     os.environ.setdefault("TRITON_INTERPRET", "1")

@@ -20,9 +20,9 @@ if sys.platform != "linux":
 
 from fits import PATIENCE, Fit, memory_of
 
+from kgs.app.files.results_folder import CHECKPOINT
 from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
-from kgs.app.files.results_folder import CHECKPOINT
 
 SHORT, LONG = 24, 450  # steps
 

@@ -41,8 +41,8 @@ from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.init_points.files import read_points
-from kgs.ply import load_ply
 from kgs.metrics.lpips import Lpips
+from kgs.ply import load_ply
 
 Target = tuple[str, Damage]  # a file of the set, and how it is damaged
 

@@ -1,0 +1,92 @@
+"""`backend` of fits and commands: what "auto" became is kept, and a fit goes on with what it was begun with."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_cli import one_line, run
+
+from kgs import DataError, backends
+from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.fit_folder import fit_folder
+from kgs.app.saved_fit import load_fit
+from kgs.fit import FitConfig, Trainer
+from kgs.fit.plan import make_plan
+from kgs.json_files import read_json
+
+CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """A "numba" that is torch under another name; sets whether it is installed."""
+
+    class Numba(backends.TorchBackend):
+        name, devices, package = "numba", ("cpu",), ("numba", "fast")
+
+        def covers(self, like):
+            return self.is_installed()
+
+    numba = Numba()
+    monkeypatch.setattr(backends, "BACKENDS", (numba, backends.TorchBackend()))
+
+    def set_installed(there):
+        monkeypatch.setattr(numba, "is_installed", lambda: there)
+
+    set_installed(True)
+    return set_installed
+
+
+def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert [backends.resolve("auto", device) for device in (cpu, gpu)] == ["numba", "torch"]
+    assert [backends.resolve(name, cpu) for name in ("torch", "numba")] == ["torch", "numba"]
+    with pytest.raises(ValueError, match='backend: expected "auto" or "torch" on cuda, got "numba"'):
+        backends.resolve("numba", gpu)
+    installed(False)
+    assert backends.resolve("auto", cpu) == "torch"
+    with pytest.raises(ModuleNotFoundError, match="numba"):
+        backends.resolve("numba", cpu)
+
+
+@pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch"), ("numba", "numba")])
+def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, asked, made):
+    request = {"scene": "somewhere", "train_views": None, "downscale": None, "background": "black"}
+    metrics, _ = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, request=request)
+    assert metrics["backend"] == made
+    assert read_json(tmp_path / "config.json")["fit"]["backend"] == asked
+    saved = load_fit(tmp_path)
+    assert saved.backend == made
+    assert torch.equal(
+        saved.render(scene.test.camera(0), scene.background),
+        Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT).render(scene.test.camera(0)),
+    )
+
+
+@pytest.mark.parametrize(("begun", "other"), [("torch", "numba"), ("numba", "torch")])
+def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, points, tmp_path, begun, other):
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, backend=begun)), points)
+    trainer.train_step()
+    trainer.save(tmp_path / CHECKPOINT)
+    for asked in ("auto", begun):
+        resumed = Trainer.resume(scene, replace(CONFIG, backend=asked), tmp_path / CHECKPOINT)
+        assert (resumed.plan.backend, resumed.renderer.backend) == (begun, begun)
+    with pytest.raises(DataError, match=f"backend: expected '{begun}', as the fit was begun with, got '{other}'"):
+        Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
+
+
+@pytest.mark.parametrize(
+    "words", [["fit", "{scene}"], ["demo"], ["render", "{scene}/transforms_train.json", "--cameras", "{scene}"]]
+)
+def test_numba_that_is_not_installed_is_one_line_before_any_work(installed, folder, tmp_path, capsys, words):
+    installed(False)
+    words = [word.format(scene=folder) for word in words]
+    assert run(*words, "-o", tmp_path / "out", "--backend", "numba") == 2
+    assert 'numba is missing: run pip install -e ".[fast]"' in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_versions_say_where_numba_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr("kgs.machine.versions", lambda: {"kgs": "1"})
+    assert run("--version") == 0
+    assert "numba is not installed" in capsys.readouterr().out

@@ -1,0 +1,398 @@
+"""The command `kgs`, as a user types it."""
+
+import functools
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import tyro
+
+import kgs
+import kgs.app.cli.run
+from kgs.app import cli
+from kgs.app.files.outputs import FILMS
+from kgs.app.files.results_folder import RESULTS
+from kgs.fit.config import DETAILS, PAPER, FitConfig
+
+STEPS = 30
+FIT = ("--init", "scene", "--max-gaussians", 3000)
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([str(argument) for argument in arguments])
+    return stop.value.code
+
+
+@pytest.fixture(scope="module")
+def fitted(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    assert run("fit", folder, "-o", out, "--steps", STEPS, *FIT) == 0
+    return out
+
+
+def test_fit_writes_everything(fitted):
+    files = set(os.listdir(fitted))
+    assert {*RESULTS, "test"} - {*FILMS} <= files
+    assert len(files & {*FILMS}) == 1
+    assert "checkpoint.safetensors" in os.listdir(fitted)
+    assert sorted(os.listdir(fitted / "test")) == ["test_r_0.png", "test_r_1.png"]
+    assert cv2.imread(str(fitted / "test" / "test_r_0.png")).shape == (36, 40, 3)
+    assert cv2.imread(str(fitted / "curve.png")) is not None
+
+
+def test_metrics_have_the_agreed_keys(fitted):
+    metrics = json.loads((fitted / "metrics.json").read_text())
+    assert set(metrics) == {
+        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "needs", "steps", "seed", "drop", "init",
+        "backend", "protocol", "versions", "seen", "poses", "generator",
+    }  # fmt: skip
+    assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
+    assert metrics["test"]["lpips_vgg"] is None
+    assert set(metrics["curve"][-1]) == {"step", "seconds", "test_psnr", "train_psnr"}
+    assert metrics["curve"][-1]["test_psnr"] == pytest.approx(metrics["test"]["psnr"], abs=1e-2)  # before pruning
+    assert (metrics["steps"], metrics["drop"]) == (STEPS, FitConfig().drop)
+    assert metrics["init"] == {"kind": "random", "points": 10_000}
+
+
+def test_the_splat_is_the_model(fitted):
+    model = kgs.load_ply(fitted / "splat.ply")
+    assert len(model) == json.loads((fitted / "metrics.json").read_text())["gaussians"]
+    assert model.max_sh_degree == 0  # three training views
+
+
+def test_config_says_what_happens_when(fitted):
+    config = json.loads((fitted / "config.json").read_text())
+    assert config["fit"]["steps"] == STEPS
+    assert config["timetable"]["densify"] == [10, 20]
+
+
+def test_render_gives_the_pictures_of_fit(fitted, folder, tmp_path):
+    assert run("render", fitted / "splat.ply", "--cameras", folder, "-o", tmp_path) == 0
+    assert len(os.listdir(tmp_path)) == 6
+    for name in os.listdir(fitted / "test"):
+        one, two = (cv2.imread(str(path / name)).astype(int) for path in (tmp_path, fitted / "test"))
+        assert np.abs(one - two).max() <= 1
+
+
+def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
+    path = fitted / "metrics.json"
+    before = json.loads(path.read_text())
+    for values in (before["test"], *before["test"]["views"], before["train"], *before["train"]["views"]):
+        values |= {"lpips_vgg": 0.25, "lpips_vgg_unscaled": 0.125}
+    before["peak_rss_mb"] = 1
+    wrong = json.loads(json.dumps(before))
+    wrong["test"]["psnr"] = wrong["train"]["views"][0]["ssim"] = 1.0
+    path.write_text(json.dumps(wrong))
+    assert run("eval", fitted) == 0
+    assert json.loads(path.read_text()) == before
+    assert "PSNR" in capsys.readouterr().out
+
+
+def test_eval_refuses_measures_of_other_views(fitted, capsys, tmp_path):
+    shutil.copytree(fitted, tmp_path / "copy")
+    path = tmp_path / "copy" / "metrics.json"
+    metrics = json.loads(path.read_text())
+    metrics["test"]["views"][0]["name"] = "another"
+    path.write_text(json.dumps(metrics))
+    assert run("eval", tmp_path / "copy") == 2
+    assert "has other views" in one_line(capsys)
+    assert json.loads(path.read_text()) == metrics
+
+
+def test_resume_of_a_finished_fit_changes_nothing(fitted, folder):
+    before = (fitted / "splat.ply").read_bytes()
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS, *FIT, "--resume") == 0
+    assert (fitted / "splat.ply").read_bytes() == before
+
+
+def test_resume_with_other_numbers_is_refused(fitted, folder, capsys):
+    assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--seed", 1, *FIT, "--resume") == 2
+    assert "--seed: expected 0, as the fit was begun with, got 1" in one_line(capsys)
+
+
+def one_line(capsys):
+    captured = capsys.readouterr().err.strip().splitlines()
+    assert len(captured) == 1, captured
+    assert captured[0].startswith("kgs: ")
+    return captured[0]
+
+
+def test_bare_photos_need_poses(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "a.png"), np.zeros((20, 20, 3), np.uint8))
+    assert run("fit", tmp_path / "photos", "-o", tmp_path / "out") == 2
+    assert "poses" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["fit", "{missing}", "-o", "{out}"], "missing"),
+        (["fit", "{scene}", "-o", "{out}", "--views", "99"], "--views: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--drop", "1.0"], "--drop: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--init", "file", "--init-file", "{missing}"], "missing"),
+        (["fit", "{scene}", "-o", "{out}", "--lpips-weights", "{missing}"], "missing"),
+        (["fit", "{scene}", "-o", "{out}", "--max-gaussians", "0"], "--max-gaussians: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--device", "foo"], "--device: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--device", "cuda:99"], "--device: expected"),
+        (["fit", "{scene}", "-o", "{scene}"], "holds files of a scene"),
+        (["fit", "{scene}", "-o", "{scene}/transforms_train.json"], "expected a folder for results"),
+        (["fit", "{scene}", "-o", "{scene}/transforms_train.json/below"], "expected a folder for results"),
+        (["fit", "{scene}", "-o", "{out}", "--downscale", "0"], "--downscale: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--size", "31"], "--size: expected at least 32 pixels, got 31"),
+        (["fit", "{scene}", "-o", "{out}", "--size", "48", "--downscale", "2"], "--size: expected either a size"),
+        (["fit", "{scene}", "-o", "{out}", "--roll", "400"], "--roll: expected degrees in [-360, 360], got 400"),
+        (["render", "{file}", "--cameras", "{scene}", "-o", "{out}", "--downscale", "0.5"], "--downscale: expected"),
+        (["fit", "{scene}", "-o", "{out}", "--downscale", "2"], "--downscale: expected at least 32 pixels, got photos"),
+        (["demo", "-o", "{out}", "--steps", "0"], "--steps: expected"),
+        (["demo", "-o", "{out}", "--device", "foo"], "--device: expected"),
+        (["demo", "-o", "{out}", "--size", "11", "40"], "--size: expected"),
+        (["demo", "-o", "{scene}"], "holds files of a scene"),
+        (["eval", "{scene}"], "config.json"),
+        (["eval", "{scene}", "--lpips-weights", "{missing}"], "missing"),
+        (["eval", "{scene}", "--device", "foo"], "--device: expected"),
+        (["render", "{file}", "--cameras", "{scene}", "-o", "{scene}/train"], "holds files of a scene"),
+        (["render", "{file}", "--cameras", "{scene}", "-o", "{out}", "--device", "foo"], "--device: expected"),
+        (["render", "{missing}", "--cameras", "{missing}", "-o", "{out}"], "missing"),
+        (["page", "{missing}", "--cameras", "{scene}", "-o", "{scene}.html"], "missing"),
+        (["page", "{file}", "--cameras", "{scene}", "-o", "{out}"], "--out: expected a file that ends in .html"),
+        (["nonsense"], "one of demo, fit, render, eval, page, check, bench, study, got 'nonsense'"),
+        (["fti", "{scene}"], "did you mean fit?"),
+        (
+            ["fit", "{scene}", "--views", "3"],
+            "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o ",
+        ),
+        (["render", "{file}", "--cameras", "{scene}"], " -o transforms_train-render"),
+        (["bench", "nonsense"], "one of speed, precision, extremes, got"),
+        (["bench", "sped"], "did you mean speed?"),
+        (["render", "{missing}", "--cameras", "{scene}", "-o", "{out}"], "missing"),
+        (["eval", "{missing}"], "missing: expected a file or folder that is there"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(folder, tmp_path, capsys, arguments, said):
+    places = {"missing": tmp_path / "missing", "scene": folder, "out": tmp_path / "out"}
+    places["file"] = folder / "transforms_train.json"
+    before = sorted(folder.rglob("*"))
+    assert run(*(argument.format(**places) for argument in arguments)) == 2
+    assert said.format(**places) in one_line(capsys)
+    assert sorted(folder.rglob("*")) == before
+    assert os.listdir(tmp_path) == []  # nothing was begun
+
+
+def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
+    assert run("eval", tmp_path / "a\nb") == 2
+    assert r"a\nb" in one_line(capsys)
+
+
+def test_demo_fits_with_dropping(tmp_path, capsys):
+    assert run("demo", "-o", tmp_path, "--steps", 2, "--size", 32, 40) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(metrics) == {"generator", "with"}
+    assert "difference on test views" not in capsys.readouterr().out
+    assert {"index.html", "demo.png", "curve.png", "splat.ply"} <= set(os.listdir(tmp_path))
+
+
+def test_demo_compares_at_equal_starts(tmp_path, capsys):
+    assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40, "--compare") == 0
+    runs = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(runs) == {"generator", "without", "with"}
+    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, FitConfig().drop)
+    assert runs["without"]["init"] == runs["with"]["init"]
+    gain = runs["with"]["test"]["psnr"] - runs["without"]["test"]["psnr"]
+    assert f"{gain:+.2f} dB" in capsys.readouterr().out
+    assert cv2.imread(str(tmp_path / "demo.png")) is not None
+    assert cv2.imread(str(tmp_path / "curve.png")) is not None
+    assert len(kgs.load_ply(tmp_path / "splat.ply")) == runs["with"]["gaussians"]
+
+
+def test_time_and_memory_are_announced_before_a_fit_and_not_when_it_goes_on(folder, tmp_path, capsys):
+    words = ("fit", folder, "-o", tmp_path, "--steps", 2, *FIT)
+    assert run(*words) == 0
+    said = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in said if line.startswith("this takes about ")]
+    assert re.search(r" \(start .* fit .* film and page .*\) and [0-9.]+ GiB of memory$", line)
+    assert said.index(line) < said.index(next(line for line in said if line.startswith("initial points")))
+    assert run(*words, "--resume") == 0
+    assert "this takes about" not in capsys.readouterr().out
+
+
+def test_as_many_initial_points_as_asked_for(folder, tmp_path):
+    assert run("fit", folder, "-o", tmp_path, "--steps", 1, "--init", "random", "--init-points", 321) == 0
+    assert json.loads((tmp_path / "metrics.json").read_text())["init"] == {"kind": "random", "points": 321}
+
+
+def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, monkeypatch):
+    seen = []
+
+    def fit_scene(scene, config, *args, **kwargs):
+        seen.append((config, max(scene.train.images.shape[-2:])))
+        raise kgs.DataError(folder, "", "enough")
+
+    monkeypatch.setattr("kgs.fit.run.fit_scene", fit_scene)
+    low, high = (DETAILS[name].entries for name in ("low", "high"))
+    cases = [
+        ([], FitConfig()),
+        (["--detail", "low"], FitConfig(**low)),
+        (["--detail=low", "--steps", 700], FitConfig(**{**low, "steps": 700})),
+        (["--detail", "high"], FitConfig(**high)),
+        (["--detail", "high", "--init-points", 9, "--size", 40], FitConfig(**{**high, "init_points": 9})),
+        (["--steps", 700], FitConfig(steps=700)),
+        (["--preset", "paper"], PAPER),
+        (["--preset", "paper", "--detail", "low"], replace(PAPER, **low)),
+    ]
+    for options, _ in cases:
+        assert run("fit", folder, "-o", tmp_path, *options) == 2
+    assert [config for config, _ in seen] == [config for _, config in cases]
+    full = seen[0][1]
+    assert [size for _, size in seen] == [full, full, full, full, 40, full, full, full]  # smaller than any detail's
+    assert run("fit", folder, "-o", tmp_path, "--preset=plain", "--sh-degree", 1) == 2
+    assert seen[-1][0] == replace(PAPER, drop=0.0, sh_degree=1)
+    assert run("fit", folder, "-o", tmp_path, "--preset", "none") == 2
+    assert run("fit", folder, "-o", tmp_path, "--size", 40, "--downscale", 2) == 2
+    assert len(seen) == len(cases) + 1
+
+
+def test_versions(capsys):
+    assert run("--version") == 0
+    lines = dict(line.split(" ", 1) for line in capsys.readouterr().out.splitlines())
+    assert lines["kgs"] == kgs.__version__
+    assert {"torch", "kornia", "python"} <= lines.keys()
+
+
+@pytest.mark.parametrize("command", cli.run._COMMANDS)
+def test_each_help_page_has_two_examples_that_parse(command, capsys):
+    words = command.split()
+    assert run(*words, "--help") == 0
+    said = capsys.readouterr().out
+    assert f"usage: kgs {command} " in said
+    examples = re.findall(rf"^  (?:[A-Z_]+=\S+ )*kgs {command}(|  *.+)$", said, re.M)
+    assert len(examples) == 2
+    function, defaults = cli.run._load(command)
+    parse = functools.wraps(function)(lambda *_, **__: None)
+    for example in examples:
+        options = shlex.split(example)
+        tyro.cli(functools.partial(parse, **defaults(options)), args=options)
+
+
+def test_the_help_of_a_fit_is_short_and_its_last_line_names_the_long_one(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    said = {}
+    for words in (["--help"], ["--preset", "paper", "-h"], ["--help-all"], ["--preset", "paper", "--help-all"]):
+        assert run("fit", *words) == 0
+        said[" ".join(words)] = capsys.readouterr().out
+    short, whole = said["--help"], said["--help-all"]
+    assert len(short.splitlines()) <= 60
+    assert max(map(len, short.splitlines())) <= 80
+    assert short.splitlines()[-1] == "kgs fit --help-all shows all options"
+    names = set(re.findall(r"--[a-z][a-z.-]+", short)) - {"--help", "--help-all"}
+    assert names >= {"--out", "--views", "--size", "--preset", "--resume", "--steps", "--drop", "--device"}
+    assert not {name for name in names if "recipe" in name} | names & {"--coarse", "--growth", "--max-bytes"}
+    assert {"--recipe.lr-means", "--coarse", "--downscale", "--lpips-weights", *names} <= set(
+        re.findall(r"--[a-z][a-z.-]+", whole)
+    )
+    assert "(default: 3)" in said["--preset paper --help-all"]  # of --sh-degree
+    hidden = ["--recipe.near-plane", "0.1", "--coarse", "2"]  # both are read
+    assert run("fit", folder, "-o", tmp_path / "out", *hidden) == 2
+    assert "--coarse: expected" in one_line(capsys)
+
+
+@pytest.mark.parametrize("words", [[], ["--help"], ["bench"], ["bench", "--help"]])
+def test_help_without_a_command(words, capsys):
+    assert run(*words) == 0
+    said = capsys.readouterr().out
+    assert "usage: kgs" in said
+    assert "speed" in said
+    assert ("demo" in said) == ("bench" not in words)
+
+
+def test_a_warning_is_one_line_without_code(folder, tmp_path, capsys):
+    assert run("fit", folder, "-o", tmp_path, "--steps", 1, "--init", "sift", "--init-points", 30) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "SIFT" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("kgs: initial points: SIFT found")
+
+
+def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, capsys):
+    assert run("fit", folder, "-o", tmp_path, "--steps", 40, "--init", "random", "--init-points", 50) == 0
+    said = capsys.readouterr()
+    assert len([line for line in said.err.splitlines() if line.startswith("fit: ")]) == 10
+    assert "\r" not in said.err
+    assert f"kgs render {tmp_path}/splat.ply --cameras {folder}" in said.out
+    assert f"kgs eval {tmp_path}" in said.out
+
+
+@pytest.mark.parametrize("package", ["tyro", "matplotlib", "safetensors"])
+def test_a_missing_extra_is_one_line_before_any_work(folder, tmp_path, package, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert run("fit", folder, "-o", tmp_path / "out") == 2
+    said = one_line(capsys)
+    assert f'{package} is missing: run pip install -e ".[app]" in a clone of kgs' in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "project"), [("pycolmap", "pycolmap (of the extra sfm)"), ("jinja2", "jinja2 (of the extra app)")]
+)
+def test_a_package_that_cannot_be_loaded_is_one_line(tmp_path, package, project, capsys, monkeypatch):
+    """As a shared library that it lacks leaves it."""
+    home, photos = tmp_path / "broken" / package, tmp_path / "photos"
+    home.mkdir(parents=True)
+    (home / "__init__.py").write_text("from .core import x")
+    (home / "core.py").write_text("raise ImportError('libx.so.1: cannot open shared object file\\nSee the manual.')")
+    photos.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(photos / f"{i}.png"), np.full((20, 20, 3), i, np.uint8))
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(home.parent)
+    monkeypatch.setattr("importlib.metadata.packages_distributions", dict)
+    assert run("fit", photos, "-o", tmp_path / "out") == 2
+    said = f"{package} is installed, but cannot be loaded (libx.so.1: cannot open shared object file): run pip install"
+    assert one_line(capsys) == f"kgs: {said} --force-reinstall {project}"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_large_package_that_cannot_be_loaded(monkeypatch):
+    def broken(name):
+        raise OSError("libcudart.so.12: cannot open shared object file")  # torch loads its libraries itself
+
+    monkeypatch.setattr(cli.run, "import_module", broken)
+    with pytest.raises(ImportError, match="libcudart") as caught:
+        cli.run._import("torch")
+    assert "torch is installed, but cannot be loaded (libcudart" in cli.run._of_a_broken_package(caught.value)
+    cli.run._import("numba")  # torch may do in its place
+    with pytest.raises(ImportError, match="of ours"):
+        cli.run._of_a_broken_package(ImportError("of ours", name="kgs.errors"))
+
+
+def test_all_photos_can_be_trained_on(folder, tmp_path, capsys):
+    assert run("fit", folder, "-o", tmp_path, "--hold-out", 0, "--steps", 6, *FIT) == 0
+    assert "no photo was held out" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["test"] is None
+    assert len(metrics["protocol"]["train"]) == 6
+    assert os.listdir(tmp_path / "test") == []
+    assert run("eval", tmp_path) == 0
+    assert run("fit", folder, "-o", tmp_path / "other", "--hold-out", 1, *FIT) == 2
+    assert "--hold-out: expected" in capsys.readouterr().err
+
+
+def test_a_scene_may_have_one_photo(folder, tmp_path):
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    shutil.copytree(folder / "train", scene / "train")
+    content = json.loads((folder / "transforms_train.json").read_text())
+    frame = content["frames"][0]
+    frame["file_path"] += ".png"
+    (scene / "transforms.json").write_text(json.dumps(content | {"frames": [frame]}))
+    words = ("--init", "random", "--hold-out", 0, "--size", 32, "--steps", 4)
+    assert run("fit", scene, "-o", out, *words) == 0
+    assert run("render", out / "splat.ply", "--cameras", scene, "-o", tmp_path / "renders") == 0
+    assert [path.name for path in (tmp_path / "renders").glob("*.png")] == ["train_r_0.png"]

@@ -1,0 +1,69 @@
+"""Lines and progress: by name, sparse without a terminal, and no reader or terminal that is gone ends the work."""
+
+import io
+import sys
+
+import pytest
+
+from kgs.app.console import as_line, progress, say
+from kgs.errors import DataError
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_without_a_terminal_a_line_every_tenth(capsys):
+    with progress(200, "depth maps", done=50, unit="view") as advance:
+        for _ in range(150):
+            advance("fine")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [f"depth maps: {done} of 200 views, fine" for done in range(60, 201, 20)]
+
+
+def test_few_units_are_a_line_each(capsys):
+    with progress(3, "fit") as advance:
+        for _ in range(3):
+            advance()
+    assert capsys.readouterr().err.splitlines() == [f"fit: {done} of 3 steps" for done in (1, 2, 3)]
+
+
+def test_on_a_terminal_a_bar_with_the_name(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress(4, "fit") as advance:
+        for _ in range(4):
+            advance("loss=0.1")
+    assert "fit: 100%" in sys.stderr.getvalue()
+    assert "loss=0.1" in sys.stderr.getvalue()
+
+
+def test_letters_that_the_terminal_lacks_become_escapes():
+    raw = io.BytesIO()
+    stream = io.TextIOWrapper(raw, encoding="ascii", write_through=True)
+    say("caf\u00e9 \u6f22 \udcff", stream)
+    assert raw.getvalue().strip() == rb"caf\xe9 \u6f22 \udcff"
+
+
+@pytest.mark.parametrize("kind", ["none", "closed", "broken"])
+def test_a_reader_that_has_gone_ends_nothing(monkeypatch, kind):
+    class Broken(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError(32, "Broken pipe")
+
+    stream = {"none": None, "closed": io.StringIO(), "broken": Broken()}[kind]
+    if kind == "closed":
+        stream.close()
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, stream)
+    say("a line")
+    with progress(2, "fit") as advance:
+        advance()
+        advance()
+
+
+def test_control_characters_in_names_become_escapes(capsys):
+    say("one\x1b[31m\ntwo\r")
+    assert capsys.readouterr().out == "one\\x1b[31m\ntwo\\r\n"
+    assert str(DataError("a\nb", "c\nd", "is missing")) == "a\\nb: c\\nd: is missing"
+    assert as_line("kgs", "a b", "it's\na \\") == r"kgs 'a b' $'it\'s\na \\'"

@@ -1,0 +1,180 @@
+"""What other programs get beside the PLY file: the list of cameras, the world upright, PNGs with alpha."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from factories import random_model, random_views
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+import kgs
+from kgs.app.cli.render import render
+from kgs.app.files import film
+from kgs.app.files.cameras import camera_list, upright
+from kgs.app.files.outputs import EXPORTS, film_in
+from kgs.app.files.ownership import is_own
+from kgs.fit import exports
+from kgs.geometry import typical_depths
+from kgs.json_files import write_json
+
+POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+
+
+SKY = 300 * torch.nn.functional.normalize(torch.randn(450, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+
+
+@pytest.mark.parametrize("around", [SKY[:0], SKY])
+def test_the_bounds_are_those_of_the_scene_not_of_strays_or_a_sky(around: torch.Tensor) -> None:
+    """In each entry, as readers take every element of the list for a camera: none of them is anything else."""
+    strays = torch.tensor([[900.0, 0.5, 0.5], [0.5, -900.0, 0.5], [0.5, 0.5, 900.0]])
+    offset = torch.tensor([1e6, 2e6, -5.0]).double()
+    listed = camera_list([random_views(2)], offset, torch.cat([POINTS, strays, around]))
+    assert all(
+        {"position", "rotation", "img_name", "fx", "fy", "width", "height", "bounds"} <= set(each) for each in listed
+    )
+    for entry in listed:
+        low, high = (torch.tensor(corner, dtype=torch.float64) - offset for corner in entry["bounds"])
+        torch.testing.assert_close(low, torch.full((3,), 0.01).double(), atol=0.01, rtol=0)
+        torch.testing.assert_close(high, torch.full((3,), 0.99).double(), atol=0.01, rtol=0)
+        outside = torch.cat([low > POINTS, high < POINTS], 1).float().mean(0)
+        assert ((outside > 0.007) & (outside < 0.013)).all()
+    assert all("bounds" not in each for each in camera_list([random_views(2)], offset, torch.zeros(0, 3)))
+
+
+def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:
+    """With the reader of the reference viewers in mind: pixel = f R^T (x - position) + the middle."""
+    views, offset = random_views(3), torch.tensor([1e6, 2e6, -5.0]).double()
+    write_json(tmp_path / "cameras.json", camera_list([views.select([2, 0]), views.select([1])], offset, POINTS))
+    assert is_own(tmp_path / "cameras.json")
+    listed = json.loads((tmp_path / "cameras.json").read_text())
+    assert [(each["id"], each["img_name"]) for each in listed] == [
+        (0, views.names[2]),
+        (1, views.names[0]),
+        (2, views.names[1]),
+    ]
+    point = torch.tensor([0.3, -0.2, 4.0])
+    for entry, index in zip(listed, (2, 0, 1), strict=True):
+        ours: PinholeCamera = views.camera(index)
+        pixel = ours.project(point[None, None])[0, 0] - torch.stack([ours.cx, ours.cy])[:, 0]
+        x, y, z = np.array(entry["rotation"]).T @ (point.double() + offset - torch.tensor(entry["position"])).numpy()
+        assert (entry["fx"] * x / z, entry["fy"] * y / z) == pytest.approx(pixel.tolist(), abs=1e-3)
+        assert (entry["width"], entry["height"]) == (int(ours.width), int(ours.height))
+
+
+def test_upright() -> None:
+    torch.manual_seed(1)
+    turn = torch.linalg.qr(torch.randn(3, 3).double()).Q
+    turn *= turn.det().sign()
+    tilts = 0.2 * torch.randn(6, 3).double()
+    poses = torch.eye(4).double().repeat(6, 1, 1)
+    poses[:, :3, :3] = axis_angle_to_rotation_matrix(tilts) @ turn
+    found = upright(poses)
+    torch.testing.assert_close(found @ found.T, torch.eye(3).double())
+    assert found.det() > 0
+    up, ahead = found @ -poses[:, 1, :3].mean(0), found @ poses[:, 2, :3].mean(0)
+    assert up[1] / up.norm() > 1 - 1e-9
+    assert ahead[2] / ahead.norm() < -0.95
+    for some in (poses[:1], torch.cat([poses[:1], torch.diag(torch.tensor([-1.0, -1, 1, 1])).double() @ poses[:1]])):
+        found = upright(some)  # one camera; two of opposite ups
+        torch.testing.assert_close(found @ found.T, torch.eye(3).double())
+
+
+def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+
+    class Fitted:
+        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        scene.background = torch.zeros(3)
+        shown, notes = random_model(), list[str]()
+        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
+
+        def note(self, text: str) -> None:
+            self.notes.append(text)
+
+    monkeypatch.setattr(film, "FRAMES", 3)
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert {path.name for path in tmp_path.iterdir()} == set(EXPORTS) - {"turntable.mp4"}
+    assert all(is_own(path) for path in tmp_path.iterdir())
+    assert film_in(tmp_path) == tmp_path / "turntable.webm"
+    (tmp_path / "turntable.webm").unlink()
+    assert film_in(tmp_path) is None
+    monkeypatch.setattr(exports, "write_film", lambda *_: "no turntable.webm: a reason")
+    monkeypatch.setenv("KGS_H264", "libx264")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert Fitted.notes == [
+        "no turntable.webm: a reason",
+        "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)",
+    ]
+
+
+def test_the_film_leaves_out_what_is_right_before_its_camera(tmp_path: Path, monkeypatch: Any) -> None:
+    class Fitted:
+        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        scene.background = torch.ones(3)
+        shown = random_model()
+        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
+
+    given: list[Any] = []
+    monkeypatch.setattr(exports, "write_film", lambda path, render, views, *_: given.extend([render, views]) or "")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    render, views = given
+    camera = views.camera(0)
+    nearest = float(typical_depths(Fitted.shown.means, views.cameras)[0])
+    camera.extrinsics[0, 2, 3] -= 0.6 * nearest  # among the Gaussians
+    with torch.no_grad():
+        images = [
+            kgs.GaussianRenderer(near_plane=near).eval()(Fitted.shown(), camera, Fitted.scene.background).image
+            for near in (0.01, nearest / 2)
+        ]
+    assert (images[0] - images[1]).abs().max() > 0.01
+    torch.testing.assert_close(render(camera), images[1])
+
+
+def test_one_film_takes_the_place_of_the_other(tmp_path: Path, monkeypatch: Any) -> None:
+    class Fitted:
+        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
+        scene.background = torch.zeros(3)
+        shown = random_model()
+        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
+
+    pytest.importorskip("av")
+    monkeypatch.setattr(film, "FRAMES", 3)
+    monkeypatch.setenv("KGS_H264", "libx264")
+    (tmp_path / "turntable.webm").write_bytes(b"made by kgs")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert [path.name for path in tmp_path.glob("turntable.*")] == ["turntable.mp4"]
+    assert is_own(tmp_path / "turntable.mp4")
+    (tmp_path / "turntable.webm").write_bytes(b"mine")
+    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert (tmp_path / "turntable.webm").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_path: Path, background: Any) -> None:
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -1.05, 1.25])
+    model = kgs.GaussianModel.from_points(points, torch.rand(300, 3), 0)
+    with torch.no_grad():
+        model.opacity_logits += 1.0
+    kgs.save_ply(tmp_path / "splat.ply", model)
+    render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "clear", background="transparent")
+    render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "opaque", background=background)
+    names = sorted(path.name for path in (tmp_path / "opaque").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "clear").iterdir())
+    for name in names:
+        clear = cv2.imread(str(tmp_path / "clear" / name), cv2.IMREAD_UNCHANGED).astype(float)
+        opaque = cv2.imread(str(tmp_path / "opaque" / name)).astype(float)
+        assert clear.shape[2] == 4
+        share = clear[:, :, 3:] / 255
+        assert share.min() == 0
+        assert share.max() > 0.5
+        composed = share * clear[:, :, :3] + (1 - share) * (255 if background == "white" else 0)
+        assert np.abs(composed - opaque).max() <= 1.6  # three values, each rounded to 8 bits
+        assert is_own(tmp_path / "clear" / name)

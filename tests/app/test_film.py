@@ -1,0 +1,410 @@
+"""The film: its path through the cameras, its frames, and that a browser plays it."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from browser import Browser
+from torch import Tensor
+
+from kgs import GaussianRenderer, Gaussians
+from kgs.app.files import encoders, film
+from kgs.app.files.film import tour, write_film
+from kgs.app.files.ownership import is_own
+from kgs.datasets.scene import Views, pinholes
+
+
+def looking_at(target: Tensor, places: Tensor) -> Tensor:
+    """World-to-camera matrices of cameras at `places` that look at the target; the world's z is up."""
+    poses = []
+    for place in places.double():
+        ahead = (target - place) / (target - place).norm()
+        right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]).double())
+        right = right / right.norm()
+        turn = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
+        pose = torch.eye(4).double()
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ place
+        poses.append(pose)
+    return torch.stack(poses)
+
+
+def ring(count: int, radius: float = 3.0) -> Tensor:
+    """Cameras around the z axis in a scrambled order, at several heights."""
+    angles = 2 * math.pi * torch.arange(count).double() / count
+    places = torch.stack([radius * angles.cos(), radius * angles.sin(), 1 + 0.3 * (3 * angles).sin()], 1)
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(count))
+    return looking_at(torch.zeros(3).double(), places[order])
+
+
+def facing(count: int) -> Tensor:
+    """Cameras side by side that look ahead."""
+    poses = torch.eye(4).double().repeat(count, 1, 1)
+    poses[:, :3, 3] = -torch.rand(count, 3, generator=torch.Generator().manual_seed(count)).double() * torch.tensor(
+        [2.0, 1.0, 0.1]
+    )
+    return poses
+
+
+def centers(poses: Tensor) -> Tensor:
+    return torch.linalg.inv(poses)[:, :3, 3]
+
+
+def angles(a: Tensor, b: Tensor) -> Tensor:
+    """Degrees between the rotations of poses."""
+    cosine = ((a[:, :3, :3] * b[:, :3, :3]).sum((1, 2)) - 1) / 2
+    return cosine.clamp(-1, 1).acos().rad2deg()
+
+
+def evenly(frames: int) -> Any:
+    return np.arange(frames) / frames
+
+
+PATHS = {
+    "ring of 3": ring(3),
+    "ring of 8": ring(8),
+    "2 facing": facing(2),
+    "3 facing": facing(3),
+    "6 facing": facing(6),
+}
+
+
+@pytest.mark.parametrize("poses", PATHS.values(), ids=PATHS)
+def test_the_path_passes_each_camera_and_is_smooth(poses: Tensor) -> None:
+    path = tour(poses, evenly(2000), 1.0)
+    for pose in poses:
+        nearest = int((path - pose).abs().amax((1, 2)).argmin())
+        assert (centers(path)[nearest] - centers(pose[None])[0]).norm() < 0.02
+        assert angles(path[nearest, None], pose[None]) < 0.5
+    assert torch.allclose(path[:, :3, :3] @ path[:, :3, :3].mT, torch.eye(3).double(), atol=1e-12)
+    moves = centers(path).diff(dim=0, append=centers(path)[:1])  # the first frame follows the last
+    turns = angles(path, path.roll(-1, 0))
+    assert moves.norm(dim=1).max() < 4 * moves.norm(dim=1).mean()
+    assert turns.max() <= 4 * turns.mean() + 1e-3
+    assert (moves.diff(dim=0).norm(dim=1) < 0.2 * moves.norm(dim=1).max()).all()  # no corner
+
+
+def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
+    poses = ring(5)
+    path = tour(poses, evenly(100), 1.0)
+    places = centers(path)
+    radii, lengths = places.norm(dim=1), centers(poses).norm(dim=1)
+    assert (lengths.min() - 0.05 < radii).all()  # a chord of the ring would come to 2.4
+    assert (radii < lengths.max() + 0.05).all()
+    assert (-(path[:, 2, :3] * places).sum(1) / radii > 0.999).all()
+    turned = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
+    assert min(turned.sum(), (2 * math.pi - turned).sum()) < 2 * math.pi  # once around
+
+
+def test_cameras_side_by_side_are_never_left() -> None:
+    poses = facing(6)
+    places = centers(tour(poses, evenly(300), 1.0))
+    assert (places >= centers(poses).amin(0) - 1e-9).all()
+    assert (places <= centers(poses).amax(0) + 1e-9).all()
+
+
+@pytest.mark.parametrize("poses", [*PATHS.values(), ring(12), ring(7)[:1]], ids=[*PATHS, "ring of 12", "1"])
+def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
+    """Measured on the poses of the film: where the path does not turn back, steps are as long as each other."""
+    path = film.paced(poses, 400, 3.0)
+    places = centers(path)
+    unit = torch.cdist(centers(poses), centers(poses)).max() if len(poses) > 1 else 3.0
+    moves = torch.cat([places / unit, path[:, 2, :3] / math.pi], 1).diff(dim=0)
+    lengths = moves.norm(dim=1)
+    ahead = moves / lengths[:, None]
+    turns = (ahead[1:] * ahead[:-1]).sum(1).clamp(-1, 1).acos().rad2deg()
+    cruise = lengths.quantile(0.75)
+    assert (lengths <= 1.03 * cruise).all()  # at its speed, and never above
+    bends = torch.nn.functional.max_pool1d(turns[None], 25, 1, 12)[0]  # sharpest turn within 12 frames
+    calm = (bends < 4)[50:348]
+    assert calm.float().mean() > 0.5
+    torch.testing.assert_close(lengths[51:349][calm], cruise.expand(int(calm.sum())), rtol=0.03, atol=0)
+    assert lengths[[0, -1]].max() < 0.1 * cruise
+    assert (lengths[:20].diff() > -1e-6 * cruise).all()  # gets up to its speed
+    assert (lengths[-20:].diff() < 1e-6 * cruise).all()
+    assert (lengths.diff().abs() < 0.25 * cruise).all()  # no jolt
+    torch.testing.assert_close(path[0], tour(poses, evenly(1), 3.0)[0])
+
+
+def test_an_even_path_takes_each_step_in_the_same_time() -> None:
+    """Against the plain round of a circle: 86 % of the way at one speed, the rest at half of it on the mean."""
+    count, frames = 12, 240
+    rim = 2 * math.pi * torch.arange(count).double() / count
+    poses = looking_at(torch.zeros(3).double(), torch.stack([rim.cos(), rim.sin(), 0.3 * torch.ones(count)], 1))
+    places = centers(film.paced(poses, frames, 1.0))
+    steps = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
+    steps = torch.minimum(steps, 2 * math.pi - steps)
+    expected = 2 * math.pi / frames * (0.86 + 2 * 0.14)
+    torch.testing.assert_close(steps[40:200], torch.full((160,), expected).double(), rtol=0.02, atol=0)
+
+
+def test_the_round_trip_is_short() -> None:
+    assert centers(tour(ring(12), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.2
+    assert centers(tour(ring(40), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * 1.3
+
+
+def test_a_single_camera_sways_and_keeps_its_target() -> None:
+    pose = ring(7)[2]
+    path = tour(pose[None], evenly(60), depth=4.0)
+    torch.testing.assert_close(path[0], pose)
+    target = torch.linalg.inv(pose) @ torch.tensor([0.0, 0.0, 4.0, 1.0]).double()
+    seen = path @ target
+    torch.testing.assert_close(seen[:, :2], torch.zeros(60, 2).double(), atol=1e-9, rtol=0)
+    moved = (centers(path) - centers(pose[None])).norm(dim=1)
+    assert 0.05 < moved.max() < 0.5
+
+
+def test_cameras_at_one_place_are_no_trouble() -> None:
+    assert tour(facing(1).repeat(3, 1, 1), evenly(10), 1.0).isfinite().all()
+    assert film.paced(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
+
+
+def views_of(size: tuple[int, int]) -> Views:
+    lens = torch.eye(4).repeat(3, 1, 1)
+    lens[:, 0, 0] = lens[:, 1, 1] = 0.9 * size[1]
+    lens[:, 0, 2], lens[:, 1, 2] = (size[1] - 1) / 2, (size[0] - 1) / 2
+    names = ("a", "b", "c")
+    return Views(pinholes(lens, facing(3).float(), size), torch.zeros(3, 3, *size), names)
+
+
+def render(camera: Any) -> Tensor:
+    """A picture that says from where it was taken: a bright bar where a point 2 before the origin is."""
+    height, width = int(camera.height), int(camera.width)
+    column = float(camera.project(torch.tensor([[[1.0, 0.5, 2.0]]]))[0, 0, 0])
+    bar = torch.exp(-(((torch.arange(width) - column) / (0.05 * width)) ** 2))
+    return torch.stack([bar, 0.8 * bar, 0.6 * bar])[None, :, None].expand(1, 3, height, width)
+
+
+@pytest.fixture(params=["webm", "mp4"])
+def suffix(request: Any, monkeypatch: Any) -> str:
+    """Of a film that can be made here: MP4 by the encoder that PyAV's packages have on Linux."""
+    if request.param == "mp4":
+        pytest.importorskip("av")
+        monkeypatch.setenv(encoders.ASKED, "libx264")
+        assert encoders.film_suffix() == (".mp4", "")
+    return f".{request.param}"
+
+
+@pytest.mark.parametrize(("size", "expected"), [((33, 45), (32, 44)), ((1000, 1500), (426, 640))])
+def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: str, size: Any, expected: Any) -> None:
+    monkeypatch.setattr(film, "FRAMES", 8)
+    monkeypatch.setattr(encoders, "BITS", 2.0)
+    rendered = []
+
+    def kept(camera: Any) -> Tensor:
+        rendered.append(render(camera)[0])
+        return rendered[-1][None]
+
+    views, path = views_of(size), tmp_path / f"film{suffix}"
+    assert write_film(path, kept, views, 1.0) == ""
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    assert is_own(path)
+    video, frames = cv2.VideoCapture(str(path)), []
+    while (found := video.read())[0]:
+        frames.append(torch.from_numpy(np.ascontiguousarray(found[1][:, :, ::-1])).permute(2, 0, 1) / 255)
+    assert len(frames) == 8
+    assert tuple(frames[0].shape[1:]) == expected
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
+    for frame, image in zip(frames, rendered, strict=True):
+        assert (frame - image).square().mean() < 2e-3  # 27 dB; another frame's bar is at another place
+    small, photo = rendered[0][0, 0], render(views.camera(0))[0, 0, 0]  # of the first camera, in two sizes
+    centre = [float((row * (torch.arange(len(row)) + 0.5)).sum() / row.sum()) / len(row) for row in (small, photo)]
+    assert centre[0] == pytest.approx(centre[1], abs=1e-3)
+
+
+def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path, monkeypatch: Any) -> None:
+    """Three cameras side by side before a wall; between them black Gaussians, outside of their pictures."""
+    monkeypatch.setattr(film, "FRAMES", 48)
+    generator = torch.Generator().manual_seed(0)
+    count, size = 3000, (36, 48)
+    spread = torch.rand(count, 3, generator=generator) * 2 - 1
+    wall = spread * torch.tensor([8.0, 5.0, 0.1]) + torch.tensor([0.0, 0.0, 4.0])
+    between = torch.tensor([[-0.75, 0.0, 0.1], [0.75, 0.0, 0.1]])
+    means = torch.cat([wall, between])
+    n = len(means)
+    scales = torch.full((n, 3), 0.2)
+    scales[count:] = 0.1
+    colors = torch.cat([0.4 + 0.2 * torch.rand(count, 3, generator=generator), torch.zeros(2, 3)])
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    gaussians = Gaussians(means, quats, scales, torch.full((n,), 0.9), colors)
+    lens = torch.eye(4).repeat(3, 1, 1)
+    lens[:, 0, 0] = lens[:, 1, 1] = 48.0
+    lens[:, 0, 2] = 23.5
+    lens[:, 1, 2] = 17.5
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor([1.5, 0.0, -1.5])
+    views = Views(pinholes(lens, poses, size), torch.zeros(3, 3, *size), ("a", "b", "c"))
+
+    def levels(near_plane: float) -> list[float]:
+        renderer = GaussianRenderer(near_plane=near_plane).eval()
+        found = []
+
+        def render(camera: Any) -> Tensor:
+            image = renderer(gaussians, camera).image
+            found.append(float(image.mean()))
+            return image
+
+        assert write_film(tmp_path / "a.webm", render, views, 4.0) == ""
+        return found
+
+    def flashes(means: list[float]) -> int:
+        """Frames that differ from both neighbours by more than these from each other and 3 %."""
+        triples = zip(means, means[1:], means[2:], strict=False)
+        return sum(min(abs(b - a), abs(b - c)) > abs(a - c) + 0.03 for a, b, c in triples)
+
+    near_plane = film.path_near_plane(gaussians.means, views.cameras, 0.01)
+    assert near_plane == pytest.approx(0.5 * 3.9, rel=0.02)
+    dark, clear = levels(0.01), levels(near_plane)
+    assert flashes(dark) > 0
+    assert flashes(clear) == 0
+    assert min(clear) > 0.9 * max(clear)
+    assert film.path_near_plane(gaussians.means, views.cameras, 3.0) == 3.0
+
+
+def boxes(content: bytes) -> list[tuple[bytes, bytes]]:
+    """The kinds and contents of the boxes of ISO/IEC 14496-12, one after the other."""
+    found = []
+    while content:
+        length = int.from_bytes(content[:4], "big")
+        found.append((content[4:8], content[8:length]))
+        content = content[length:]
+    return found
+
+
+def test_a_phone_plays_the_mp4(tmp_path: Path, monkeypatch: Any) -> None:
+    """Main profile, 4:2:0, eight bits, the index in front; read by the standard's boxes, not by FFmpeg."""
+    pytest.importorskip("av")
+    monkeypatch.setenv(encoders.ASKED, "libx264")
+    frame = np.zeros((48, 96, 3), np.uint8)
+    assert encoders.encode(tmp_path / "a.mp4", [frame] * 30, (96, 48)) == ""
+    content = (tmp_path / "a.mp4").read_bytes()
+    kinds = [kind for kind, _ in boxes(content)]
+    assert kinds[0] == b"ftyp"
+    assert kinds.index(b"moov") < kinds.index(b"mdat")
+    assert boxes(content)[-1] == (b"free", b"made by kgs")
+    configuration = content[content.index(b"avcC") + 4 :]
+    assert configuration[1] in (66, 77)  # baseline, main (ISO/IEC 14496-15)
+    assert configuration[3] <= 31  # level 3.1: 1280x720 at 30 frames per second
+    assert content.count(b"avc1") >= 1
+
+
+def test_the_colours_of_a_film_are_those_of_the_frames(tmp_path: Path, suffix: str) -> None:
+    colors = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (230, 230, 230), (20, 20, 20)]
+    frame = np.repeat(np.array(colors, np.uint8)[None], 64, 0).repeat(32, 1)
+    path = tmp_path / f"a{suffix}"
+    assert encoders.encode(path, [frame] * 5, (160, 64)) == ""
+    shown = cv2.VideoCapture(str(path)).read()[1][32, 16::32]
+    np.testing.assert_allclose(shown.astype(int), colors, rtol=0, atol=6)
+
+
+def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
+    monkeypatch.setattr(film, "FRAMES", 6)
+    monkeypatch.setattr(encoders, "BITS", 4.0)
+    path, views = tmp_path / f"film{suffix}", views_of((180, 240))
+    noise = torch.rand(6, 3, 180, 240, generator=torch.Generator().manual_seed(0))
+    frames = iter(noise)
+    assert write_film(path, lambda _: next(frames)[None], views, 1.0) == ""
+    size = path.stat().st_size
+    assert film.film_within(path, size) == path.read_bytes()
+    smaller = tmp_path / f"smaller{suffix}"
+    smaller.write_bytes(film.film_within(path, size // 3))
+    assert 0 < smaller.stat().st_size <= size // 3
+    assert is_own(smaller)
+    video, count = cv2.VideoCapture(str(smaller)), 0
+    while (found := video.read())[0]:
+        count += 1
+        height, width = found[1].shape[:2]
+    assert count == 6
+    assert width / height == pytest.approx(4 / 3, rel=0.05)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
+    assert film.film_within(path, 100) == b""
+
+
+def test_an_mp4_where_there_is_no_encoder_any_more_is_shown_as_webm(tmp_path: Path, monkeypatch: Any) -> None:
+    pytest.importorskip("av")
+    frames = np.random.default_rng(0).integers(0, 256, (6, 180, 240, 3)).astype(np.uint8)
+    with monkeypatch.context() as patch:
+        patch.setenv(encoders.ASKED, "libx264")
+        assert encoders.encode(tmp_path / "film.mp4", frames, (240, 180), 4e6) == ""
+    monkeypatch.setitem(sys.modules, "av", None)
+    smaller = film.film_within(tmp_path / "film.mp4", 60_000)
+    assert 0 < len(smaller) <= 60_000
+    assert smaller[:4] == b"\x1aE\xdf\xa3"  # EBML
+
+
+def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.delenv(encoders.ASKED, raising=False)
+    assert encoders.film_suffix() == (".webm", "")
+    monkeypatch.setenv(encoders.ASKED, "libx264")
+    assert encoders.film_suffix() == (".webm", "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)")
+    assert (
+        write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0) == "no a.mp4: there is no encoder of H.264 here"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["libx265", "h264_nothing", "mpeg4", "aac"])
+def test_an_encoder_of_something_else_is_none(monkeypatch: Any, name: str) -> None:
+    pytest.importorskip("av")
+    monkeypatch.setenv(encoders.ASKED, name)
+    suffix, note = encoders.film_suffix()
+    assert suffix == ".webm"
+    assert f"has no encoder KGS_H264={name} that works" in note
+
+
+def test_an_encoder_that_fails_leaves_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
+    av = pytest.importorskip("av")
+    monkeypatch.setenv(encoders.ASKED, "libx264")
+
+    def failing(*_: Any, **__: Any) -> None:
+        raise av.error.ExternalError(1, "no session left")
+
+    monkeypatch.setattr(av, "open", failing)
+    assert "no a.mp4: libx264: " in write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_codec_there_is_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(encoders.cv2.VideoWriter, "fourcc", lambda *_: 0)
+    assert "this OpenCV writes no WebM" in write_film(tmp_path / "film.webm", render, views_of((12, 16)), 1.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_render_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "film.webm").write_bytes(b"before")
+
+    def failing(_: Any) -> Tensor:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_film(tmp_path / "film.webm", failing, views_of((12, 16)), 1.0)
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("film.webm", b"before")]
+    assert not is_own(tmp_path / "film.webm")
+
+
+@pytest.mark.slow
+def test_a_browser_plays_it(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
+    monkeypatch.setattr(film, "FRAMES", 15)
+    path = tmp_path / f"film{suffix}"
+    (tmp_path / "page.html").write_text(f'<video id="v" src="{path.name}" preload="auto" muted></video>')
+    flat = torch.tensor([200, 40, 90]).reshape(1, 3, 1, 1) / 255
+    with Browser(tmp_path / "profile") as page:
+        assert write_film(path, lambda _: flat.expand(1, 3, 48, 64), views_of((48, 64)), 1.0) == ""
+        page.open(tmp_path / "page.html", ready="v.error || v.readyState == 4")
+        assert page.run("v.error && v.error.message") is None
+        assert page.run("[v.videoWidth, v.videoHeight]") == [64, 48]
+        assert page.run("v.duration") == pytest.approx(15 / 24, abs=0.05)
+        page.run("v.play()")
+        page.run("new Promise(done => { v.onended = done })")
+        page.call("Page.bringToFront")
+        picture = page.picture("data:," + page.call("Page.captureScreenshot")["data"])
+        bound = 3 if suffix == ".mp4" else 12  # OpenCV's VP8 is BT.601 and does not say so; Chromium takes it for 709
+        np.testing.assert_allclose(picture[20:40, 20:60].mean((0, 1)) * 255, [200, 40, 90], rtol=0, atol=bound)
+        assert page.problems == []

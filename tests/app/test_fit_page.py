@@ -1,0 +1,181 @@
+"""The page that a fit leaves: what it says of the fit, of its cameras, and of what was not measured."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from factories import random_views
+
+from kgs.app.cli.evaluate import evaluate
+from kgs.app.page import fit_page
+from kgs.app.page.fit_page import refresh_page, spread, write_own_page
+from kgs.app.saved_fit import load_fit
+from kgs.datasets import Views, load_scene, synthetic_scene
+from kgs.fit import run
+from kgs.fit.config import FitConfig
+from kgs.init_points import InitialPoints
+from kgs.metrics.lpips import Lpips
+
+CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
+REQUEST = {"train_views": 3, "downscale": None, "background": "black"}
+REPORT = {
+    "photos": {"a.jpg": {"points": 70, "blurred": True}, "b.jpg": {"points": 90, "blurred": False}},
+    "matches": [["a.jpg", "b.jpg", 123]],
+    "focal_px": 123.456,
+    "gates": {"most_degrees": 2.0, "passed": True},
+    "seconds": {"matches": 3.0, "cameras": 1.5},
+    "sha256": ["0123abcd"],
+}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: Any) -> Any:
+    out, scene = tmp_path_factory.mktemp("fitted"), synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0)
+    scene = replace(scene, root=out)
+    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
+    (out / "photos.json").write_text(json.dumps(REPORT))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "choose_points", lambda *_: InitialPoints(points, torch.full((150, 3), 0.5), "random"))
+        request = REQUEST | {"scene": "/photos/mine/room"}
+        run.fit_scene(scene, CONFIG, out, request=request, before_publish=write_own_page, say=lambda line: None)
+    return out, scene
+
+
+def test_it_says_what_the_fit_knows(fitted: Any) -> None:
+    out, _ = fitted
+    text = (out / "index.html").read_text(encoding="utf-8")
+    assert "<h1>room</h1>" in text
+    assert "mine" not in text
+    assert "3 training and 8 test photos of 32 × 24 pixels" in text
+    assert "6 of 8 test photos." in text
+    assert text.count('class="render"') == 6
+    assert f"{json.loads((out / 'metrics.json').read_text(encoding='utf-8'))['test']['psnr']:.2f}" in text
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
+    assert facts["points in a photo"] == "70 to 90"
+    assert facts["blurred"] == "a.jpg"
+    assert facts["matches of a pair"] == "123 to 123"
+    assert facts["gates: passed"] == "yes"
+    assert facts["time"] == "4 s"
+    assert facts["scene"] == "room"
+    assert facts["steps"] == "3"
+    assert "0123abcd" not in text
+
+
+def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any) -> None:
+    out, scene = fitted
+    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    refresh_page(out, load_fit(out), replace(scene, root=out / "elsewhere"), metrics)
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", (out / "index.html").read_text(encoding="utf-8")))
+    assert "blurred" not in facts
+    assert "time" not in facts
+    (out / "index.html").write_bytes(own)
+
+
+def test_measures_that_come_later_are_on_it(fitted: Any, tmp_path: Path) -> None:
+    out, scene = fitted
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    for view in (metrics["test"], *metrics["test"]["views"]):
+        view["lpips_vgg"] = 0.4321
+    refresh_page(out, load_fit(out), scene, metrics)
+    assert ">LPIPS</th>" in (out / "index.html").read_text(encoding="utf-8")
+    own = (out / "index.html").read_bytes()
+    (out / "index.html").write_text("mine")
+    refresh_page(out, load_fit(out), scene, metrics)
+    assert (out / "index.html").read_text(encoding="utf-8") == "mine"
+    (out / "index.html").write_bytes(own)
+
+
+def flat_views(masks: Any = None, light: Any = None) -> Views:
+    """Two photos of 20 x 30 pixels: grey inside, of two colours at the border."""
+    images = torch.full((2, 3, 20, 30), 0.5)
+    for image, colour in zip(images, ([0.2, 0.4, 0.6], [0.4, 0.4, 0.8]), strict=True):
+        image[:, [0, -1], :] = torch.tensor(colour)[:, None, None]
+        image[:, :, [0, -1]] = torch.tensor(colour)[:, None, None]
+    return replace(random_views(2, 20, 30), images=images, masks=masks, light=light)
+
+
+def test_the_ground_is_the_mean_of_the_photos_border() -> None:
+    black = torch.zeros(3)
+    torch.testing.assert_close(fit_page._ground(flat_views(), black), torch.tensor([0.3, 0.4, 0.7]))
+    assert torch.equal(fit_page._ground(flat_views(masks=torch.ones(2, 1, 20, 30)), black), black)
+    assert torch.equal(fit_page._ground(flat_views(), torch.ones(3)), torch.ones(3))
+    light = torch.zeros(20, 30)
+    light[3:-3, 3:-3] = 1.0  # a dark border that no photo shows the scene in
+    torch.testing.assert_close(fit_page._ground(flat_views(light=light), black), torch.full((3,), 0.5))
+
+
+def test_without_a_photo_held_out_training_views_are_shown(fitted: Any) -> None:
+    out, scene = fitted
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8")) | {"test": None, "seen": None}
+    refresh_page(out, load_fit(out), replace(scene, test=scene.test.select([])), metrics)
+    text = (out / "index.html").read_text(encoding="utf-8")
+    assert "No photo was held out" in text
+    assert "The training photos." in text
+    assert text.count('class="render"') == 3
+
+
+def test_a_page_without_photos_shows_none(folder: Path, tmp_path: Path) -> None:
+    request = REQUEST | {"scene": str(folder), "photos": False}
+    config = replace(CONFIG, init="random", init_points=50)
+    run.fit_scene(load_scene(folder, 3), config, tmp_path, request=request, before_publish=write_own_page)
+    for again in (False, True):
+        if again:
+            evaluate(tmp_path)
+        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+        assert "data:image" not in text
+        assert "<video" in text
+        assert "held out of the training" in text
+
+
+def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    from kgs.app.cli import main
+
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", str(folder), "-o", str(tmp_path), "--init", "random", "--init-points", "50", "--steps", "3"])
+    assert stop.value.code == 0
+    assert f"open {tmp_path / 'index.html'} in a browser" in capsys.readouterr().out
+    (tmp_path / "index.html").unlink()
+    evaluate(tmp_path)
+    assert (tmp_path / "index.html").stat().st_size > 50_000
+    assert "LPIPS" not in capsys.readouterr().out
+
+
+class Half:
+    """Stands for LPIPS: the mean difference, or half of it where the inputs are not rescaled."""
+
+    net = "vgg16"
+
+    def to(self, device: Any) -> Half:
+        return self
+
+    def __call__(self, image: torch.Tensor, target: torch.Tensor, rescale: bool = True) -> torch.Tensor:
+        return (image - target).abs().mean() * (1.0 if rescale else 0.5)
+
+
+def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    config = replace(CONFIG, init="random", init_points=50)
+    request = REQUEST | {"scene": str(folder)}
+    scene = load_scene(folder, 3)
+    run.fit_scene(scene, config, tmp_path, request=request, before_publish=write_own_page, say=lambda line: None)
+    before = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
+    monkeypatch.setattr(Lpips, "load", lambda weights: Half())
+    evaluate(tmp_path, lpips_weights=tmp_path)
+    after = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
+    for part in ("test", "train"):
+        for row, old in zip([after[part], *after[part]["views"]], [before[part], *before[part]["views"]], strict=True):
+            assert row["lpips_vgg"] > 0
+            assert row["lpips_vgg"] == pytest.approx(2 * row["lpips_vgg_unscaled"])
+            assert row["psnr"] == old["psnr"]
+    assert f"LPIPS {after['test']['lpips_vgg']:.4g}" in capsys.readouterr().out
+    assert ">LPIPS</th>" in (tmp_path / "index.html").read_text(encoding="utf-8")
+
+
+def test_pictures_are_spread_over_the_views() -> None:
+    assert spread(3, 6) == [0, 1, 2]
+    assert spread(25, 6) == [0, 5, 10, 14, 19, 24]

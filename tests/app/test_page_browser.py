@@ -1,0 +1,502 @@
+"""The page in a real Chromium: it needs nothing else, draws what kgs draws, and is readable on a phone."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from browser import Browser
+from factories import batch, random_camera, random_gaussians, with_camera
+
+import kgs
+from kgs import Gaussians
+from kgs.app.files import film as films
+from kgs.app.page import Picture, write_page
+from kgs.app.page.fit_page import write_fit_page
+from kgs.app.sfm import pose_photos
+from kgs.datasets import load_scene
+from kgs.datasets.scene import Views
+from kgs.fit.config import DEMO
+from kgs.fit.plan import make_plan
+from kgs.fit.run import choose_points
+from kgs.fit.trainer import Trainer
+
+SIZE = (150, 200)  # height, width
+BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
+PARTS = ["training", "training", "training", "test"]
+CENTRAL = 1  # the training camera nearest the mean pose
+READY = "document.querySelector('.viewer').dataset.state === 'ready'"
+SHOW = """(index, width, height) => {
+  const canvas = document.querySelector("canvas");
+  Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
+  if (index !== null) viewer.place(index);
+  viewer.draw();
+  return canvas.toDataURL();
+}"""
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    """Anisotropic Gaussians with harmonics of degree 3, some faint, some beside the frame; off-centre cameras."""
+    gaussians = random_gaussians(400, 0, torch.float32, sh_degree=3, image_size=max(SIZE), opacities=(0.001, 0.999))
+    beside = random_gaussians(20, 1, torch.float32, sh_degree=3)
+    beside.means[:, 0] = torch.linspace(0.7, 1.3, 20) * beside.means[:, 2]  # the frame ends at about 0.5
+    beside.scales[:] = torch.tensor([0.05, 0.05, 1.5])
+    beside.quats[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    gaussians = Gaussians(*map(torch.cat, zip(vars(gaussians).values(), vars(beside).values(), strict=True)))
+    first, last, test = (random_camera(*SIZE, seed, torch.float32) for seed in range(3))
+    between = first.extrinsics.clone()
+    between[:, :3, 3] = (first.extrinsics + last.extrinsics)[:, :3, 3] / 2
+    return gaussians, batch(first, with_camera(first, extrinsics=between), last, test)
+
+
+@pytest.fixture(scope="module")
+def renders(scene: Any) -> Any:
+    gaussians, cameras = scene
+    with torch.no_grad():
+        return kgs.GaussianRenderer(backend="torch").eval()(gaussians, cameras, background=BACKGROUND).image.clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: Any) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("chromium")) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
+    gaussians, cameras = scene
+    path: Path = tmp_path_factory.mktemp("page") / "index.html"
+    names = [f"a photo with a rather long name that someone gave it {i}.jpg" for i in range(4)]
+    pictures = [Picture(names[3], 1 - renders[3], {"": renders[3]})]
+    views = [{"name": names[3], "psnr": 20.0, "ssim": 0.5, "ssim_zero_padded": 0.5, "lpips_vgg": 0.25}]
+    curve = [{"step": i, "seconds": 1.0 * i, "test_psnr": 20 + i / 9, "train_psnr": 25.0 + i} for i in range(4)]
+    metrics = {"test": {**views[0], "views": views}, "train": None, "curve": curve, "seconds": 3.0, "steps": 3}
+    rules: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "pictures": pictures}
+    film = path.with_name("film.webm")
+    views_of_film = Views(cameras, renders, tuple(names))
+    assert films.write_film(film, lambda _: renders[:1], views_of_film, 4.0) == ""
+    settings = {"init_file": "/photos/someone/points.ply", "a_setting_with_a_long_name": "x" * 60}
+    shown: dict[str, Any] = {"runs": {"": metrics}, "settings": settings, "film": film.read_bytes()}
+    write_page(path, "A test", gaussians, cameras, names, PARTS, **shown, **rules)
+    return path
+
+
+def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    assert [url for url in browser.requests if not url.startswith("data:")] == [page.as_uri()]
+    assert browser.problems == []
+
+
+def show(browser: Browser, index: int | None, width: int = SIZE[1], height: int = SIZE[0]) -> Any:
+    """The canvas in some size of pixels, at a camera of the page or, without index, where the eye is now."""
+    words = ", ".join(json.dumps(value) for value in (index, width, height))
+    return browser.picture(browser.run(f"({SHOW})({words})"))
+
+
+def array(image: torch.Tensor) -> np.ndarray[Any, Any]:
+    """`(H, W, 3)` of `(3, H, W)`."""
+    return image.permute(1, 2, 0).double().numpy()
+
+
+def psnr(shown: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> float:
+    assert shown.shape == expected.shape
+    error = np.mean((shown - expected) ** 2)
+    return -10 * math.log10(error) if error else math.inf
+
+
+def test_the_canvas_shows_what_kgs_renders(browser: Browser, page: Path, renders: Any) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    for index, render in enumerate(renders):
+        shown, expected = show(browser, index), array(render)
+        assert psnr(shown, expected) >= 38, PARTS[index]
+        assert np.abs(shown - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 844), (844, 390)])
+def test_the_first_view_is_a_whole_photo_on_every_screen(
+    browser: Browser, page: Path, renders: Any, width: int, height: int
+) -> None:
+    browser.size(width, height)
+    browser.open(page, READY)
+    canvas = browser.run(
+        "(() => { const box = viewer.canvas.getBoundingClientRect(); return [box.width, box.height]; })()"
+    )
+    stage = browser.run("[document.querySelector('.stage').clientWidth, document.querySelector('.stage').clientHeight]")
+    assert canvas == pytest.approx(stage, abs=1)
+    assert canvas[0] == pytest.approx(canvas[1] * SIZE[1] / SIZE[0], abs=1)
+    assert canvas[1] <= 0.8 * height
+    assert canvas[0] >= 0.9 * width or canvas[1] >= 0.75 * height  # as large as the screen allows
+    assert browser.run("document.querySelector('select').value") == str(CENTRAL)
+    shown = browser.picture(browser.run("(viewer.draw(), viewer.canvas.toDataURL())"))
+    shown = cv2.resize(shown, SIZE[::-1], interpolation=cv2.INTER_AREA)
+    assert psnr(shown, array(renders[CENTRAL])) >= 30
+
+
+def test_start_goes_back_to_the_first_view(browser: Browser, page: Path) -> None:
+    browser.size(1280, 900)
+    browser.open(page, READY)
+    for button in ("viewer.flyTo(3)", "document.querySelector('.start').click()"):
+        browser.run(button)
+    assert browser.run("document.querySelector('select').value") == str(CENTRAL)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (16, 9), (9, 16)])
+def test_what_the_photos_frame_shows_does_not_depend_on_the_canvas(
+    browser: Browser, page: Path, scene: Any, shape: tuple[int, int]
+) -> None:
+    """In orbits around the middle of the scene, on canvases that hold the frame of a photo in its own pixels."""
+    gaussians, cameras = scene
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    height, width = SIZE
+    wide, tall = round(height * shape[0] / shape[1] / 2), round(width * shape[1] / shape[0] / 2)
+    canvas = max(width, 2 * wide), max(height, 2 * tall)  # even: the frame lies on whole pixels
+    left, top = (canvas[0] - width) // 2, (canvas[1] - height) // 2
+    browser.run("viewer.isRoaming = true")
+    for yaw, pitch in ((0, 0), (12, 0), (25, 0), (-25, 0), (0, 20)):
+        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({math.radians(yaw)}, {math.radians(pitch)})")
+        lens = Views(cameras, torch.zeros(4, 3, *SIZE), tuple("abcd")).camera(CENTRAL)
+        camera = camera_of(browser, lens)
+        with torch.no_grad():
+            render = kgs.GaussianRenderer(backend="torch").eval()(gaussians, camera, background=BACKGROUND).image
+        shown = show(browser, None, *canvas)[top : top + height, left : left + width]
+        assert psnr(shown, array(render[0].clamp(0, 1))) >= 38, (yaw, pitch)
+
+
+def test_an_antialiased_splat_is_drawn_as_such(browser: Browser, scene: Any, tmp_path: Path) -> None:
+    """Of many Gaussians that are smaller than a pixel."""
+    gaussians, cameras = scene
+    small = replace(gaussians, scales=gaussians.scales * torch.linspace(0.02, 0.2, len(gaussians))[:, None])
+    with torch.no_grad():
+        plain, fine = (
+            kgs.GaussianRenderer(antialiased=antialiased, backend="torch").eval()(small, cameras, BACKGROUND).image
+            for antialiased in (False, True)
+        )
+    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "antialiased": True}
+    write_page(tmp_path / "index.html", "a", small, cameras, list("abcd"), PARTS, **options)
+    browser.size(1000, 800)
+    browser.open(tmp_path / "index.html", READY)
+    for index in range(4):
+        shown = show(browser, index)
+        level = psnr(shown, array(fine[index].clamp(0, 1)))
+        assert level >= 38
+        assert level > psnr(shown, array(plain[index].clamp(0, 1))) + 6
+
+
+def test_strays_change_nothing_of_what_is_shown(browser: Browser, scene: Any, renders: Any, tmp_path: Path) -> None:
+    """Behind all cameras: one that is left out, one that is not so far away, and one with a harmonic of 1e8."""
+    gaussians, cameras = scene
+    strays = random_gaussians(3, 2, torch.float32, sh_degree=3)
+    strays.means[:] = torch.tensor([[0.0, 0.0, -1.0]]) * torch.tensor([[1e12], [2e5], [30.0]])
+    strays.colors[2, 9, 1] = 1e8
+    more = Gaussians(*map(torch.cat, zip(vars(gaussians).values(), vars(strays).values(), strict=True)))
+    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND}
+    words = write_page(tmp_path / "index.html", "a", more, cameras, list("abcd"), PARTS, **options)
+    assert words == "all but 1 stray Gaussian"
+    browser.size(1000, 800)
+    browser.open(tmp_path / "index.html", READY)
+    for index, render in enumerate(renders):
+        assert psnr(show(browser, index), array(render)) >= 50
+
+
+def camera_of(browser: Browser, lens: Any) -> Any:
+    """The camera of the eye, with the intrinsics of `lens`."""
+    rotation, position = (torch.tensor(browser.run(f"viewer.eye.{name}")) for name in ("rotation", "position"))
+    pose = torch.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ position
+    return with_camera(lens, extrinsics=pose[None])
+
+
+def drag(browser: Browser, share: float) -> None:
+    """From the middle of the stage to the right, by a share of its width, in ten moves."""
+    x, y, width = browser.run(
+        "(() => { const b = viewer.canvas.getBoundingClientRect();"
+        " return [b.x + b.width / 5, b.y + b.height / 2, b.width]; })()"
+    )
+    event: dict[str, Any] = {"y": y, "button": "left", "buttons": 1}
+    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, clickCount=1, **event)
+    for i in range(1, 11):
+        browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + share * width * i / 10, **event)
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + share * width, clickCount=1, **event)
+
+
+def test_roaming_ends_where_the_splat_leaves_the_stage(browser: Browser, page: Path) -> None:
+    """A third of the stage, measured on what the canvas shows before two grounds."""
+    browser.size(1000, 800)
+    browser.open(page, READY)
+
+    def covered() -> float:
+        shown = []
+        for ground in ("[0, 0, 0]", "[1, 1, 1]"):
+            browser.run(f"viewer.renderer.settings.background = {ground}")
+            shown.append(show(browser, None))
+        return float(1 - (shown[1] - shown[0]).mean())
+
+    for sign in (1, -1):
+        browser.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
+        least = min(1 / 3, covered() / 2)
+        browser.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
+        assert covered() >= least - 0.01
+        at_once = browser.run("viewer.eye.position")
+        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
+        assert browser.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)
+        browser.run("viewer.place(viewer.scene.first); viewer.zoom(2.5); window.start = viewer.eye.position")
+        browser.run(f"viewer.turn({0.3 * sign}, 0)")  # from farther away it turns as well
+        assert browser.run("viewer.eye.position !== start")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["colmap/monstree", "photos/banana", "nerfstudio/fox"])
+def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
+    browser: Browser, name: str, kgs_data: Path, tmp_path: Path
+) -> None:
+    """Not more black, and not more of the ground, than a render from there before the same ground."""
+    folder = kgs_data / name
+    if name.startswith("photos"):
+        folder = tmp_path / "posed"
+        pose_photos(kgs_data / name, folder)
+    wide = max(load_scene(folder, 6, hold_out=0, photos=False).train.images.shape[-2:])
+    real = load_scene(folder, 6, wide / 200, hold_out=0)
+    config = replace(DEMO, steps=100)
+    fit = Trainer(real, make_plan(real, config), choose_points(real, config)).fit()
+    path = tmp_path / "index.html"
+    near_plane = fit.options.near_plane
+    write_fit_page(path, name, {"": fit}, photos=False)
+    browser.size(1000, 800)
+    browser.open(path, READY)
+    ground = torch.tensor(browser.run("viewer.renderer.settings.background"))
+    assert ground.amax() > 0.05
+    height, width = real.train.images.shape[-2:]
+    show(browser, None, width, height)
+    renderer = kgs.GaussianRenderer(near_plane=near_plane).eval()
+    lens = real.train.camera(browser.run("viewer.scene.first"))
+    for share in (0.0, 0.1, 0.3, 0.6, -0.1, -0.3, -0.6):
+        browser.run("viewer.place(viewer.scene.first)")
+        drag(browser, share)
+        shown = show(browser, None, width, height)
+        with torch.no_grad():
+            image = renderer(fit.model(), camera_of(browser, lens), ground).image[0]
+        expected = array(image.clamp(0, 1))
+        for colour in (torch.zeros(3), ground):
+            shares = [np.mean(np.abs(picture - colour.numpy()).max(axis=2) < 8 / 255) for picture in (shown, expected)]
+            assert shares[0] <= shares[1] + 0.01, (share, colour)
+
+
+def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    eye = "JSON.stringify([viewer.eye.position, viewer.eye.rotation])"
+    views = [browser.run(eye)]
+    middle = browser.run(
+        "(() => { const b = viewer.canvas.getBoundingClientRect(); return [b.x + 300, b.y + 200]; })()"
+    )
+
+    def mouse(kind: str, x: float, **more: Any) -> None:
+        browser.call("Input.dispatchMouseEvent", type=kind, x=middle[0] + x, y=middle[1], button="left", **more)
+
+    def drag() -> None:
+        mouse("mousePressed", 0, clickCount=1, buttons=1)
+        mouse("mouseMoved", 40, buttons=1)
+        mouse("mouseReleased", 40, clickCount=1)
+        views.append(browser.run(eye))
+
+    browser.run("document.querySelector('.pyramids').click()")
+    drag()
+    browser.run("viewer.canvas.focus()")
+    for key in ("ArrowUp", "+"):
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key=key)
+        views.append(browser.run(eye))
+    assert len(set(views)) == 4
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key="+", modifiers=2)  # with Ctrl: the browser's zoom
+    assert browser.run(eye) == views[-1]
+    square = "M{0} {2}L{1} {2}L{1} {3}L{0} {3}Z".format(*(x + d for x in (300, 200) for d in (-50, 50)))
+    browser.run("viewer.drawPyramids = () => {}")  # a large one stays below the pointer
+    browser.run(f"viewer.pyramids[1].setAttribute('d', '{square}')")
+    drag()  # on a pyramid: no click
+    mouse("mouseWheel", 0, deltaX=0, deltaY=100)
+    views.append(browser.run(eye))
+    assert len(set(views)) == 6
+    mouse("mousePressed", 0, clickCount=1, buttons=1)
+    mouse("mouseReleased", 0, clickCount=1)
+    there = "JSON.stringify([viewer.scene.cameras[1].position, viewer.scene.cameras[1].rotation])"
+    browser.wait(f"{eye} === {there}")
+
+
+def test_a_key_turns_the_pictures_by_a_quarter(browser: Browser, page: Path, renders: Any) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    start = show(browser, CENTRAL)
+    browser.run("viewer.canvas.removeAttribute('style'); viewer.canvas.focus()")
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key="r")
+    stage = browser.run("[document.querySelector('.stage').clientWidth, document.querySelector('.stage').clientHeight]")
+    assert stage[0] == pytest.approx(stage[1] * SIZE[0] / SIZE[1], abs=2)
+    turned = show(browser, None, *SIZE)
+    assert psnr(turned, np.rot90(array(renders[CENTRAL]), -1)) >= 38
+    assert psnr(show(browser, 0, *SIZE), np.rot90(array(renders[0]), -1)) >= 38  # other cameras, too
+    up = browser.run("viewer.scene.up")
+    down = browser.run("viewer.scene.cameras[1].rotation[1]")
+    assert np.dot(up, down) < -0.9
+    for _ in range(3):
+        browser.run("viewer.rollQuarter()")
+    assert np.array_equal(show(browser, CENTRAL), start)
+
+
+def test_graphics_that_the_browser_took_back_come_again(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    before = show(browser, 0)
+    browser.run("window.loss = viewer.renderer.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
+    browser.wait("document.querySelector('.viewer').dataset.state === 'lost'")
+    assert "graphics" in browser.run("document.querySelector('.failure').textContent")
+    browser.run("loss.restoreContext()")
+    browser.wait(READY)
+    assert browser.run("document.querySelector('.failure').textContent") == ""
+    assert np.array_equal(show(browser, 0), before)
+
+
+def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    over = "document.querySelector('.over')"
+    assert browser.run(f"{over}.src === document.querySelector('img.render').src")
+    clips = [browser.run(f"{over}.style.clipPath")]
+    browser.run("document.querySelector('.wipe input').focus()")
+    for _ in range(30):
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", windowsVirtualKeyCode=37)
+    clips.append(browser.run(f"{over}.style.clipPath"))
+    assert clips == ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 20%)"]
+    browser.run("document.querySelector('.pair').scrollIntoView()")
+    left, top, width = browser.run(
+        "(() => { const b = document.querySelector('.pair').getBoundingClientRect(); return [b.x, b.y, b.width]; })()"
+    )
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=left + 0.75 * width, y=top + 20)
+    assert browser.run("Number(document.querySelector('.wipe input').value)") == pytest.approx(75, abs=1)
+
+
+TURNED = """(() => {
+  const { up, arc } = viewer.scene, back = viewer.eye.rotation[2].map((value) => -value);
+  return [Math.atan2(dot(up, cross(arc.origin, back)), dot(arc.origin, back)), Math.asin(dot(up, back))];
+})()"""
+
+
+def test_a_drag_ends_a_quarter_beyond_the_cameras_unless_it_roams(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    arc = browser.run("viewer.scene.arc")
+    for sign in (1, -1):
+        for axis, name in enumerate(("yaw", "pitch")):
+            browser.run("viewer.place(viewer.scene.first)")
+            # a drag to the right is a turn to the left
+            step = [0.0, 0.0]
+            step[axis] = sign * (-0.02 if axis == 0 else 0.02)
+            browser.run(f"for (let i = 0; i < 400; i++) viewer.turn({step[0]}, {step[1]})")
+            low, high = arc[name]
+            end = high if sign > 0 else low
+            beyond = sign * (browser.run(TURNED)[axis] - end) / (high - low)
+            assert 0.15 < beyond <= 0.25 + 1e-6, (sign, name)
+    browser.run("viewer.place(viewer.scene.first)")
+    browser.run("viewer.turn(-1e3 * viewer.turnPerPixel(), 0)")  # one long drag stops there, too
+    assert browser.run(TURNED)[0] <= arc["yaw"][1] + 0.25 * (arc["yaw"][1] - arc["yaw"][0]) + 1e-6
+    browser.run("viewer.place(viewer.scene.first); document.querySelector('.roam').click()")
+    assert browser.run("document.querySelector('.roam').getAttribute('aria-pressed')") == "true"
+    browser.run("viewer.turn(-2.5, 0)")
+    assert browser.run(TURNED)[0] == pytest.approx(2.5, abs=0.02)
+
+
+def test_a_drag_across_the_stage_is_the_arc_of_the_cameras(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    low, high = browser.run("viewer.scene.arc.yaw")
+    assert browser.run("viewer.turnPerPixel() * viewer.canvas.clientWidth") == pytest.approx(high - low)
+
+
+def test_the_distance_has_limits(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    start = browser.run("viewer.eye.distance")
+    for factor, limit in ((1.3, 3), (0.7, 0.3)):
+        browser.run(f"for (let i = 0; i < 40; i++) viewer.zoom({factor})")
+        assert browser.run("viewer.eye.distance") == pytest.approx(limit * start)
+
+
+def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, page: Path) -> None:
+    browser.size(1000, 500)
+    browser.open(page, READY)
+    assert browser.run("getComputedStyle(viewer.canvas).touchAction") == "pan-y"
+    browser.run("document.querySelector('.stage').scrollIntoView()")
+    box = (
+        "(() => { const b = viewer.canvas.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+    )
+    x, y = browser.run(box)
+    distance, before = browser.run("viewer.eye.distance"), browser.run("scrollY")
+    wheel: dict[str, Any] = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": 100}
+    browser.call("Input.dispatchMouseEvent", **wheel)
+    browser.wait(f"scrollY > {before}")
+    assert browser.run("viewer.eye.distance") == distance
+    x, y = browser.run(box)
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    before = browser.run("scrollY")
+    browser.call("Input.dispatchMouseEvent", **wheel | {"y": y})
+    browser.wait(f"viewer.eye.distance > {distance}")
+    assert browser.run("scrollY") == before
+
+
+def test_it_sways_until_it_is_touched(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800, motion="no-preference")
+    browser.open(page, READY)
+    place = "JSON.stringify(viewer.eye.position)"
+    start = browser.run(place)
+    browser.wait(f"{place} !== {start!r}")
+    browser.run("document.querySelector('.stage').dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
+    assert not browser.run("viewer.isSwaying")
+    stopped = browser.run(place)
+    browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert browser.run(place) == stopped
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    assert not browser.run("viewer.isSwaying")  # where the system asks for less motion
+
+
+def test_the_cameras_are_hidden_until_they_are_wanted(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    shown = "getComputedStyle(viewer.overlay).display !== 'none'"
+    assert not browser.run(shown)
+    browser.run("document.querySelector('.pyramids').click()")
+    assert browser.run(shown)
+
+
+def test_the_film_plays(browser: Browser, page: Path) -> None:
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    film = "document.querySelector('video')"
+    browser.wait(f"{film}.readyState >= 2")
+    assert browser.run(f"[{film}.videoWidth, {film}.videoHeight]") == [SIZE[1], SIZE[0]]
+    assert browser.run(f"{film}.duration") == pytest.approx(films.FRAMES / films.RATE, abs=0.01)
+
+
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: str) -> None:
+    browser.size(400, 800, scheme)
+    browser.open(page, READY)
+    assert browser.run("document.documentElement.scrollWidth") <= 400
+    cut = """[...document.querySelectorAll("body *")].filter((one) => !one.closest(".scroll, pre, svg, details")
+      && one.getBoundingClientRect().right > innerWidth + 0.5).map((one) => one.outerHTML.slice(0, 99))"""
+    assert browser.run(cut) == []
+    browser.run("document.querySelector('details').open = true")
+    assert browser.run("document.documentElement.scrollWidth") <= 400
+    channels = browser.run("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
+    assert (max(channels) < 64) if scheme == "dark" else (min(channels) > 240)

@@ -1,0 +1,163 @@
+"""`kgs render`: pictures of a splat, and no photo of the user's lost."""
+
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from factories import random_model
+
+import kgs
+from kgs import GaussianRenderer, save_ply
+from kgs.app.cli.page import check_page, page
+from kgs.app.cli.render import render
+from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.image_file import ImageFile
+from kgs.errors import DataError
+
+
+@pytest.fixture(scope="module")
+def splat(tmp_path_factory):
+    path = tmp_path_factory.mktemp("splat") / "splat.ply"
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(50, 3, generator=generator) + torch.tensor([-0.5, -0.5, 4.0])
+    save_ply(path, kgs.GaussianModel.from_points(points, torch.rand(50, 3, generator=generator), 0))
+    return path
+
+
+@pytest.fixture
+def llff(tmp_path):
+    """An LLFF folder with ten PNGs."""
+    scene = synthetic_scene(train_views=8, test_views=2, size=(30, 40), seed=0)
+    root = tmp_path / "llff"
+    (root / "images").mkdir(parents=True)
+    rows = []
+    for k, image in enumerate([*scene.train.images, *scene.test.images]):
+        cv2.imwrite(str(root / "images" / f"{k}.png"), (image.permute(1, 2, 0) * 255).byte().numpy())
+        pose = np.array([[0, 1, 0, 0.1 * k, 30], [1, 0, 0, 0, 40], [0, 0, -1, 0, 35]], dtype=float)
+        rows.append([*pose.ravel(), 3.0, 8.0])
+    np.save(root / "poses_bounds.npy", np.array(rows))
+    return root
+
+
+def hashes(folder):
+    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("out", ["images", "."])
+def test_photos_are_never_overwritten(splat, llff, out):
+    before = hashes(llff)
+    with pytest.raises(DataError, match="holds files of a scene"):
+        render(splat, cameras=llff, out=llff / out)
+    assert hashes(llff) == before
+
+
+def test_a_copy_of_the_photos_is_not_overwritten_either(splat, llff, tmp_path):
+    photo = (llff / "images" / "3.png").read_bytes()
+    (tmp_path / "copy").mkdir()
+    (tmp_path / "copy" / "3.png").write_bytes(photo)
+    with pytest.raises(DataError, match=r"3\.png: was not written by kgs"):
+        render(splat, cameras=llff, out=tmp_path / "copy")
+    assert hashes(tmp_path / "copy").keys() == {tmp_path / "copy" / "3.png"}
+    assert (tmp_path / "copy" / "3.png").read_bytes() == photo
+
+
+def test_a_second_render_replaces_the_first(splat, llff):
+    out = llff / "renders"  # below the scene, with nothing of it inside
+    render(splat, cameras=llff, out=out)
+    first = hashes(out)
+    assert len(first) == 10
+    render(splat, cameras=llff, out=out)
+    assert hashes(out) == first
+
+
+def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_path):
+    for background, least in (("black", 0.0), ("white", 1.0)):
+        out = tmp_path / background
+        render(splat, cameras=llff, out=out, downscale=2.0, background=background)
+        pictures = [cv2.imread(str(path)) for path in sorted(out.iterdir())]
+        assert {picture.shape for picture in pictures} == {(15, 20, 3)}
+        assert {int(picture[0, 0].max()) for picture in pictures} == {round(255 * least)}  # no Gaussian is there
+    page(splat, cameras=llff, out=tmp_path / "page.html", downscale=2.0, background="white")
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "10 photos of 20 × 15 pixels" in text
+    assert '"background":[1.0,1.0,1.0]' in text
+    with pytest.raises(ValueError, match="downscale: expected photos of at least 11 pixels a side, got 8x6"):
+        page(splat, cameras=llff, out=tmp_path / "page.html", downscale=5.0)
+
+
+@pytest.mark.parametrize("tag", [None, "SplatRenderMode: mip", "antialiased 1"])
+def test_a_splat_is_rendered_as_its_tag_says(llff, tmp_path, tag):
+    generator = torch.Generator().manual_seed(0)
+    model = random_model(300, 0)  # small Gaussians: the low-pass filter makes most of the footprint
+    with torch.no_grad():
+        model.means.copy_(2.0 * torch.rand(300, 3, generator=generator) + torch.tensor([-1.0, -1.0, 3.0]))
+        model.log_scales.fill_(-4.0)
+    save_ply(tmp_path / "splat.ply", model)
+    content = (tmp_path / "splat.ply").read_bytes()
+    if tag:
+        content = content.replace(b"element vertex", f"comment {tag}\nelement vertex".encode())
+    (tmp_path / "splat.ply").write_bytes(content)
+    render(tmp_path / "splat.ply", cameras=llff, out=tmp_path / "out")
+    scene = load_scene(llff, train_views=None, hold_out=0)
+    images, camera = {}, scene.train.camera(0)
+    with torch.no_grad():
+        model.means.sub_(scene.offset)
+    for antialiased in (False, True):
+        with torch.no_grad():
+            image = GaussianRenderer(antialiased=antialiased)(model(), camera).image[0]
+        images[antialiased] = 255.0 * image.clamp(0.0, 1.0).permute(1, 2, 0).flip(2).numpy()
+    picture = cv2.imread(str(tmp_path / "out" / "0.png"))
+    assert np.abs(images[True] - images[False]).max() > 50
+    np.testing.assert_allclose(picture, images[tag is not None], rtol=0, atol=1.0)
+
+
+def moved(splat, path, shift):
+    model = kgs.load_ply(splat)
+    with torch.no_grad():
+        model.means.add_(torch.tensor(shift))
+    save_ply(path, model)
+    return path
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, -100.0), (1000.0, 0.0, 0.0)])
+def test_a_splat_that_no_camera_sees_is_refused_before_anything_is_written(splat, llff, tmp_path, shift):
+    path = moved(splat, tmp_path / "moved.ply", shift)
+    for call, out in ((render, "renders"), (page, "page.html")):
+        with pytest.raises(DataError, match=r"moved\.ply: Gaussians: expected some that a camera of .* got none of 50"):
+            call(path, cameras=llff, out=tmp_path / out)
+        assert not (tmp_path / out).exists()
+
+
+def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
+    render(splat, cameras=llff, out=tmp_path / "all")
+    assert "see no Gaussian" not in capsys.readouterr().out
+    poses = np.load(llff / "poses_bounds.npy")
+    for row in (poses[3], poses[7]):
+        row[:15].reshape(3, 5)[:, 1:3] *= -1.0  # turned about
+    np.save(llff / "poses_bounds.npy", poses)
+    render(splat, cameras=llff, out=tmp_path / "some")
+    assert f"these cameras see no Gaussian of {splat}: 3.png, 7.png" in capsys.readouterr().out
+    assert not cv2.imread(str(tmp_path / "some" / "3.png")).any()
+
+
+def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
+    out, decoded, plain = tmp_path / "page.html", [], ImageFile.read
+    monkeypatch.setattr(ImageFile, "read", lambda file: decoded.append(file.path.name) or plain(file))
+    page(splat, cameras=llff, out=out)
+    text = out.read_text(encoding="utf-8")
+    assert len(decoded) == 6  # of ten: there may be hundreds
+    assert all(f'alt="photo {name}"' in text for name in decoded)
+    assert "10 photos of 40 × 30 pixels" in text
+    assert "Whether the splat was fitted to these photos is not known here." in text
+    assert f"open {out} in a browser" in capsys.readouterr().out
+    page(splat, cameras=llff, out=out)  # its own file is written again
+    out.write_text("mine")
+    for place, error, message in (
+        (out, DataError, r"page\.html: was not written by kgs"),
+        (tmp_path / "page", ValueError, r"out: expected a file that ends in \.html, got"),
+        (tmp_path / "no" / "page.html", DataError, "expected a file in a folder that is there"),
+    ):
+        with pytest.raises(error, match=message):
+            check_page(llff, place, None, 0.0, "cpu", "auto")

@@ -1,0 +1,328 @@
+"""The folder of a fit: one fit at a time, and old results that stay whole until the new ones are."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kgs.app.files import staging
+from kgs.app.files.ownership import make_own_folder
+from kgs.app.files.results_folder import CHECKPOINT, locked
+from kgs.app.fit_folder import fit_folder
+from kgs.app.saved_fit import load_fit
+from kgs.datasets.synthetic import synthetic_scene
+from kgs.errors import DataError, TrainingDiverged
+from kgs.fit import run
+from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
+from kgs.fit.config import FitConfig, Recipe, with_pace
+from kgs.fit.plan import make_plan
+from kgs.fit.trainer import Trainer
+from kgs.init_points import InitialPoints
+
+CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))
+OTHER = replace(CONFIG, seed=1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    return synthetic_scene(train_views=3, test_views=2, size=(24, 32), seed=0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_points() -> Any:
+    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
+    first = InitialPoints(points, torch.full((150, 3), 0.5), "random")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "choose_points", lambda *_: first)
+        yield
+
+
+@pytest.fixture(scope="module")
+def first_fit(scene: Any, tmp_path_factory: Any) -> Path:
+    out: Path = tmp_path_factory.mktemp("first")
+    fit(scene, CONFIG, out)
+    return out
+
+
+@pytest.fixture
+def done(first_fit: Path, tmp_path: Path) -> Path:
+    """A folder with the finished fit of CONFIG, for this test alone."""
+    shutil.copytree(first_fit, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def fit(scene: Any, config: FitConfig, out: Path, **options: Any) -> list[str]:
+    """Fit; the lines that were said."""
+    lines: list[str] = []
+    request = {"scene": "/photos", "train_views": 3, "downscale": None, "background": "black"}
+    fit_folder(scene, config, out, say=lines.append, request=request, **options)
+    return lines
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def seed_of(out: Path) -> int:
+    """The seed of the set of files, the same in all of them."""
+    config, metrics = (json.loads((out / name).read_text()) for name in ("config.json", "metrics.json"))
+    assert config["fit"]["seed"] == metrics["seed"] == load_checkpoint(out / CHECKPOINT)["config"]["seed"]
+    assert load_fit(out).model.means.shape[0] == metrics["gaussians"]
+    return int(metrics["seed"])
+
+
+def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(DataError, match="another fit is at work in this folder"):
+        fit(scene, CONFIG, tmp_path)
+    fit(scene, CONFIG, tmp_path)
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
+    if not hasattr(os, "fork"):
+        pytest.skip("processes as POSIX has them")
+    told, tell = os.pipe()
+    with warnings.catch_warnings(action="ignore"):  # there are threads
+        child = os.fork()
+    if child == 0:
+        with locked(tmp_path):
+            os.write(tell, b"locked")
+            time.sleep(600)
+        os._exit(1)
+    assert os.read(told, 6) == b"locked"
+    with pytest.raises(DataError, match="another fit"), locked(tmp_path):
+        pass
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    for end in (told, tell):
+        os.close(end)
+    with locked(tmp_path):
+        pass
+
+
+def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkeypatch: Any) -> None:
+    before = contents(done)
+    monkeypatch.setattr("kgs.fit.trainer.gradient_fault", lambda model: "expected finite gradients")
+    with pytest.raises(TrainingDiverged, match="step 1.*no checkpoint yet"):
+        fit(scene, OTHER, done)
+    assert contents(done) == before
+    assert "unfinished" not in os.listdir(done)
+
+
+@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json"])
+def test_results_that_cannot_be_written_leave_the_old_ones(
+    scene: Any, done: Path, monkeypatch: Any, failing: str
+) -> None:
+    plain = getattr(run, failing)
+
+    def full(path: Any, *arguments: Any, **options: Any) -> Any:
+        if failing == "write_json" and path.name != "metrics.json":
+            return plain(path, *arguments, **options)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run, failing, full)
+    with pytest.raises(OSError, match="space"):
+        fit(scene, OTHER, done)
+    assert seed_of(done) == 0
+    monkeypatch.undo()
+    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 3"  # the training is not lost
+    assert seed_of(done) == 1
+
+
+def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
+    scene: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """The disk fills up during the training: splat and curve still fit on it, the first test picture does not."""
+
+    def full(path: Any, *_: Any) -> Any:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Trainer, "save", full)
+    monkeypatch.setattr(run, "write_png", full)
+    lines: list[str] = []
+    with pytest.raises(OSError, match="space") as error:
+        fit_folder(scene, CONFIG, tmp_path, say=lines.append)
+    unfinished = tmp_path / "unfinished"
+    assert error.value.filename == str(unfinished / "test" / "test_00.png")
+    assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(unfinished))
+    assert any(line.startswith(f"{unfinished}: holds the results") for line in lines)
+
+
+@pytest.mark.parametrize("failures", [2, 3])  # of the evaluation's, the last one, and the second try of that
+def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
+    scene: Any, done: Path, monkeypatch: Any, failures: int
+) -> None:
+    """What it shows and what is evaluated later would differ; the last checkpoint is tried again at the end."""
+    failed, save = [], Trainer.save
+
+    def full_at_the_end(trainer: Trainer, path: Any) -> None:
+        if trainer.step == 3 and len(failed) < failures:
+            failed.append(1)
+            raise OSError(28, "No space left on device", str(path))
+        save(trainer, path)
+
+    monkeypatch.setattr(Trainer, "save", full_at_the_end)
+    lines: list[str] = []
+    if failures == 2:
+        fit_folder(scene, OTHER, done, say=lines.append)
+        assert load_checkpoint(done / CHECKPOINT)["step"] == 3
+        return
+    with pytest.raises(OSError, match="No space"):
+        fit_folder(scene, OTHER, done, say=lines.append)
+    assert any(line.startswith(f"{done / 'unfinished'}: holds the results") for line in lines)
+    assert seed_of(done) == 0
+    monkeypatch.undo()
+    fit(scene, OTHER, done, resume=True)
+    assert (seed_of(done), load_checkpoint(done / CHECKPOINT)["step"]) == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"near_plane": -1.0}, "near_plane"),
+        ({"near_plane": "near"}, "near_plane"),
+        ({"step": -5}, "step"),
+        ({"backend": "foo"}, "backend"),
+        ({"poses": {"extrinsics": [1.0]}}, "poses"),
+        ({"poses": "none"}, "model"),
+    ],
+)
+def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], field: str) -> None:
+    path = done / CHECKPOINT
+    save_checkpoint(path, load_checkpoint(path) | changes)
+    previous(path).unlink(missing_ok=True)
+    with pytest.raises(DataError) as error:
+        load_fit(done)
+    assert (error.value.path, error.value.field) == (path, field)
+
+
+@pytest.mark.parametrize("moves", [0, 1, 3, 7])
+def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, moves: int) -> None:
+    make_own_folder(done / "finished")  # half removed
+    plain, calls = os.replace, []
+
+    def killed(source: Any, target: Any) -> None:
+        if Path(source).name == "unfinished" or calls:
+            calls.append(source)
+        if len(calls) > moves:
+            raise KeyboardInterrupt
+        plain(source, target)
+
+    monkeypatch.setattr(staging.os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, OTHER, done)
+    monkeypatch.undo()
+    load_fit(done)  # ends the move
+    assert seed_of(done) == (0 if moves == 0 else 1)
+    assert not (done / "finished").exists()
+
+
+def test_no_pictures_or_checkpoints_of_the_former_fit_stay(scene: Any, done: Path) -> None:
+    (done / "test" / "notes.txt").write_text("mine")
+    fit(replace(scene, test=scene.test.select([1])), OTHER, done)
+    assert len(list((done / "test").glob("*.png"))) == 1
+    assert (done / "test" / "notes.txt").exists()
+    assert seed_of(done) == 1
+
+
+def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:
+    plain = Trainer._descend
+
+    def interrupted(self: Trainer) -> float:
+        if self.step == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return plain(self)
+
+    monkeypatch.setattr(Trainer, "_descend", interrupted)
+    lines = fit(scene, OTHER, done)
+    assert f"{done} keeps its finished fit" in lines[-1]
+    assert seed_of(done) == 0
+    assert seed_of(done / "unfinished") == 1
+    monkeypatch.undo()
+    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 2"
+    assert seed_of(done) == 1
+    assert not (done / "unfinished").exists()
+
+
+def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one_is_resumed(
+    scene: Any, done: Path
+) -> None:
+    unfinished = Trainer(scene, make_plan(scene, OTHER), run.choose_points(scene, OTHER))
+    make_own_folder(done / "unfinished")
+    path = done / "unfinished" / CHECKPOINT
+    unfinished.save(path)
+    kept = path.read_bytes()
+    message = f"{re.escape(str(path))}: steps: expected 3, as the fit was begun with"
+    with pytest.raises(DataError, match=message) as error:
+        fit(scene, replace(CONFIG, steps=5), done, resume=True)
+    assert error.value.path == path
+    assert path.read_bytes() == kept
+    shutil.rmtree(done / "unfinished")
+    lines = fit(scene, replace(CONFIG, steps=5), done, resume=True)
+    assert lines[0] == "resumed at step 3"
+    assert "trained on from step 3" in lines[1]
+    assert json.loads((done / "metrics.json").read_text())["steps"] == 5
+
+
+@pytest.mark.parametrize("name", ["finished", "unfinished", CHECKPOINT, previous(Path(CHECKPOINT)).name])
+def test_what_another_program_or_person_made_stays(scene: Any, tmp_path: Path, name: str) -> None:
+    mine = tmp_path / name / "thesis.txt" if "." not in name else tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    with pytest.raises(DataError, match=f"{name}: was not written by kgs.*choose another folder"):
+        fit(scene, CONFIG, tmp_path)
+    assert mine.read_text() == "mine"
+
+
+def test_a_damaged_checkpoint_of_a_fit_does_not_stand_in_the_way(scene: Any, done: Path) -> None:
+    (done / CHECKPOINT).write_bytes(b"damaged")
+    fit(scene, OTHER, done)
+    assert seed_of(done) == 1
+
+
+@pytest.mark.parametrize("place", ["file", "file/out", "/proc/kgs"])
+def test_a_folder_that_cannot_be_written_to_is_refused_first(scene: Any, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DataError, match="expected a folder"):
+        fit(scene, CONFIG, tmp_path / place)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("place", [".", "images"])
+def test_results_do_not_go_among_the_scenes_files(scene: Any, tmp_path: Path, place: str) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "poses_bounds.npy").write_bytes(b"")
+    import cv2
+    import numpy as np
+
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((4, 4, 3), np.uint8))
+    before = contents(tmp_path)
+    with pytest.raises(DataError, match="holds files of a scene"):
+        fit(replace(scene, root=tmp_path), CONFIG, tmp_path / place)
+    assert contents(tmp_path) == before
+
+
+def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="device: expected"):
+        fit(scene, replace(CONFIG, device="foo"), tmp_path / "out")
+    with pytest.raises(DataError, match="expected at least 6x6 pixels, got 5x5"):
+        fit(synthetic_scene(train_views=2, size=(5, 5)), CONFIG, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
+    saved, trainer = load_fit(done), Trainer.resume(scene, CONFIG, done / CHECKPOINT)
+    assert trainer.plan.config == with_pace(CONFIG, len(scene.train))
+    assert (saved.config, saved.step, saved.request["scene"]) == (trainer.plan.config, 3, "/photos")
+    camera = scene.test.camera(0)
+    assert torch.equal(saved.render(camera, scene.background), trainer.render(camera))

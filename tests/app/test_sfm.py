@@ -1,0 +1,218 @@
+"""Cameras from unposed photos: right ones, the same again, in files that other programs read."""
+
+import json
+import shutil
+from itertools import combinations
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from init_point_scenes import WIDTH, focal_length
+from photo_folders import NAMES, close, planes, poses, write_photos, write_planes
+
+from kgs.app.sfm import pose_photos
+from kgs.app.sfm.write import write_model
+from kgs.datasets import load_scene
+from kgs.errors import DataError
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    """The folder of photos, the folder of results, the report and what was said."""
+    root, lines = tmp_path_factory.mktemp("photos"), []
+    report = pose_photos(write_planes(root / "photos"), root / "out", say=lines.append)
+    return root / "photos", root / "out", report, lines
+
+
+def degrees(rotation):
+    return np.degrees(np.linalg.norm(cv2.Rodrigues(rotation)[0]))
+
+
+def test_the_cameras_are_those_that_took_the_photos(posed):
+    _, out, report, _ = posed
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    found, true = np.array([found[name] for name in NAMES])[:, :3], poses()[:, :3]
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        error = found[j, :, :3] @ found[i, :, :3].T @ (true[j, :, :3] @ true[i, :, :3].T).T
+        assert degrees(error) < 0.5
+    centers = [-np.einsum("nji,nj->ni", pose[..., :3], pose[..., 3]) for pose in (found, true)]
+    steps = [np.linalg.norm(c[1] - c[0]) / np.linalg.norm(c[2] - c[1]) for c in centers]
+    assert steps[0] == pytest.approx(steps[1], rel=0.02)
+    assert report["focal_px"] == pytest.approx(focal_length(WIDTH), rel=0.05)
+    assert report["agreement_degrees"] < 1
+    assert report["focal_rise"] > 0.05
+
+
+def test_pycolmap_and_kgs_read_the_same_scene(posed):
+    _, out, report, _ = posed
+    model, scene = pycolmap.Reconstruction(out / "sparse" / "0"), load_scene(out, points="model-points")
+    names = [*scene.train.names, *scene.test.names]
+    extrinsics = np.concatenate([views.cameras.extrinsics.numpy() for views in (scene.train, scene.test)])
+    for name, pose in zip(names, extrinsics, strict=True):
+        expected = model.find_image_with_name(name).cam_from_world().matrix()
+        offset = expected[:, :3] @ scene.offset.numpy()
+        np.testing.assert_allclose(pose[:3, :3], expected[:, :3], atol=1e-6)
+        np.testing.assert_allclose(pose[:3, 3], expected[:, 3] + offset, atol=1e-5)
+    camera = next(iter(model.cameras.values()))
+    assert (camera.width, camera.height) == scene.train.images.shape[:1:-1] == tuple(report["size"])
+    assert (camera.model_name, camera.params[0]) == ("SIMPLE_RADIAL", report["focal_px"])
+    assert len(model.points3D) == report["points"] > 50
+    assert all(point.track.length() >= 2 for point in model.points3D.values())
+    colors = np.array([point.color for point in model.points3D.values()])
+    assert colors.std(axis=0).min() > 5  # of the photos, not all black
+
+
+def test_points_project_to_where_the_photos_show_them(posed):
+    _, out, report, _ = posed
+    model, errors = pycolmap.Reconstruction(out / "sparse" / "0"), []
+    for image in model.images.values():
+        for point in image.get_observation_points2D():
+            errors.append(np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy))
+    assert np.mean(errors) == pytest.approx(report["reprojection_error_px"], rel=0.05)  # COLMAP's is over points
+    assert np.median(errors) < 0.5
+
+
+def test_a_model_that_was_not_written_whole_is_an_error(posed, tmp_path):
+    """COLMAP's writers do not look whether the disk took what they wrote."""
+    found = pycolmap.Reconstruction(posed[1] / "sparse" / "0")
+
+    class OnAFullDisk:
+        def write_binary(self, folder):
+            found.write_binary(folder)
+            data = (folder / cut).read_bytes()
+            (folder / cut).write_bytes(data[: len(data) // 2])
+
+        def extract_colors_for_all_images(self, images):
+            """They are there."""
+
+    for cut in ("points3D.bin", "images.bin", "cameras.bin"):
+        with pytest.raises(OSError, match="was not written whole"):
+            write_model(tmp_path / cut, SimpleNamespace(reconstruction=OnAFullDisk()), posed[1] / "images")
+
+
+def test_up_is_minus_y_and_the_median_depth_is_one(posed):
+    model = pycolmap.Reconstruction(posed[1] / "sparse" / "0")
+    rotations = np.array([image.cam_from_world().matrix()[:, :3] for image in model.images.values()])
+    up = -rotations[:, 1].sum(0)
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-9)
+    depths = []
+    for image in model.images.values():
+        row = image.cam_from_world().matrix()[2]
+        depths += [model.points3D[p.point3D_id].xyz @ row[:3] + row[3] for p in image.get_observation_points2D()]
+    assert np.median(depths) == pytest.approx(1)
+    assert min(depths) > 0
+
+
+def test_the_images_are_the_photos(posed):
+    for name, image in zip(NAMES, planes(), strict=True):
+        written = posed[1] / "images" / name
+        assert np.array_equal(cv2.imread(str(written)), image)
+        assert b"eXIf" not in written.read_bytes()
+
+
+def test_the_report_says_what_was_found(posed):
+    folder, out, report, lines = posed
+    written = json.loads((out / "photos.json").read_text())
+    assert written == {key: value for key, value in report.items() if key not in ("reused", "folder")}
+    assert (report["reused"], report["folder"]) == (False, str(out))
+    assert set(report["sha256"]) == set(report["photos"]) == set(NAMES)
+    assert {tuple(row[:2]) for row in report["matches"]} == {(a, b) for a in NAMES for b in NAMES if a < b}
+    assert min(row[2] for row in report["matches"]) > 50
+    assert report["versions"]["pycolmap"] == pycolmap.__version__
+    assert report["focal_35mm"] == pytest.approx(report["focal_px"] * 43.2666 / np.hypot(*report["size"]), rel=1e-4)
+    assert sorted(path.name for path in out.iterdir()) == [".lock", "images", "photos.json", "sparse"]
+    assert str(folder) not in (out / "photos.json").read_text()
+    assert any("3 photos" in line for line in lines)
+
+
+@pytest.mark.slow
+def test_the_same_photos_and_seed_give_the_same_files(posed, tmp_path):
+    folder, out, report, _ = posed
+    again = pose_photos(folder, tmp_path / "again")
+    for name in [
+        *(f"images/{name}" for name in NAMES),
+        *(f"sparse/0/{s}.bin" for s in ("cameras", "images", "points3D")),
+    ]:
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
+    different = {"seconds": None, "folder": None}
+    assert again | different == report | different
+
+
+def test_a_second_run_uses_what_is_there(posed, monkeypatch):
+    folder, out, _, _ = posed
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.*")}
+    lines = []
+    report = pose_photos(folder, out, say=lines.append)
+    assert report["reused"]
+    assert "used again" in lines[0]
+    assert {
+        path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".lock"
+    }.items() <= before.items()
+
+
+@pytest.mark.slow
+def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_path):
+    lines, folder = [], write_photos(tmp_path / "photos", close(1), film=30)
+    report = pose_photos(folder, tmp_path / "out", say=lines.append)
+    assert report["focal_px"] == report["exif_focal_px"] == pytest.approx(30 * WIDTH / 34.6, rel=1e-3)
+    assert report["focal_rise"] is None
+    assert any("the Exif says 208 pixels" in line for line in lines)
+
+
+@pytest.mark.slow
+def test_photos_that_tell_the_focal_length_are_believed_more_than_their_exif(tmp_path):
+    report = pose_photos(write_photos(tmp_path / "photos", planes(), film=40), tmp_path / "out", say=lambda line: None)
+    assert report["exif_focal_px"] > 1.3 * focal_length(WIDTH)
+    assert report["focal_px"] == pytest.approx(focal_length(WIDTH), rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strength", [0.03, -0.1])
+def test_the_distortion_of_the_lens_is_found(tmp_path, strength):
+    images = np.stack([distorted(image, strength) for image in planes()])
+    report = pose_photos(write_photos(tmp_path / "photos", images), tmp_path / "out", say=lambda line: None)
+    assert report["radial_distortion"] == pytest.approx(strength, abs=0.02)
+    assert report["focal_px"] == pytest.approx(focal_length(WIDTH), rel=0.05)
+
+
+def distorted(image: np.ndarray, strength: float) -> np.ndarray:
+    """What a lens shows of a pinhole's image that takes points at u to u (1 + strength |u|^2), u over focal length."""
+    height, width = image.shape[:2]
+    center, focal = np.array([width / 2 - 0.5, height / 2 - 0.5]), focal_length(width)
+    shown = (np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - center) / focal
+    straight = shown
+    for _ in range(30):
+        straight = shown / (1 + strength * np.sum(straight**2, axis=-1, keepdims=True))
+    places = (straight * focal + center).astype(np.float32)
+    return cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "views", "rotation"),
+    [("llff/fern", 3, 1.0), ("colmap/trex", 3, 1.0), ("nerfstudio/fox", 6, 1.5), ("nerfstudio/fox", 3, None)],
+)
+def test_real_photos_against_given_poses(tmp_path, kgs_data, name, views, rotation):
+    """Fox 3, photos 42 to 53 degrees apart, has to be refused: its reprojection error is small, and it is wrong."""
+    given = load_scene(kgs_data / name, views, photos=False).train
+    folder = next(path for path in (kgs_data / name / "images", kgs_data / name / "images_8") if path.is_dir())
+    (tmp_path / "photos").mkdir()
+    for view in given.names:
+        shutil.copy(folder / Path(view).name, tmp_path / "photos")
+    if rotation is None:
+        with pytest.raises(DataError, match="no cameras that can be trusted"):
+            pose_photos(tmp_path / "photos", tmp_path / "out")
+        return
+    pose_photos(tmp_path / "photos", tmp_path / "out")
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    found = {Path(image.name).stem: image.cam_from_world().matrix()[:, :3] for image in model.images.values()}
+    true = {
+        Path(n).stem: e[:3, :3].double().numpy() for n, e in zip(given.names, given.cameras.extrinsics, strict=True)
+    }
+    for a, b in combinations(sorted(true), 2):
+        assert degrees(found[b] @ found[a].T @ (true[b] @ true[a].T).T) < rotation

@@ -1,0 +1,96 @@
+"""What cameras write into photos: orientation, as OpenCV applies it, and focal length, by the rules of CIPA."""
+
+import io
+from functools import partial
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+from photo_folders import exif, planes, with_exif
+
+from kgs.app.console import silent
+from kgs.app.sfm.read import Exif, open_photos, read_photos
+from kgs.datasets.image_file import ImageFile
+
+JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_are_turned_as_opencv_turns_them(tmp_path, orientation):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(with_exif(JPEG, exif(orientation=orientation)))
+    (photo,) = read_photos(open_photos([path]), silent)
+    expected = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    assert photo.pixels.shape == expected.shape == ((240, 180, 3) if orientation > 4 else (180, 240, 3))
+    assert np.abs(photo.pixels.astype(int) - expected).mean() < 2  # two decoders
+
+
+def read_exif(folder, data):
+    path = folder / "photo"
+    path.write_bytes(data)
+    return Exif.of(ImageFile(path).metadata.tags)
+
+
+def saved(format, block):
+    """The photo as Pillow writes it with this metadata."""
+    file = io.BytesIO()
+    PIL.Image.fromarray(planes()[0][..., ::-1]).save(file, format, exif=b"Exif\0\0" + block)
+    return file.getvalue()
+
+
+def tiff(block):
+    """The photo in front of the tags of `block`, which stay where they are: in the first directory of the file."""
+    order = {"I": "<", "M": ">"}[chr(block[0])]
+    plain = io.BytesIO()
+    exif = PIL.Image.Exif()
+    exif.load(block)
+    exif.endian = order
+    PIL.Image.fromarray(planes()[0][..., ::-1]).save(plain, "TIFF", exif=exif)
+    return plain.getvalue()
+
+
+CONTAINERS = {
+    "jpeg": lambda block: with_exif(JPEG, block),
+    "png": partial(saved, "PNG"),
+    "webp": partial(saved, "WEBP"),
+    "tiff": tiff,
+}
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("order", "<>")
+def test_tags_are_found_in_every_container(tmp_path, container, order):
+    found = read_exif(tmp_path, CONTAINERS[container](exif(order, orientation=6, film=28)))
+    assert found == Exif(6, 28.0, None)
+    # CIPA DCG-001: the diagonal of the photo to that of the film
+    assert found.focal_ratio(3024, 4032) == pytest.approx(28 / np.hypot(36, 24) * np.hypot(3, 4) / 4)
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(1, (4000, 3000)), (6, (3000, 4000))])
+def test_a_focal_length_in_millimetres_counts_where_the_density_of_pixels_is_known(tmp_path, orientation, size):
+    # 5 mm on a sensor of 8 x 6 mm: 4000 pixels in 0.8 cm
+    block = exif(orientation=orientation, focal=5, density=5000, width=4000)
+    assert read_exif(tmp_path, with_exif(JPEG, block)).focal_ratio(*size) == pytest.approx(5 / 8)
+    assert read_exif(tmp_path, with_exif(JPEG, exif(focal=5))).focal_ratio(4000, 3000) is None
+
+
+def test_nothing_and_damage_are_no_metadata(tmp_path):
+    block = exif(orientation=6, film=28, focal=5, density=5000, width=4000)
+    whole = read_exif(tmp_path, with_exif(JPEG, block))
+    assert whole == Exif(6, 28.0, pytest.approx(5 / 8))
+    assert read_exif(tmp_path, JPEG) == read_exif(tmp_path, saved("PNG", b"")) == Exif()
+    assert read_exif(tmp_path, with_exif(JPEG, exif(orientation=9))) == Exif()
+    for cut in range(len(block)):
+        found = read_exif(tmp_path, with_exif(JPEG, block[:cut]))
+        assert found.orientation in (1, 6)
+        assert found.focal_35mm in (None, 28.0)
+        assert found.focal_over_width in (None, whole.focal_over_width)
+
+
+@pytest.mark.parametrize("value", [0, -3.0, float("nan"), float("inf"), "28", b"28", (), (0,), None, 10**400])
+def test_values_that_are_no_positive_number_count_as_missing(value):
+    found = Exif.of({0xA405: value, 0x0112: value})
+    assert found.orientation == 1
+    assert found.focal_35mm in (None, 28.0)
+    assert found.focal_ratio(4, 3) is None or found.focal_35mm == 28.0

@@ -1,0 +1,405 @@
+"""What a user's folder may hold instead of photos that fit together: what happened, and what to do, is said."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from init_point_scenes import cameras, texture
+from limits import limited
+from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
+
+from kgs.app.cli import main
+from kgs.app.cli.unposed import settle
+from kgs.app.console import silent
+from kgs.app.files.outputs import write_png
+from kgs.app.files.ownership import MARK
+from kgs.app.sfm import pose, pose_photos
+from kgs.app.sfm.find import find_photos, notes_on
+from kgs.app.sfm.place import photo_staging
+from kgs.app.sfm.read import blurred, open_photos, read_photos
+from kgs.errors import DataError
+from kgs.json_files import write_json
+
+pytest.importorskip("pycolmap")
+
+
+@pytest.fixture
+def refused(capsys):
+    """Runs `kgs fit` on a folder that is refused; the message. Nothing half-made is left behind."""
+
+    def run(folder, *parts, out=None, code=2, kept=False, options=()):
+        place = out or folder.parent / "out"
+        with pytest.raises(SystemExit) as stop:
+            main(["fit", str(folder), "-o", str(place), *options])
+        assert stop.value.code == code
+        assert kept or not [path.name for path in place.glob("*photos*")]
+        text = capsys.readouterr().err
+        assert "Traceback" not in text
+        for part in parts:
+            assert part in text, text
+        return text
+
+    return run
+
+
+def small(images):
+    return [cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA) for image in images]
+
+
+def save(folder, images, names=None):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in zip(names or [f"{i}.png" for i in range(len(images))], images, strict=True):
+        cv2.imwrite(str(folder / name), image)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "photos"
+    path.mkdir()
+    return path
+
+
+def test_no_folder(tmp_path, refused):
+    refused(tmp_path / "none", "expected a file or folder that is there, found none")
+
+
+def test_an_empty_folder(folder, refused):
+    (folder / "notes.txt").write_text("nothing")
+    refused(folder, "expected photos", ".jpg", "found none", "Take 3 to 12 photos")
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_photos(folder, count, refused):
+    save(folder, planes()[:count])
+    refused(folder, f"at least 3 photos, found {count}", "Take 3 to 12")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_a_link_to_a_photo_that_is_gone(folder, refused):
+    save(folder, small(planes()))
+    (folder / "3.png").symlink_to("gone.png")
+    refused(folder, "links to files that are not there: 3.png")
+
+
+def test_a_folder_one_level_too_deep(folder, refused):
+    save(folder / "DCIM", planes())
+    refused(folder, "these folders in it do: DCIM")
+
+
+def test_photos_of_a_kind_that_is_not_read(folder, refused):
+    save(folder, planes())
+    (folder / "raw.dng").write_bytes(b"II*\0")
+    refused(folder, "1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible")
+
+
+@pytest.mark.parametrize("heic", [True, False])
+def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
+    monkeypatch.setattr("kgs.datasets.folders.has_heic", lambda: heic)
+    save(folder, planes())
+    for name in ("0.DNG", "1.dng", "2.HEIC", "dynamic_mask_0.png"):
+        (folder / name).write_bytes(b"II*\0")
+    assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
+    said = " ".join(notes_on(folder))
+    for name in ("0.DNG", "1.dng", "2.HEIC", "dynamic_mask"):
+        assert name in said
+
+
+def test_what_names_the_cameras_of_a_folder_too_deep_is_told(folder, refused):
+    save(folder / "images", planes())
+    (folder / "transform_train.json").write_text("{}")
+    refused(folder, "these folders in it do: images", "transform_train.json is not used")
+
+
+def test_a_video_that_is_called_jpeg(folder, refused):
+    save(folder, planes())
+    (folder / "z.jpg").write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
+    refused(folder, "z.jpg: is a HEIC photo or a video", "sips")
+
+
+def test_videos(folder, refused):
+    (folder / "clip.MOV").write_bytes(b"\0\0\0\x14ftypqt  ")
+    refused(folder, "clip.MOV is a video", 'ffmpeg -i "clip.MOV"', "3 to 12 sharp ones")
+    refused(folder / "clip.MOV", "is a video", "ffmpeg")
+
+
+def test_one_photo_twice(folder, refused):
+    save(folder, [*planes(), planes()[1]])
+    refused(folder, "3.png: is the same photo as 1.png: remove one of them")
+
+
+@pytest.mark.slow
+def test_one_photo_twice_saved_anew(folder, refused):
+    save(folder, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"])
+    refused(folder, "1.png and 2.jpg match at the same pixels", "remove one of them")
+
+
+def test_upright_and_lying_photos(folder, refused):
+    save(folder, [*planes(), planes()[0].transpose(1, 0, 2)])
+    refused(folder, "2 (240x180: 0.png, 1.png, 2.png; 180x240: 3.png)", "all upright or all lying")
+
+
+def test_photos_of_several_shapes(folder, refused):
+    save(folder, [*planes(), planes()[0][:120]])
+    text = refused(folder, "expected photos of one shape, got 2", "240x120: 3.png", "Cropped")
+    assert "upright" not in text
+
+
+def test_photos_of_several_lenses(folder, refused):
+    for i, (image, film) in enumerate(zip(planes(), (26, 26, 13), strict=True)):
+        jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+        (folder / f"{i}.jpg").write_bytes(with_exif(jpeg, exif(film=film)))
+    refused(folder, "one focal length, got 2", "13 mm: 2.jpg", "26 mm: 0.jpg, 1.jpg", "without zoom")
+
+
+@pytest.mark.slow
+def test_photos_without_overlap(folder, refused):
+    save(folder, [texture(seed, (220.0, 220.0, 220.0), 120).astype(np.uint8) for seed in range(3)])
+    refused(folder, "no two of the 3 photos show enough of the same things", "smaller step", "Matches of each pair")
+
+
+@pytest.mark.slow
+def test_two_scenes_in_one_folder(folder, refused):
+    save(folder, small([*planes()[:2], *planes()[:2, :, ::-1]]))
+    text = refused(folder, "2 groups that do not overlap (1: 0.png, 1.png; 2: 2.png, 3.png)", "If they show two scenes")
+    rows = [line.split() for line in text.splitlines()[-4:]]
+    assert [row[:2] for row in rows] == [["1", "0.png"], ["2", "1.png"], ["3", "2.png"], ["4", "3.png"]]
+    assert int(rows[0][3]) == int(rows[1][2]) > 50  # a table is symmetric
+    assert max(int(rows[i][j]) for i in (0, 1) for j in (4, 5)) < 30
+    assert rows[3][5] == "."
+
+
+def test_a_camera_that_only_turned(folder, refused):
+    """Homographies of one plane, seen from one place: nothing tells the depth."""
+    wall, lens = (
+        texture(0, (220.0, 220.0, 220.0)).astype(np.uint8),
+        np.array([[220.0, 0, 120], [0, 220, 90], [0, 0, 1]]),
+    )
+    far = np.array([[220.0, 0, 450], [0, 220, 450], [0, 0, 1]])
+    turns = [cv2.Rodrigues(np.array([0.02 * i, 0.12 * i, 0.0]))[0] for i in range(3)]
+    save(folder, [cv2.warpPerspective(wall, lens @ turn @ np.linalg.inv(far), (240, 180)) for turn in turns])
+    refused(folder, "a camera that only turned on the spot, explains all matches", "step to the side", "Matches of")
+
+
+@pytest.mark.slow
+def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
+    message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
+    refused(write_photos(tmp_path / "photos", close(0.5)), *message)
+
+
+@pytest.mark.slow
+def test_walking_forward(tmp_path, refused):
+    images = planes(cameras(np.array([[0.02, 0.0, -0.2], [0.0, 0.02, 0.0], [-0.02, 0.0, 0.2]]), 0.01))
+    text = refused(write_photos(tmp_path / "photos", images), "step sideways, not forward", "Matches of each pair")
+    assert "places between" not in text
+
+
+def test_photos_that_would_be_shrunk_to_nothing(folder, refused):
+    """Told before their cameras are found."""
+    save(folder, [cv2.resize(image, (640, 480)) for image in planes()])
+    said = refused(folder, options=("--downscale", "40"))
+    assert said == "kgs: --downscale: expected 32 pixels or more of the longer side, got 16x12 of 640x480\n"
+
+
+def test_a_blurred_photo_is_told(folder):
+    images = planes()
+    images[1] = cv2.GaussianBlur(images[1], (0, 0), 2.0)
+    save(folder, images)
+    assert [photo.path.name for photo in blurred(read_photos(open_photos(sorted(folder.iterdir())), silent))] == [
+        "1.png"
+    ]
+
+
+@pytest.mark.slow
+def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
+    save(folder, [planes()[0], *(cv2.resize(image, (480, 360)) for image in planes()[1:])])
+    photos = read_photos(open_photos(sorted(folder.iterdir())), silent)
+    assert {photo.size for photo in photos} == {(240, 180)}
+    large = cv2.resize(planes()[0], (2400, 1800))
+    save(folder, [large, large[::-1], large[:, ::-1]])
+    assert {photo.size for photo in read_photos(open_photos(sorted(folder.iterdir())), silent)} == {(1600, 1200)}
+
+
+def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
+    write_planes(folder)
+    (tmp_path / "scene" / "sparse").mkdir(parents=True)
+    save(tmp_path / "other" / "images", planes())
+    for out, said in (
+        (folder, "the photos themselves"),
+        *((tmp_path / n, "kgs did not write") for n in ("scene", "other")),
+    ):
+        refused(folder, "choose another folder", out=out)
+        with pytest.raises(DataError, match=f"{said}.*: choose another folder"):
+            pose_photos(folder, out)
+
+
+@pytest.mark.parametrize("name", ["images", "finished-photos", "unfinished-photos", "finished", "unfinished", "sparse"])
+def test_a_users_own_folders_stay(folder, tmp_path, refused, name):
+    """Also such as hold what kgs does not read: HEIC photos, notes."""
+    mine = tmp_path / "project" / name / "deeper" / "IMG_1.HEIC"
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"mine")
+    refused(write_planes(folder), "choose another folder", out=tmp_path / "project", kept=True)
+    assert mine.read_bytes() == b"mine"
+
+
+def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
+    images = write_planes(tmp_path / "images")
+    refused(images, "choose another folder", out=tmp_path)
+    for path in images.iterdir():  # as renders of kgs are
+        write_png(path, torch.rand(3, 8, 8))
+    with pytest.raises(DataError, match="holds the photos themselves"):
+        pose_photos(images, tmp_path)
+    assert len(list(images.iterdir())) == 3
+
+
+def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
+    out = tmp_path / "project"
+    out.mkdir()
+    for name in ("checkpoint.safetensors", "checkpoint.previous.safetensors"):
+        (out / name).write_bytes(b"mine")
+        refused(write_planes(folder), f"{name}: was not written by kgs", out=out)
+        assert (out / name).read_bytes() == b"mine"
+        (out / name).unlink()
+
+
+def test_pycolmap_that_is_not_there(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(ModuleNotFoundError, match="pycolmap"):
+        pose_photos(write_planes(folder), folder.parent / "out")
+
+
+def test_a_move_that_was_stopped_is_ended(tmp_path):
+    """A kill between the renaming of the new folder and the last of its parts."""
+    staging = photo_staging(tmp_path)
+    staging.start()
+    (staging.unfinished / "sparse" / "0").mkdir(parents=True)
+    (staging.unfinished / "sparse" / "0" / "cameras.bin").touch()
+    save(tmp_path / "images", planes()[:1], ["old.png"])
+    save(staging.unfinished / "images", planes()[:1], ["new.png"])
+    write_json(staging.unfinished / "photos.json", {})
+    staging.seal()
+    staging.complete()
+    left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
+    assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0", "sparse/0/cameras.bin"]
+
+
+def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch):
+    """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
+    out, found = folder.parent / "out", []
+
+    def find(opened, new, *_):
+        paths = [photo.path for photo in opened]
+        found.append(len(paths))
+        (new / "images").mkdir()
+        (new / "sparse" / "0").mkdir(parents=True)
+        for path in paths:
+            (new / "images" / path.name).write_bytes(MARK)
+        for name in ("cameras", "images", "points3D"):
+            (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
+        return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}
+
+    def placed():
+        """How many photos the cameras in their place are of."""
+        return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
+
+    monkeypatch.setattr(pose, "find_cameras", find)
+    assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
+    assert placed() == (3, 3)
+    (out / "splat.ply").write_bytes(b"ply")
+    save(folder, planes()[:1, 20:], ["IMG_4.png"])
+    for reused in (False, True):
+        report = pose_photos(folder, out, wait=True)
+        assert (report["reused"], report["folder"]) == (reused, str(out / "finished-photos"))
+        assert len(report["photos"]) == 4
+        assert placed() == (3, 3)
+    settle(out)
+    assert placed() == (4, 4)
+    assert not (out / "finished-photos").exists()
+    (folder / "IMG_4.png").unlink()
+    assert pose_photos(folder, out, wait=True)["folder"] == str(out / "finished-photos")
+    save(folder, planes()[:1, 20:], ["IMG_4.png"])
+    assert pose_photos(folder, out, wait=True)["folder"] == str(out)  # those of the fit after all
+    assert not (out / "finished-photos").exists()
+    assert found == [3, 4, 3]
+    (folder / "IMG_4.png").unlink()
+    assert pose_photos(folder, out)["folder"] == str(out)
+    assert placed() == (3, 3)
+
+
+NOT_FOUND = "kgs: stopped: the cameras were not found yet, and nothing was written\n"
+
+
+@pytest.mark.parametrize("stage", ["pose.write_images", "pose.write_matches"])
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [(OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, NOT_FOUND)],
+)
+def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refused, stage, error, code, said):
+    def fail(*arguments):
+        raise error
+
+    monkeypatch.setattr(f"kgs.app.sfm.{stage}", fail)
+    refused(write_planes(folder), said, code=code)
+    assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
+
+
+@pytest.mark.parametrize("size", [250_000, pytest.param(600_000, marks=pytest.mark.slow)])
+def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
+    """The first of two, in this process; and the second, in another one that it aborts."""
+    with limited(size):
+        said = refused(write_planes(folder), code=1).splitlines()
+    assert said[-1].removesuffix("/work: File too large").removesuffix(": File too large") == (
+        f"kgs: {folder.parent}/out/unfinished-photos"
+    )
+    assert all(" of 3 " in line for line in said[:-1])  # how far the work was
+    assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
+    save(folder, [cv2.resize(image, (1600, 1200)) for image in planes()])
+    command = [
+        sys.executable,
+        "-c",
+        "import kgs.app.cli; kgs.app.cli.main()",
+        "fit",
+        str(folder),
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        lines = iter(process.stderr.readline, "")
+        assert any(line.startswith("keypoints: ") for line in lines)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        assert process.wait(20) == 130
+        said = list(lines)
+    assert said[-1] == NOT_FOUND
+    assert not [line for line in said[:-1] if " of 3 " not in line]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]
+
+
+def test_neither_solver_sees_what_alpha_hides(folder, tmp_path, monkeypatch):
+    shown = []
+
+    def look(aside, step, database, images="", names=(), **_):
+        shown.extend(cv2.imread(f"{images}/{name}", cv2.IMREAD_UNCHANGED) for name in names)
+        raise RuntimeError("that is enough")
+
+    monkeypatch.setattr(pose.Aside, "run", look)
+    images = planes()
+    alpha = np.full((*images.shape[:3], 1), 255, np.uint8)
+    alpha[:, :60] = 0
+    save(folder, np.concatenate([images, alpha], 3))
+    with pytest.raises(RuntimeError, match="that is enough"):
+        pose_photos(folder, tmp_path / "out")
+    assert len(shown) == len(images)
+    for seen, image in zip(shown, images, strict=True):
+        assert seen.shape[2] == 3
+        assert not seen[:60].any()
+        assert np.array_equal(seen[60:], image[60:])

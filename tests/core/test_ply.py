@@ -1,0 +1,328 @@
+"""Splats that are written: read back bit for bit, by others, at map coordinates, and never half."""
+
+import math
+import os
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from factories import pinhole, random_model, splat_columns
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from kgs import Densifier, GaussianRenderer
+from kgs.app.files.glb import save_glb
+from kgs.app.page.data import pack
+from kgs.datasets import Views
+from kgs.fit.prune import contributions
+from kgs.model import GaussianModel
+from kgs.ply import load_ply, save_ply
+
+
+def same(one, two):
+    return all(torch.equal(a.view(torch.int32), b.view(torch.int32)) for a, b in pairs(one, two))
+
+
+def pairs(one, two):
+    return zip(one.parameters(), two.parameters(), strict=True)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 6])
+def test_what_is_written_comes_back_bit_for_bit(tmp_path, degree, n):
+    model = random_model(n, degree)
+    model.sh_degree = degree // 2
+    save_ply(tmp_path / "a.ply", model)
+    again = load_ply(tmp_path / "a.ply")
+    assert same(model, again)
+    assert (again.max_sh_degree, again.sh_degree) == (degree, degree // 2)
+    save_ply(tmp_path / "b.ply", again)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    values=arrays.arrays(
+        np.float32, (3, 23), elements=st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=True)
+    )
+)
+def test_any_finite_float32_comes_back_bit_for_bit(tmp_path_factory, values):
+    path = tmp_path_factory.getbasetemp() / "any.ply"
+    table = torch.from_numpy(values)
+    model = GaussianModel(
+        means=table[:, :3],
+        quats=table[:, 3:7],
+        log_scales=table[:, 7:10],
+        opacity_logits=table[:, 10],
+        sh_dc=table[:, None, 11:14],
+        sh_rest=table[:, 14:].reshape(3, 3, 3),
+    )
+    save_ply(path, model)
+    assert same(model, load_ply(path))
+
+
+def test_trimesh_reads_all_columns(tmp_path):
+    model = random_model(5)
+    save_ply(tmp_path / "a.ply", model)
+    raw = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+    read = {name: np.asarray(raw[name]).reshape(-1) for name in splat_columns(3)}
+    assert len(read) == 62
+    expected = {name: model.means[:, i] for i, name in enumerate("xyz")}
+    expected |= {name: torch.zeros(5) for name in ("nx", "ny", "nz")}
+    expected |= {f"f_dc_{c}": model.sh_dc[:, 0, c] for c in range(3)}
+    expected |= {f"f_rest_{15 * c + k}": model.sh_rest[:, k, c] for c in range(3) for k in range(15)}
+    expected |= {"opacity": model.opacity_logits}
+    expected |= {f"scale_{i}": model.log_scales[:, i] for i in range(3)}
+    expected |= {f"rot_{i}": model.quats[:, i] for i in range(4)}
+    for name, values in expected.items():
+        assert read[name].dtype == np.float32
+        assert np.array_equal(read[name], values.detach().numpy()), name
+
+
+def test_header_is_that_of_3d_gaussian_splatting(tmp_path):
+    save_ply(tmp_path / "a.ply", random_model(n=4, sh_degree=1))
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    expected = ["ply", "format binary_little_endian 1.0", "element vertex 4"]  # their viewer counts the lines
+    expected += [f"property float {name}" for name in splat_columns(1)]
+    lines = head.decode().splitlines()
+    assert lines[: len(expected)] == expected
+    assert all(line.startswith("comment ") for line in lines[len(expected) :])
+    assert len(body) == 4 * 26 * 4
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_of_a_higher_degree_are_zeros_in_the_file(tmp_path, degree):
+    model = random_model(4, degree)
+    model.sh_degree = degree // 2
+    save_ply(tmp_path / "a.ply", model, sh_degree=3)
+    again = load_ply(tmp_path / "a.ply")
+    assert again.sh_degree == degree // 2
+    assert torch.equal(again.sh_rest[:, : model.sh_rest.shape[1]], model.sh_rest)
+    assert not again.sh_rest[:, model.sh_rest.shape[1] :].any()
+    # as the viewer of 3D Gaussian Splatting reads it: the count from the third line, then 62 floats a Gaussian
+    with open(tmp_path / "a.ply", "rb") as file:
+        count = int([file.readline() for _ in range(3)][2].split()[2])
+        while file.readline() != b"end_header\n":
+            pass
+        rows = np.fromfile(file, "<f4").reshape(count, 62)
+    np.testing.assert_array_equal(rows[:, :3], model.means.detach())
+    np.testing.assert_array_equal(rows[:, 54], model.opacity_logits.detach())
+    np.testing.assert_array_equal(rows[:, 58:], model.quats.detach())
+
+
+@pytest.mark.parametrize("degree", [0, 4, -1, 3.0])
+def test_a_degree_below_that_of_the_model_or_above_3_is_refused(tmp_path, degree):
+    with pytest.raises(ValueError, match="sh_degree: expected"):
+        save_ply(tmp_path / "a.ply", random_model(sh_degree=1), sh_degree=degree)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_an_antialiased_model_is_tagged_as_other_programs_do(tmp_path, antialiased):
+    model = random_model()
+    model.antialiased = antialiased
+    save_ply(tmp_path / "a.ply", model)
+    head = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0]
+    assert (b"\ncomment SplatRenderMode: mip\n" in head) == antialiased  # the spelling of Brush and splat-transform
+    assert load_ply(tmp_path / "a.ply").antialiased == antialiased
+
+
+UTM = torch.tensor([448262.127, 5411932.678, 118.5], dtype=torch.float64)  # metres, in zone 31
+
+
+def small_model(n=40, dtype=torch.float32):
+    """A splat before a camera at the origin, with Gaussians of some centimetres."""
+    model = random_model(n, dtype=dtype)
+    with torch.no_grad():
+        model.means.mul_(0.3).add_(torch.tensor([0.0, 0.0, 3.0]))
+        model.log_scales.mul_(0.3).sub_(3.0)
+    return model
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_scene_at_map_coordinates_comes_back_where_it_was(tmp_path, dtype):
+    model = small_model(dtype=dtype)
+    save_ply(tmp_path / "a.ply", model, UTM)
+    again = load_ply(tmp_path / "a.ply", origin=UTM)
+    # 1e-9 is what float64 leaves of a metre at 5e6 metres
+    torch.testing.assert_close(again.means.double(), model.means.double(), rtol=1e-7, atol=2e-9)
+    render, camera = GaussianRenderer(), pinhole(40, 48, 50.0, dtype=torch.float32)
+    with torch.no_grad():
+        before, after = (render(m.float()(), camera).image for m in (model, again))
+    assert before.amax() > 0.5
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
+
+
+def test_others_read_the_doubles(tmp_path):
+    model = small_model()
+    save_ply(tmp_path / "a.ply", model, UTM)
+    expected = model.means.detach().double() + UTM
+    raw = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+    for i, name in enumerate("xyz"):
+        assert raw[name].dtype == np.float64
+        assert np.array_equal(np.asarray(raw[name]).reshape(-1), expected[:, i].numpy())
+    assert np.array_equal(np.asarray(raw["rot_3"]).reshape(-1), model.quats[:, 3].detach().numpy())
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    assert [line for line in head.decode().splitlines() if line.startswith("property double")] == [
+        f"property double {name}" for name in "xyz"
+    ]
+    rows = np.frombuffer(body, [(name, "<f8" if name in "xyz" else "<f4") for name in splat_columns(3)])
+    assert np.array_equal(rows["y"], expected[:, 1].numpy())
+
+
+def test_a_float64_model_that_is_at_map_coordinates_itself_keeps_them(tmp_path):
+    model = small_model(dtype=torch.float64)
+    with torch.no_grad():
+        model.means.add_(UTM)
+    save_ply(tmp_path / "a.ply", model)
+    near = load_ply(tmp_path / "a.ply", origin=UTM).means.double() + UTM
+    torch.testing.assert_close(near, model.means.detach(), rtol=0, atol=1e-6)
+
+
+def test_reading_without_an_origin_warns_where_float32_is_too_coarse(tmp_path, recwarn):
+    save_ply(tmp_path / "a.ply", small_model(), UTM)
+    load_ply(tmp_path / "a.ply", origin=UTM)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"pass an origin= near them, \(448262, 5411933, 12[12]\)"):
+        load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("offset", [[1.5, -3.0, 0.1], [0.0, 0.0, 0.0]])
+def test_a_usual_offset_keeps_the_layout_that_viewers_expect(tmp_path, offset):
+    model, offset = small_model(), torch.tensor(offset, dtype=torch.float64)
+    save_ply(tmp_path / "a.ply", model, offset)
+    assert b"property float x\n" in (tmp_path / "a.ply").read_bytes()
+    again = load_ply(tmp_path / "a.ply")
+    assert torch.equal(again.means, (model.means.detach().double() + offset).float())
+    assert torch.equal(again.quats, model.quats)
+
+
+def test_other_than_three_finite_numbers_are_no_offset_and_no_origin(tmp_path):
+    save_ply(tmp_path / "a.ply", random_model())
+    for call, name in (
+        (lambda x: save_ply(tmp_path / "a.ply", random_model(), x), "offset"),
+        (lambda x: load_ply(tmp_path / "a.ply", x), "origin"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name}: expected shape \(3,\), got \(1, 3\)"):
+            call(torch.zeros(1, 3))
+        with pytest.raises(ValueError, match=f"{name}: expected finite numbers"):
+            call(torch.tensor([0.0, math.nan, 0.0]))
+
+
+def test_a_float64_model_is_rounded_once(tmp_path):
+    model = random_model(dtype=torch.float64)
+    save_ply(tmp_path / "a.ply", model)
+    assert same(load_ply(tmp_path / "a.ply"), model.float())
+
+
+def test_values_that_float32_cannot_hold_are_not_written(tmp_path):
+    for value in (math.nan, math.inf, 1e300):
+        model = random_model(dtype=torch.float64)
+        with torch.no_grad():
+            model.sh_rest[1, 2, 0] = value
+        with pytest.raises(ValueError, match="finite in float32, got others in f_rest_2"):
+            save_ply(tmp_path / "a.ply", model)
+    assert not list(tmp_path.iterdir())
+
+
+DISC = torch.tensor([-1.0, -2.0, -math.inf])  # scales of a flat disc: its third axis has no extent
+
+
+def test_flat_discs_come_back(tmp_path):
+    model = random_model()
+    with torch.no_grad():
+        model.log_scales[2] = DISC
+        model.log_scales[4] = -math.inf
+    save_ply(tmp_path / "a.ply", model)
+    assert same(model, load_ply(tmp_path / "a.ply"))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degrees", [0.0, 50.0, 90.0])
+def test_a_flat_disc_has_the_footprint_of_an_ellipse(tmp_path, each_backend, degrees, antialiased):
+    model = random_model(1, 0)
+    angle = math.radians(degrees)
+    with torch.no_grad():
+        model.means.copy_(torch.tensor([[0.0, 0.0, 2.0]]))
+        model.quats.copy_(torch.tensor([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]]))  # about x
+        model.log_scales.copy_(DISC)
+    save_ply(tmp_path / "a.ply", model)
+    model = load_ply(tmp_path / "a.ply")
+    renderer = GaussianRenderer(antialiased=antialiased)
+    render = renderer(model(), pinhole(40, 48, 50.0, dtype=torch.float32))
+    widths = [25.0 * math.exp(-1.0), 25.0 * math.exp(-2.0) * math.cos(angle)]  # pixels: a metre is 25 at 2 metres
+    conics = torch.tensor([[1.0 / (widths[0] ** 2 + 0.3), 0.0, 1.0 / (widths[1] ** 2 + 0.3)]])
+    torch.testing.assert_close(render.projected.conics, conics, rtol=1e-4, atol=1e-6)
+    render.image.sum().backward()
+    assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters() if parameter.grad is not None)
+
+
+def test_what_takes_a_splat_takes_flat_discs(tmp_path):
+    model = small_model()
+    with torch.no_grad():
+        model.log_scales[::2] = DISC
+        model.log_scales[1] = -math.inf
+    camera = pinhole(40, 48, 50.0, dtype=torch.float32)
+    views = Views(camera, torch.rand(1, 3, 40, 48), ("0.png",))
+    save_glb(tmp_path / "a.glb", model, torch.eye(3))
+    assert pack(model(), camera, most_bytes=10**6).layout["count"] == len(model)
+    weights = contributions(model, views, near_plane=0.01)
+    assert weights.isfinite().all()
+    assert weights[2] > 0
+    densifier = Densifier(model, torch.optim.Adam(model.parameters()), extent=10.0, grad_threshold=0.0)
+    render = GaussianRenderer()(model(), camera)
+    render.image.sum().backward()
+    densifier.observe(render.projected)
+    report = densifier.step()
+    assert report.cloned > 0
+    assert report.split > 0
+    assert all(not bool(parameter.isnan().any()) for parameter in model.parameters())
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    save_ply(path, random_model(seed=1))
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_ply(path, random_model(seed=2))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_the_file_behind_a_link_is_written_and_the_link_stays(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "link.ply").symlink_to(tmp_path / "far" / "a.ply")
+    for seed in (1, 2):
+        save_ply(tmp_path / "link.ply", random_model(seed=seed))
+        assert (tmp_path / "link.ply").is_symlink()
+        assert same(load_ply(tmp_path / "far" / "a.ply"), random_model(seed=seed))
+    assert [entry.name for entry in (tmp_path / "far").iterdir()] == ["a.ply"]
+
+
+def test_a_name_as_long_as_the_file_system_allows(tmp_path):
+    path = tmp_path / ("n" * 251 + ".ply")
+    save_ply(path, random_model())
+    assert same(load_ply(path), random_model())
+
+
+def test_default_device_and_default_dtype_do_not_reach_the_file(tmp_path):
+    model = random_model()
+    save_ply(tmp_path / "a.ply", model, torch.ones(3))
+    try:
+        torch.set_default_device("meta")  # stands for an accelerator
+        torch.set_default_dtype(torch.float64)
+        save_ply(tmp_path / "b.ply", model, torch.ones(3, device="cpu"))
+        again = load_ply(tmp_path / "b.ply", origin=torch.ones(3, device="cpu"))
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert again.means.device.type == "cpu"
+    assert again.means.dtype == torch.float32

@@ -1,0 +1,102 @@
+"""A photo's file is opened once and its pixels are decoded once, on every path that reads photos."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_folders import planes, write_photos
+from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
+
+from kgs.app.sfm import pose, pose_photos
+from kgs.datasets import image_file, load_scene
+from kgs.errors import DataError
+
+IMAGES = {".png", ".jpg"}
+
+_watched: list[Counter[str]] = []
+
+
+def _watch(event: str, arguments: tuple[object, ...]) -> None:
+    if event == "open" and _watched and isinstance(arguments[0], str | bytes | Path):
+        _watched[-1][os.fsdecode(arguments[0])] += 1
+
+
+sys.addaudithook(_watch)  # cannot be removed; does nothing while nobody counts
+
+
+@pytest.fixture
+def opened() -> Iterator[Counter[str]]:
+    """How often each file was opened, by its path, from the first line of a test that empties it."""
+    _watched.append(Counter())
+    yield _watched[-1]
+    _watched.pop()
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The bytes of each image that was decoded."""
+    sizes: list[int] = []
+    real = image_file._decode
+
+    def decode(kind: str, data: bytes) -> np.ndarray:
+        sizes.append(len(data))
+        return real(kind, data)
+
+    monkeypatch.setattr(image_file, "_decode", decode)
+    return sizes
+
+
+def images(opened: Counter[str]) -> dict[str, int]:
+    return {name: count for name, count in opened.items() if Path(name).suffix in IMAGES}
+
+
+WRITERS = pytest.mark.parametrize("write", [write_llff, write_colmap, write_blender, write_nerfstudio])
+
+
+@WRITERS
+@pytest.mark.parametrize("downscale", [None, 2])  # 2: the training views in full size, too, for initial points
+def test_a_scene(
+    tmp_path: Path, write: Callable[[Path], None], downscale: int | None, opened: Counter[str], decoded: list[int]
+) -> None:
+    write(tmp_path)
+    opened.clear()
+    scene = load_scene(tmp_path, downscale=downscale)
+    count = len(scene.train) + len(scene.test)
+    assert (scene.finer is None) == (downscale is None)
+    assert len(images(opened)) == len(decoded) == count
+    assert set(images(opened).values()) == {1}
+
+
+@WRITERS
+def test_a_scene_without_its_photos(
+    tmp_path: Path, write: Callable[[Path], None], opened: Counter[str], decoded: list[int]
+) -> None:
+    write(tmp_path)
+    opened.clear()
+    load_scene(tmp_path, photos=False)
+    assert set(images(opened).values()) == {1}
+    assert decoded == []
+
+
+def test_unposed_photos(
+    tmp_path: Path, opened: Counter[str], decoded: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pycolmap")
+    folder = write_photos(tmp_path / "photos", planes())
+
+    def stop(*_: object) -> None:
+        raise DataError(folder, "", "stopped behind the decoding")
+
+    monkeypatch.setattr(pose, "write_matches", stop)
+    opened.clear()
+    with pytest.raises(DataError, match="stopped"):
+        pose_photos(folder, tmp_path / "out")
+    jpegs = {Path(name).name: count for name, count in opened.items() if name.endswith(".jpg")}
+    assert jpegs == {"IMG_1.jpg": 1, "IMG_2.jpg": 1, "IMG_3.jpg": 1}
+    assert len(decoded) == 3

@@ -1,0 +1,157 @@
+"""Tiny valid scenes, one in each layout, and tiny valid files: what reader tests begin with.
+
+A scene has three photos of 16 x 12 pixels and, in a COLMAP model, two points.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+import torch
+
+from kgs.fit.config import FitConfig
+from kgs.json_files import write_json
+from kgs.metrics import lpips
+from kgs.metrics.lpips import Lpips
+from kgs.model import GaussianModel
+from kgs.ply import save_ply
+
+__all__ = ["narrow_lpips", "write_blender", "write_colmap", "write_llff", "write_nerfstudio", "write_photos"]
+__all__ += ["write_config", "write_image", "write_lpips", "write_ply"]
+
+_SIZE = (16, 12)
+_NAMES = ("0.png", "1.png", "2.png")
+_TURN = (0.998, 0.02, -0.05, 0.03)  # of the second photo, w x y z, not of unit length
+_OPENCV = (14.0, 14.5, 8.2, 6.1, -0.05, 0.01, 0.001, -0.001)
+_RADIAL = (14.0, 8.0, 6.0, -0.02)
+
+
+def write_photos(folder: Path, channels: int = 3) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(0).integers(0, 255, (len(_NAMES), *_SIZE[::-1], channels), np.uint8)
+    for name, image in zip(_NAMES, noise, strict=True):
+        cv2.imwrite(str(folder / name), image)
+
+
+def write_llff(root: Path) -> None:
+    rows = np.tile(np.array([0, 1, 0, 0, 12, 1, 0, 0, 0, 16, 0, 0, -1, 0, 14, 1, 9], dtype=float), (3, 1))
+    rows[:, 3] = (0, 0.5, 1)
+    np.save(root / "poses_bounds.npy", rows)
+    write_photos(root / "images")
+
+
+def write_colmap(root: Path, text: bool = False) -> None:
+    """Two lenses, three photos, two points; as COLMAP writes them."""
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True)
+    write_photos(root / "images")
+    cameras = {1: ("OPENCV", 4, _OPENCV), 2: ("SIMPLE_RADIAL", 2, _RADIAL)}
+    poses = [
+        ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        (_TURN, (0.5, 0.0, 0.1)),
+        ((-1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ]
+    images = [(i + 1, quat, shift, 1 + i % 2, _NAMES[i]) for i, (quat, shift) in enumerate(poses)]
+    points = [(7, (0.1, 0.2, 5.0), (255, 0, 51), (1, 0, 2, 0, 3, 0)), (8, (0.3, -0.2, 6.0), (1, 2, 3), (2, 1, 3, 1))]
+    if text:
+        lens = [f"{i} {name} 16 12 {_words(numbers)}" for i, (name, _, numbers) in cameras.items()]
+        pose = [
+            f"{i} {_words(q)} {_words(t)} {camera} {name}\n3.5 4.5 7 5.5 6.5 -1" for i, q, t, camera, name in images
+        ]
+        dots = [f"{i} {_words(xyz)} {_words(rgb)} 0.5 {_words(track)}" for i, xyz, rgb, track in points]
+        for stem, lines in (("cameras", lens), ("images", pose), ("points3D", dots)):
+            (folder / f"{stem}.txt").write_text("\n".join([f"# {stem}", *lines, ""]))
+        return
+    data = struct.pack("<Q", 2)
+    for i, (_, model, numbers) in cameras.items():
+        data += struct.pack(f"<IiQQ{len(numbers)}d", i, model, 16, 12, *numbers)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", 3)
+    for i, quat, shift, camera, name in images:
+        data += struct.pack("<I7dI", i, *quat, *shift, camera) + name.encode() + b"\0"
+        data += struct.pack("<Qddqddq", 2, 3.5, 4.5, 7, 5.5, 6.5, -1)
+    (folder / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", 2)
+    for i, xyz, rgb, track in points:
+        data += struct.pack(f"<Q3d3BdQ{len(track)}I", i, *xyz, *rgb, 0.5, len(track) // 2, *track)
+    (folder / "points3D.bin").write_bytes(data)
+
+
+def _words(numbers: tuple[float, ...]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def _matrix(i: int) -> list[list[float]]:
+    """Camera-to-world, turned a little about y and moved along x."""
+    c, s = math.cos(0.1 * i), math.sin(0.1 * i)
+    return [[c, 0.0, s, 0.5 * i], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, 4.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def write_blender(root: Path) -> None:
+    for split in ("train", "test"):
+        write_photos(root / split, channels=4)
+        frames = [{"file_path": f"./{split}/{i}", "transform_matrix": _matrix(i)} for i in range(3)]
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+
+
+def write_nerfstudio(root: Path) -> None:
+    write_photos(root / "images")
+    lens: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "fl_x": 14.0,
+        "fl_y": 14.5,
+        "cx": 8.2,
+        "cy": 6.1,
+        "w": 16,
+        "h": 12,
+    }
+    frames: list[dict[str, Any]] = [{"file_path": f"images/{i}.png", "transform_matrix": _matrix(i)} for i in range(3)]
+    frames[1] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
+    (root / "transforms.json").write_text(json.dumps({**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001, "frames": frames}))
+
+
+def write_image(folder: Path, suffix: str, channels: int = 3) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (12, 16, channels), np.uint8)
+    cv2.imwrite(str(folder / f"image.{suffix}"), noise)
+
+
+def write_ply(folder: Path, text: bool = False) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points, colors = torch.rand(2, 5, 3, generator=generator)
+    path = folder / "splat.ply"
+    save_ply(path, GaussianModel.from_points(points, colors, sh_degree=1))
+    if text:
+        head, body = path.read_bytes().split(b"end_header\n")
+        header = head.decode().splitlines()
+        comments = [line for line in header if line.startswith("comment")]  # most programs write them first
+        elements = [line for line in header[2:] if line not in comments]
+        rows = [" ".join(map(repr, row)) for row in np.frombuffer(body, "<f4").reshape(5, -1).tolist()]
+        lines = ["ply", "format ascii 1.0", *comments, *elements, "end_header", *rows]
+        path.write_text("".join(f"{line}\n" for line in lines))
+
+
+def write_config(folder: Path) -> None:
+    request = {"scene": "/photos/fern", "train_views": 3, "downscale": 8.0, "background": "black", "points": "none"}
+    write_json(folder / "config.json", {"request": request, "fit": FitConfig().to_dict()})
+
+
+def write_lpips(folder: Path) -> None:
+    with torch.device("meta"), narrow_lpips():
+        shapes = {name: tuple(value.shape) for name, value in Lpips().state_dict().items()}
+    features = {name: np.zeros(shape, np.float16) for name, shape in shapes.items() if name.startswith("features")}
+    heads = {name: np.linspace(0, 1, shape[0], dtype=np.float32) for name, shape in shapes.items() if "lin" in name}
+    np.savez_compressed(folder / "vgg16_features.npz", **features)  # type: ignore[arg-type]  # numpy's stubs
+    np.savez(folder / "lpips_lin_vgg16.npz", **heads)  # type: ignore[arg-type]
+
+
+def narrow_lpips() -> AbstractContextManager[object]:
+    """Within it the network of LPIPS is narrow: its files are read in milliseconds."""
+    return mock.patch.object(lpips, "BLOCKS", ((4, 4), (6, 6), (8, 8, 8), (8, 8, 8), (8, 8, 8)))
