@@ -15,7 +15,6 @@ from photo_folders import close, exif, planes, with_exif, write_photos, write_pl
 
 from kgs.app.cli import main
 from kgs.app.cli.unposed import settle
-from kgs.app.console import silent
 from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import MARK
 from kgs.app.sfm import pose, pose_photos
@@ -24,6 +23,7 @@ from kgs.app.sfm.place import photo_staging
 from kgs.app.sfm.read import blurred, open_photos, read_photos
 from kgs.errors import DataError
 from kgs.json_files import write_json
+from kgs.progress import silent
 
 pytest.importorskip("pycolmap")
 
