@@ -117,7 +117,7 @@ def test_row_slices_change_nothing(kernel_backend, run, width):
         sliced = run(projected, features, certain, max_bytes=max_bytes)
         assert all(torch.equal(a, b) for a, b in zip(sliced[0], whole[0], strict=True))
         assert_close(sliced, whole, certain, 2e-6)
-    with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 3000 for it"):
+    with pytest.raises(ValueError, match="^max_bytes:"):
         composite(projected, features, options=RasterOptions(max_bytes=3000), backend=kernel_backend)
 
 

@@ -102,9 +102,3 @@ def test_the_densifier_says_what_is_missing():
     densifier = kgs.Densifier(model, torch.optim.Adam(model.parameters()), 1.0, absgrad=True)
     with pytest.raises(ValueError, match="means2d.absgrad, got None: the render needs absgrad=True"):
         densifier.observe(out.projected)
-
-
-@pytest.mark.parametrize("value", [1, None, "yes"])
-def test_it_is_true_or_false(value):
-    with pytest.raises(ValueError, match="absgrad: expected True or False"):
-        kgs.RasterOptions(absgrad=value)

@@ -50,7 +50,7 @@ def test_several_cameras_in_row_slices():
     for max_bytes in (2**30, 2**13):
         got = run(projected, features, torch.ones(()), **exact, max_bytes=max_bytes)
         assert_close(got, expected, torch.ones(()))
-    with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 500 for it"):
+    with pytest.raises(ValueError, match="^max_bytes:"):
         composite(projected, features, options=RasterOptions(max_bytes=500), backend="triton")
 
 

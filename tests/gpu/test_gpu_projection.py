@@ -130,7 +130,7 @@ def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
     lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), cameras.extrinsics)
     got, expected = (project(gaussians, lens, backend=backend) for backend in ("triton", "torch"))
     assert torch.equal(got.means2d, expected.means2d)
-    with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
+    with pytest.raises(ValueError, match="^extrinsics:"):
         project(gaussians, with_camera(cameras, extrinsics=flat), backend="triton")
     assert len(handed_over) == 2
     assert len(project(gaussians[:0], cameras, backend="triton")) == 0
