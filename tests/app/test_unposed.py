@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
-from kgs import cli, sfm
+from kgs.app import cli, sfm
 from kgs.app.cli.unposed import is_unposed
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
