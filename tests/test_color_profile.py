@@ -14,7 +14,7 @@ import pytest
 from PIL import ImageCms
 
 from kgs.datasets.image_file import read_image
-from kgs.io.console import silent
+from kgs.progress import silent
 from kgs.sfm.read import open_photos, read_photos
 
 # The primaries of Display P3 adapted to D50 (SMPTE EG 432-1, Bradford), and their linear light in that of sRGB.

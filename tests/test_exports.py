@@ -16,12 +16,15 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
+from kgs.app.files import exports
 from kgs.cli.render import render
-from kgs.fit import exports
+from kgs.datasets import Scene
+from kgs.fit import Fit
 from kgs.io import film
 from kgs.io.cameras import camera_list, upright
 from kgs.io.outputs import EXPORTS, film_in
 from kgs.io.ownership import is_own
+from kgs.io.staging import Staging
 from kgs.json_files import write_json
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
@@ -52,7 +55,6 @@ def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:
     """With the reader of the reference viewers in mind: pixel = f R^T (x - position) + the middle."""
     views, offset = random_views(3), torch.tensor([1e6, 2e6, -5.0]).double()
     write_json(tmp_path / "cameras.json", camera_list([views.select([2, 0]), views.select([1])], offset, POINTS))
-    assert is_own(tmp_path / "cameras.json")
     listed = json.loads((tmp_path / "cameras.json").read_text())
     assert [(each["id"], each["img_name"]) for each in listed] == [
         (0, views.names[2]),
@@ -86,52 +88,47 @@ def test_upright() -> None:
         torch.testing.assert_close(found @ found.T, torch.eye(3).double())
 
 
-def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-
-    class Fitted:
-        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
-        shown, notes = random_model(), list[str]()
-
-        def note(self, text: str) -> None:
-            self.notes.append(text)
-
-        def render(self, camera: PinholeCamera) -> torch.Tensor:
-            return torch.zeros(1, 3, int(camera.height), int(camera.width))
-
+@pytest.fixture
+def fit(monkeypatch: Any) -> Fit:
+    """A fit whose film has three frames."""
     monkeypatch.setattr(film, "FRAMES", 3)
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    none = torch.zeros(0, 3)
+    origin = torch.zeros(3, dtype=torch.float64)
+    scene = Scene(random_views(2), random_views(1), none, none, "none", origin, torch.zeros(3), Path())
+    return Fit(scene, random_model(), kgs.RasterOptions())
+
+
+def test_the_film_that_cannot_be_is_a_note(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert exports.write_exports(fit, tmp_path) == []
     assert {path.name for path in tmp_path.iterdir()} == set(EXPORTS) - {"turntable.mp4"}
-    assert all(is_own(path) for path in tmp_path.iterdir())
     assert film_in(tmp_path) == tmp_path / "turntable.webm"
     (tmp_path / "turntable.webm").unlink()
     assert film_in(tmp_path) is None
     monkeypatch.setattr(exports, "write_film", lambda *_: "no turntable.webm: a reason")
     monkeypatch.setenv("KGS_H264", "libx264")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    assert Fitted.notes == [
+    assert exports.write_exports(fit, tmp_path) == [
         "no turntable.webm: a reason",
         "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)",
     ]
 
 
-def test_one_film_takes_the_place_of_the_other(tmp_path: Path, monkeypatch: Any) -> None:
-    class Fitted:
-        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
-        shown = random_model()
-
-        def render(self, camera: PinholeCamera) -> torch.Tensor:
-            return torch.zeros(1, 3, int(camera.height), int(camera.width))
-
+def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
     pytest.importorskip("av")
-    monkeypatch.setattr(film, "FRAMES", 3)
+    staging = Staging(tmp_path)
+
+    def publish() -> list[str]:
+        staging.start()
+        exports.write_exports(fit, staging.unfinished)
+        staging.seal()
+        staging.complete()
+        return sorted(path.name for path in tmp_path.glob("turntable.*"))
+
+    assert publish() == ["turntable.webm"]
     monkeypatch.setenv("KGS_H264", "libx264")
-    (tmp_path / "turntable.webm").write_bytes(b"made by kgs")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    assert [path.name for path in tmp_path.glob("turntable.*")] == ["turntable.mp4"]
-    assert is_own(tmp_path / "turntable.mp4")
+    assert publish() == ["turntable.mp4"]
     (tmp_path / "turntable.webm").write_bytes(b"mine")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert publish() == ["turntable.mp4", "turntable.webm"]
     assert (tmp_path / "turntable.webm").read_bytes() == b"mine"
 
 
@@ -144,8 +141,9 @@ def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_
     kgs.save_ply(tmp_path / "splat.ply", model)
     render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "clear", background="transparent")
     render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "opaque", background=background)
-    names = sorted(path.name for path in (tmp_path / "opaque").iterdir())
-    assert names == sorted(path.name for path in (tmp_path / "clear").iterdir())
+    names = sorted(path.name for path in (tmp_path / "opaque").glob("*.png"))
+    assert names == sorted(path.name for path in (tmp_path / "clear").glob("*.png"))
+    assert len(names) == 6
     for name in names:
         clear = cv2.imread(str(tmp_path / "clear" / name), cv2.IMREAD_UNCHANGED).astype(float)
         opaque = cv2.imread(str(tmp_path / "opaque" / name)).astype(float)

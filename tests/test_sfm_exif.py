@@ -10,7 +10,7 @@ import pytest
 from photo_folders import exif, planes, with_exif
 
 from kgs.datasets.image_file import ImageFile
-from kgs.io.console import silent
+from kgs.progress import silent
 from kgs.sfm.read import Exif, open_photos, read_photos
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()

@@ -10,7 +10,7 @@ from photo_folders import write_planes
 from kgs.datasets import folders
 from kgs.datasets.image_file import is_heic
 from kgs.errors import DataError
-from kgs.io.console import silent
+from kgs.progress import silent
 from kgs.sfm.find import find_photos, list_photos, notes_on
 from kgs.sfm.read import open_photos, read_photos
 

@@ -27,12 +27,12 @@ def evaluate(
     from kgs.app.saved_fit import load_fit
     from kgs.io.ownership import is_own, record
     from kgs.json_files import write_json
-    from kgs.machine import check_packages
+    from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
     from kgs.page.fit_page import PAGE, write_own_page
 
-    check_packages("jinja2")
+    check_tools(device, backend, "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from kgs.init_points import InitialPoints, initial_points
 
     from .fit import Fit
-    from .measure import measure
+    from .measures import measure
     from .plan import Plan, make_plan
     from .run import choose_points, fit_scene
     from .trainer import Trainer
@@ -49,7 +49,7 @@ _MODULES = {
     "Fit": "kgs.fit.fit",
     "choose_points": "kgs.fit.run",
     "fit_scene": "kgs.fit.run",
-    "measure": "kgs.fit.measure",
+    "measure": "kgs.fit.measures",
 }
 
 
