@@ -13,6 +13,7 @@ from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import folders
 from kgs.datasets.image_file import is_heic
 from kgs.errors import DataError
+from kgs.progress import silent
 
 pi_heif = pytest.importorskip("pi_heif")
 
