@@ -9,7 +9,6 @@ import PIL.Image
 import pytest
 from photo_folders import exif, planes, with_exif
 
-from kgs.app.console import silent
 from kgs.app.sfm.read import Exif, open_photos, read_photos
 from kgs.datasets.image_file import ImageFile
 from kgs.progress import silent

@@ -15,7 +15,6 @@ from photo_folders import close, exif, planes, with_exif, write_photos, write_pl
 
 from kgs.app.cli import main
 from kgs.app.cli.unposed import settle
-from kgs.app.console import silent
 from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import record
 from kgs.app.sfm import pose, pose_photos

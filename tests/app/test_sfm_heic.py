@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from photo_folders import write_planes
 
-from kgs.app.console import silent
 from kgs.app.sfm.find import find_photos, list_photos, notes_on
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import folders

@@ -13,7 +13,6 @@ import PIL.Image
 import pytest
 from PIL import ImageCms
 
-from kgs.app.console import silent
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets.image_file import read_image
 from kgs.progress import silent
