@@ -45,7 +45,7 @@ def test_fields_are_those_of_a_scene_without_first_points(scene):
 
 @pytest.mark.parametrize("kind", ["room", pytest.param("orbit", marks=pytest.mark.slow)])
 def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
-    first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (3, 3, 4))
+    first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (0, 0, 1))
     for split in ("train", "test"):
         a, b, c = (getattr(x, split) for x in (first, again, other))
         assert torch.equal(a.images, b.images)
@@ -138,7 +138,7 @@ def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
     """Near and far things move differently by many pixels between neighbours, and some of the scene is hidden."""
     depths = synthetic_depths(scene.train.cameras)
     step = torch.linalg.norm(_centers(scene.train.cameras.extrinsics).diff(dim=0), dim=1).min()
-    assert step * scene.train.cameras.fx[0] * (1 / depths.amin() - 1 / depths.amax()) > 15
+    assert step * scene.train.cameras.fx[0] * (1 / depths.amin() - 1 / depths.amax()) > 0.09 * 112  # pixels
     _, seen, _ = _photo_error(scene.train, 0, scene.train, 1)
     assert 0.6 < seen.double().mean() < 0.95
 

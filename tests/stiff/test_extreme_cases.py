@@ -18,6 +18,7 @@ from kgs.bench.scenes import Scene
 pytestmark = pytest.mark.usefixtures("each_backend")
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_every_scene_has_its_line() -> None:
     assert [case["case"] for case in cases()] == list(SCENES)
 
@@ -50,6 +51,7 @@ def test_every_bound_is_met(case: dict[str, object], dtype: str) -> None:
     assert math.isfinite(row["gradient"])
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_files_lines_and_a_missed_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -69,6 +71,7 @@ def test_files_lines_and_a_missed_bound(
     assert extremes(out=tmp_path / "new") == 0
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_an_error_that_is_not_a_number_misses_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoilt(*args: object, **options: object) -> object:
         image, gradients = render(*args, **options)
