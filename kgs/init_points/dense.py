@@ -11,18 +11,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.geometry import ViewGeometry
 from kgs.progress import Stage, silent
 
 from .agreement import agreed_points, average_depths
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
 SCORE = 0.35  # least matching score of a point's patch; noise has scores of up to 0.3 along a smooth surface
-MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000  # of one view, and of all views together
+MOST_PIXELS = 250_000  # of one view
+MOST_PIXELS_OF_ALL = 1_600_000  # of all views together
 SKY = 2.0  # times the depth where the scene ends: points beyond are those of a sky
 PER_SKY = 2  # points of the scene for each of a sky, at least
 SMALLEST = 64  # side of an image that is not halved just to need fewer planes
 # How many points where no number is given: one for so many pixels with an agreed depth, between two limits.
-PIXELS_OF_A_POINT, FEWEST, MOST = 3, 30_000, 60_000
+PIXELS_OF_A_POINT = 3
+FEWEST = 30_000
+MOST = 60_000
 
 
 def dense_points(
@@ -50,22 +54,23 @@ def dense_points(
     together, and move by no more pixels than a sweep has planes.
     """
     pixels = pixels or views.images[:, 0].numel()
-    while (size := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * size > MOST_PIXELS_OF_ALL:
+    while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
         views = views.halved()
     while planes_wanted(views, near, far) > MOST_PLANES and min(views.images.shape[-2:]) >= 2 * SMALLEST:
         views = views.halved()
     maps = sweep_depths(views, near, far, stage, backend, to_infinity=True)
-    certain = [there.is_inner & (there.scores > SCORE) for there in maps]
-    if (usable := views.usable) is not None:
-        certain = [good & there for good, there in zip(certain, usable.cpu(), strict=True)]
-    maps = average_depths(views, maps, certain)
-    found = [_agreed(views, maps, certain, view) for view in range(len(views))]
-    points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
+    certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
+    if views.usable is not None:
+        certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]
+    geometry = ViewGeometry.of(views.cameras)
+    maps = average_depths(geometry, maps, certain)
+    parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
+    points, colors, places = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
         count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), MOST)
     view, x, y = places.unbind(1)
-    is_sky = torch.stack([there.depths for there in maps])[view, y, x] > SKY * far
+    is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
     chosen = torch.randperm(len(points), generator=generator)
     chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     chosen = chosen[_with_less_sky(is_sky[chosen])]
@@ -81,8 +86,9 @@ def _with_less_sky(is_sky: Tensor) -> Tensor:
 
 def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
     """The rows of the first place `(view, x, y)` in each of at most `count` square cells, as small as that allows."""
-    first, across = np.arange(len(places)), places.max(initial=0) + 1
-    least, most = 1.0, float(across)  # side of a cell, in pixels; found by bisection
+    first = np.arange(len(places))
+    across = places.max(initial=0) + 1
+    least, most = 1.0, float(across)  # limits of a cell's side in pixels, for bisection
     while len(first) > count or (len(places) > count and most - least > 1e-3):
         side = 0.5 * (least + most)
         columns, rows = (places[:, 1:] / side).astype(np.int64).T
@@ -93,9 +99,11 @@ def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
     return torch.from_numpy(np.sort(first))[:count]
 
 
-def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor, Tensor]:
+def _agreed(
+    views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
-    points, pixels = agreed_points(views, maps, certain, view)
+    points, pixels = agreed_points(geometry, maps, certain, view)
     columns, rows = pixels.unbind(1)
     places = torch.stack([torch.full_like(rows, view), columns, rows], 1)
     return points, views.images[view].cpu()[:, rows, columns].mT, places

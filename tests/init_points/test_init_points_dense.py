@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
-from kgs.geometry import camera_centers, nearest_pixels, project_points
+from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
 from kgs.init_points import _sweep_range, initial_points
 from kgs.init_points.agreement import AGREEMENT
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, _with_less_sky, dense_points
@@ -124,12 +124,12 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
     extrinsics[:, 0, 3] = -places
     first = views.camera(0)
     camera = PinholeCamera(first.intrinsics.repeat(n, 1, 1), extrinsics, first.height.repeat(n), first.width.repeat(n))
-    line = Views(camera, views.images[:1].repeat(n, 1, 1, 1), tuple(f"{k}.png" for k in range(n)))
+    line = ViewGeometry.of(camera)
     assert sorted(_neighbours(line, 0, 3.0)) == [3, 4, 5, 6]
     assert _neighbours(line, 7, 3.0)[0] == 6
 
 
-def test_awarp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
+def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
     image = torch.rand(20, 30, generator=generator())
     homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], [0.002, -0.003, 1.0]], dtype=torch.float64)
     rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
@@ -144,11 +144,11 @@ def test_awarp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
 
 
 def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:
-    near_camera = (
-        torch.linalg.inv(views.camera(0).extrinsics.double())[0] @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
-    )
+    geometry = ViewGeometry.of(views.cameras)
+    near_camera = torch.linalg.inv(geometry.extrinsics[0]) @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
     scene = torch.tensor([[0.0, 0.0, 4.0], [0.2, 0.1, 6.0]], dtype=torch.float64)
-    assert _sweep_range(torch.cat([scene, near_camera[None, :3]]), views) == _sweep_range(scene, views)
+    more = torch.cat([scene, near_camera[None, :3]])
+    assert _sweep_range(*geometry.project(more), geometry) == _sweep_range(*geometry.project(scene), geometry)
 
 
 def test_views_from_one_place_have_no_depth(views: Views) -> None:
