@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from factories import random_model, with_camera
+from factories import with_camera
 from init_point_scenes import flat
 
 import kgs
+from kgs.app.fit_folder import fit_folder
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Scene
 from kgs.errors import DataError
-from kgs.fit import FitConfig, fit_scene
+from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
 from kgs.init_points import initial_points
 
@@ -119,15 +121,11 @@ def test_points_in_another_frame_end_a_fit_before_it_begins(
     scene: Scene, tmp_path: Path, shift: tuple[float, float, float], in_front: int
 ) -> None:
     config = write_cloud(tmp_path / "cloud.ply", shift)
-    former = tmp_path / "out" / "splat.ply"
-    former.parent.mkdir()
-    kgs.save_ply(former, random_model())
-    content = former.read_bytes()
+    out = tmp_path / "out"
     message = f"cloud.ply: initial points: .* got none of 40, of which {in_front} lie before a camera"
     with pytest.raises(DataError, match=message):
-        fit_scene(scene, config, tmp_path / "out")
-    assert former.read_bytes() == content
-    assert [path.name for path in former.parent.iterdir() if path.suffix] == ["splat.ply"]
+        fit_folder(scene, config, out, SceneRequest("somewhere"))
+    assert not any(path.suffix for path in out.iterdir())
 
 
 def test_views_that_show_no_initial_point_are_named(scene: Scene, tmp_path: Path, recwarn: Any) -> None:
