@@ -164,7 +164,7 @@ class DropGaussian(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
-        if self._generator is not None:  # as bytes, which can be pickled for spawned processes too
+        if self._generator is not None:  # as bytes: neither generators nor temporary tensors reach a spawned process
             state["_generator"] = (self._generator.device, bytes(self._generator.get_state().tolist()))
         return state
 

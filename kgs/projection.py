@@ -64,7 +64,7 @@ def view_directions(means: Tensor, extrinsics: Tensor, parallel: bool = False) -
     """
     inverse = _inverse(extrinsics[:3, :3])
     offsets = inverse[:, 2].expand_as(means) if parallel else means + times(inverse, extrinsics[:3, 3])
-    offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # the squares of 1e20 would overflow
+    offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # else the squares of 1e20 overflow
     unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return unit
 

@@ -236,7 +236,7 @@ class ProjectedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Composited:
-    """The sums over layers, before background and normalisation."""
+    """Sums over layers, before background and normalisation."""
 
     features: Tensor  # sum of w times features, (C, F, H, W)
     transmittance: Tensor  # T behind the last layer, (C, 1, H, W)

@@ -116,7 +116,7 @@ def photometric_loss(
     return loss
 
 
-@torch.inference_mode(False)  # else a training step could not save what is made in inference mode
+@torch.inference_mode(False)  # autograd could not save tensors made in inference mode
 @torch.no_grad()
 def target_moments(target: Tensor) -> TargetMoments:
     """The part of the SSIM that depends only on the target, for :func:`photometric_loss`; it carries no gradient.

@@ -17,7 +17,7 @@ from .arguments import check_words, refuse
 from .meta import Pairs, absgrad_hook, joined
 from .scenes import Scene, batch_shape, split
 
-_FAR = 1e10  # gsplat's default far plane: no plane at all
+_FAR = 1e10  # gsplat's default far plane, which means none
 
 
 def rasterization(  # noqa: D417 - arguments without effect are described together

@@ -25,7 +25,7 @@ KINDS = ("dense", "sift", "random", "file")
 DRAWS = ("uniform", "spread")
 MIN_DENSE = 1000
 MIN_SIFT = 20  # a fit from fewer SIFT points is worse than one from random points
-MAX_SPACING = 4.0  # of a point to its neighbours, in medians over all points; beyond that it is isolated
+MAX_SPACING = 4.0  # a point is isolated if its distance to its neighbours is larger than this times the median
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ def initial_points(
         kind: "dense": points of depth maps that at least two views agree on, drawn at random; if they are fewer than
             1000, "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated with the given
             poses; if they are fewer than 20, "random" with a warning. "random": spread evenly over the space that at
-            least two of the views see (one, if there is only one), in the images' mean colours there, at the depths of
-            the SIFT points or else where the cameras look. "file": the points of a 3DGS PLY file, or of a cloud or
-            mesh that trimesh reads, up to 1 GiB.
+            least two of the views see (one, if there is only one), in the images' mean colours there; its depths are
+            those of the SIFT points, or follow from the cameras. "file": the points of a 3DGS PLY file, or of a cloud
+            or mesh that trimesh reads, up to 1 GiB.
         seed: of the random draws.
         count: how many points "random" gives, and "dense" at most; >= 1. None: of "dense" one for every 3 pixels with
             an agreed depth, 30 000 at least and 60 000 at most; of "random" 30 000.
@@ -76,7 +76,7 @@ def initial_points(
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world
             coordinates.
-        stage: shows the progress: :func:`kgs.app.console.each`, or nothing.
+        stage: displays the progress: :func:`kgs.app.console.each`, or nothing.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
         draw: how "dense" points are drawn: "uniform", or "spread" evenly over the images.
 

@@ -1,8 +1,8 @@
 """Dense initial points: points of the training views' depth maps on which two views agree.
 
-The sweep goes on to infinity, where the sky is: without points there a fit paints the sky with Gaussians among the
-things in front of it, which are fog for cameras beside the photos'. They are a minority of the points, so that the
-median of all depths stays that of the scene.
+The sweep reaches infinity, where the sky is: without points there, a fit paints the sky with Gaussians near the scene,
+which fog the view of cameras beside the photos'. Points of the sky are a minority, so that the median of all depths
+stays that of the scene.
 """
 
 import numpy as np
@@ -17,13 +17,13 @@ from kgs.progress import Stage, silent
 from .agreement import agreed_points, average_depths
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
-SCORE = 0.35  # least matching score of a point's patch; noise has scores of up to 0.3 along a smooth surface
+SCORE = 0.35  # the least matching score of a point; noise reaches 0.3 along a smooth surface
 MOST_PIXELS = 250_000  # of one view
 MOST_PIXELS_OF_ALL = 1_600_000  # of all views together
-SKY = 2.0  # times the depth where the scene ends: points beyond are those of a sky
-PER_SKY = 2  # points of the scene for each of a sky, at least
-SMALLEST = 64  # side of an image that is not halved just to need fewer planes
-# How many points where no number is given: one for so many pixels with an agreed depth, between two limits.
+SKY = 2.0  # points farther than this times the scene's largest depth belong to the sky
+PER_SKY = 2  # the least number of points of the scene for each point of the sky
+SMALLEST = 64  # pixels, the least side of an image that was halved to need fewer planes
+# The number of points for a count of None: one for so many pixels with an agreed depth, between two limits.
 PIXELS_OF_A_POINT = 3
 FEWEST = 30_000
 MOST = 60_000
@@ -42,9 +42,9 @@ def dense_points(
 ) -> tuple[Tensor, Tensor, int]:
     """At most `count` points on which two views agree, drawn at random.
 
-    The scene lies between the depths `near` and `far`; what is farther gets points, too.
+    The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
 
-    Returns the points and RGB, both `(P, 3)`, and from how many they were drawn, those of the sky not counted.
+    Returns the points and RGB, both `(P, 3)`, and the number of agreed points without those of the sky.
 
     A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
     `MOST`, in images that have together `pixels` pixels, or those of the views.
@@ -78,7 +78,7 @@ def dense_points(
 
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:
-    """The rows of all points but those of the sky, and of so many of these that there are `PER_SKY` others for each."""
+    """The rows of all points of the scene, and of the first points of the sky: one for each `PER_SKY` of the scene."""
     most = int((~is_sky).sum()) // PER_SKY
     rows: Tensor = (~is_sky | (is_sky.cumsum(0) <= most)).nonzero()[:, 0]
     return rows

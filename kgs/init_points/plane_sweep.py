@@ -20,14 +20,14 @@ from .sweep_costs import sweep_costs
 PLANES = 128  # fewest planes; above, one plane for each pixel by which an image moves
 MOST_PLANES = 256
 MOST_TO_INFINITY = 384  # planes of a sweep to infinity: these bound its memory
-NEIGHBOURS = 4  # at most
-BASELINE = 0.15  # of a neighbour, in units of the depth: shorter gives vague depths, longer more occlusion
-FARTHEST = 100.0  # what a sweep to infinity finds there is placed at so many times the depth where other sweeps end
+NEIGHBOURS = 4  # the most views that a view is compared with
+BASELINE = 0.15  # the best distance of a neighbour, over the depth: shorter is less precise, longer more occluded
+FARTHEST = 100.0  # the largest depth of a sweep to infinity, in units of `far`
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What is known of each pixel of one view, `(H, W)`."""
+    """Depths and scores of the pixels of one view, `(H, W)`."""
 
     depths: Tensor  # z in the camera's frame (OpenCV axes), in world units; pixels have integer centres
     scores: Tensor  # how well the patch matches there, from -1 to 1

@@ -1,6 +1,6 @@
 """PSNR of held-out views, separately where at least two training views show the scene and elsewhere.
 
-A single training view does not determine depth, and what no view shows is a guess: a mean over all pixels says little.
+A single training view does not determine depth, and what no view shows is guessed: a mean over all pixels says little.
 """
 
 import math
@@ -18,7 +18,7 @@ from kgs.geometry import nearest_pixels, project_points, unproject
 Draw = Callable[[PinholeCamera], Tensor]
 
 MIN_VIEWS = 2  # training views that show a point
-OCCLUDED = 1.05  # a point farther than this times a training view's depth is hidden from that view
+OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
 
 
 @torch.no_grad()
@@ -53,8 +53,9 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
         errors = (image - test.images[view].cpu().to(image)).square().mean(dim=0)
         shares.append(float(covered.float().mean()))
         for name, where in (("psnr", covered), ("psnr_rest", ~covered)):
-            if where.any() and errors[where].mean() > 0:
-                levels[name].append(-10 * math.log10(float(errors[where].mean())))
+            error = float(errors[where].mean()) if where.any() else 0.0
+            if error > 0:
+                levels[name].append(-10 * math.log10(error))
     means: dict[str, Any] = {name: round(fmean(values), 4) if values else None for name, values in levels.items()}
     return {"share": round(fmean(shares), 4), **means}
 

@@ -46,9 +46,9 @@ def generator(seed: int = 0) -> torch.Generator:
 
 @pytest.mark.slow
 def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
-    for view, found in enumerate(sweep_depths(views, *span)):
-        accepted = found.is_inner & (found.scores > 0.6)
-        errors = (found.depths / truth[view] - 1).abs()
+    for view, depth_map in enumerate(sweep_depths(views, *span)):
+        accepted = depth_map.is_inner & (depth_map.scores > 0.6)
+        errors = (depth_map.depths / truth[view] - 1).abs()
         assert float(accepted.double().mean()) > 0.6
         assert float(errors[accepted].median()) < 0.01
         assert float((errors[accepted] < 0.02).double().mean()) > 0.7
@@ -155,13 +155,13 @@ def test_views_from_one_place_have_no_depth(views: Views) -> None:
     camera = views.camera(0)
     both = [torch.cat([x, x]) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)]
     twice = Views(PinholeCamera(*both), views.images[[0, 0]], ("a.png", "b.png"))
-    assert all(not found.is_inner.any() for found in sweep_depths(twice, 1.0, 10.0))
+    assert all(not depth_map.is_inner.any() for depth_map in sweep_depths(twice, 1.0, 10.0))
 
 
 def test_dense_is_a_kind_of_first_points(views: Views) -> None:
-    found = initial_points(views, "dense")
-    assert found.kind == "dense"
-    assert 1000 <= len(found.points) <= 10_000
+    result = initial_points(views, "dense")
+    assert result.kind == "dense"
+    assert 1000 <= len(result.points) <= 10_000
 
 
 def test_smoothing_keeps_edges_and_repairs_holes() -> None:
@@ -173,8 +173,8 @@ def test_smoothing_keeps_edges_and_repairs_holes() -> None:
     cost = (torch.arange(planes)[:, None, None] - truth).abs().clamp(max=5).float() / 5
     silent = torch.rand(height, width, generator=generator()) < 0.33
     cost = torch.where(silent, 0.5, cost)
-    found = _semi_global(cost, grey).argmin(0)
-    assert float((found == truth).double().mean()) > 0.99
+    result = _semi_global(cost, grey).argmin(0)
+    assert float((result == truth).double().mean()) > 0.99
     assert float((torch.where(silent, 0.5, cost).argmin(0) == truth).double().mean()) < 0.75
 
 
@@ -218,9 +218,9 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
 
 @pytest.mark.parametrize("draw", [pytest.param("uniform", marks=pytest.mark.slow), "spread"])
 def test_few_points_are_enough_where_many_agree(draw: str) -> None:
-    found = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
-    assert found.kind == "dense"
-    assert 450 <= len(found.points) <= 500
+    result = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
+    assert result.kind == "dense"
+    assert 450 <= len(result.points) <= 500
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])

@@ -104,9 +104,9 @@ def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     points, colors = torch.randn(40, 3, generator=generator), torch.rand(40, 3, generator=generator)
     kgs.save_ply(tmp_path / "splat.ply", kgs.GaussianModel.from_points(points, colors, sh_degree=2))
-    found = initial_points(flat(), "file", file=tmp_path / "splat.ply")
-    assert torch.equal(found.points, points)
-    assert torch.allclose(found.colors, colors, atol=1e-6)
+    result = initial_points(flat(), "file", file=tmp_path / "splat.ply")
+    assert torch.equal(result.points, points)
+    assert torch.allclose(result.colors, colors, atol=1e-6)
 
 
 def write_cloud(path: Path, shift: tuple[float, float, float]) -> FitConfig:
@@ -145,8 +145,8 @@ def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
     origin = np.array([432_100.25, 5_400_000.5, 120.0])
     rows = "\n".join(" ".join(f"{x:.4f}" for x in row) for row in local + origin)
     (tmp_path / "cloud.xyz").write_text(rows)
-    found = initial_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
-    np.testing.assert_allclose(found.points.numpy(), local, atol=1e-5)
+    result = initial_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
+    np.testing.assert_allclose(result.points.numpy(), local, atol=1e-5)
 
 
 def test_a_file_whose_vertices_have_another_name_has_no_points(tmp_path: Path) -> None:
