@@ -185,7 +185,9 @@ class DropGaussian(nn.Module):
 
 def _is_seed(value: Any) -> bool:
     """Whether `torch.Generator.manual_seed` takes a value; True and False are no seeds."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and -(2**63) <= int(value) < 2**64
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        return False
+    return -(2**63) <= int(value) < 2**64
 
 
 def _fraction(name: str, value: Any, closed: bool = False) -> float:
