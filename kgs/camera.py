@@ -6,7 +6,7 @@ as in gsplat, it is therefore evaluated at a point clamped to 15 % of the image 
 models without a wide-angle mapping only). The gradient follows the clamp exactly, that of the lens its limits too.
 
 A distorted lens sees only up to the angle where the radius in the image stops growing: what lies beyond this fold of
-the radial polynomial is not drawn.
+the radial polynomial is not rendered.
 """
 
 import math

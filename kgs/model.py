@@ -153,7 +153,7 @@ class GaussianModel(nn.Module):
         colors: Tensor = self.sh_dc
         if self.sh_degree > 0:  # at degree 0 sh_rest gets no gradient, and an optimiser skips it
             colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
-        # A Gaussian whose scale overflows is not drawn. The gradient of exp would be 0 times infinity there.
+        # A Gaussian whose scale overflows is not rendered. The gradient of exp would be 0 times infinity there.
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
         return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)

@@ -60,7 +60,7 @@ def render(
         background: None (black), `(3,)`, `(1, 3)` or `(1, 3, H, W)`.
         alpha_threshold: smaller alphas are skipped; 0 skips none.
         transmittance_stop: transmittance below this counts as 0; the layer that crosses it still counts.
-        near_plane: only centres with z > near_plane are drawn; world units.
+        near_plane: only centres with z > near_plane are rendered; world units.
         eps2d: variance in px^2 added to each footprint; with 0 no footprint may be flat.
 
     Returns:

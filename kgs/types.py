@@ -122,7 +122,7 @@ def raster_options(options: RasterOptions | None, fields: Mapping[str, Any]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """A set of N Gaussians with activated values: what the renderer draws.
+    """A set of N Gaussians with activated values: the input of the renderer.
 
     Convention:
         World coordinates; a quaternion turns local axes into those of the world, the columns of R are local axes.
@@ -134,7 +134,7 @@ class Gaussians:
         scales: standard deviations along the local axes in world units, > 0, shape `(N, 3)`.
         opacities: shape `(N,)`, or `(C, N)` for one value per camera. In [0, 1], or above 1 after `DropGaussian`.
         colors: spherical harmonics `(N, K, 3)` with K = 1, 4, 9 or 16 (degree 0 to 3); or features `(N, D)` that are
-            drawn as they are, RGB for D = 3.
+            rendered as they are, RGB for D = 3.
 
     Raises:
         TypeError: a field is not a tensor, is not float32 or float64, or differs in dtype or device from `means`.

@@ -109,7 +109,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
             :func:`kgs.covariance.half_axes`.
         return_normals: `meta["normals"]` are the sums of w times normal, `(..., C, H, W, 3)`; the normal is the third
             local axis, turned towards the camera, in world axes.
-        extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, drawn into `meta["render_extra_signals"]`.
+        extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, rendered into `meta["render_extra_signals"]`.
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
         backend: "auto", "torch", or in float32 "numba" (on a CPU) or "triton" (on a GPU), see `kgs.backends`.
 

@@ -5,7 +5,7 @@ from typing import Any
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 LENSES = ("pinhole", "fisheye", "ortho")
 RAY_DEPTH_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
-_FROM_3D = "kgs draws footprints in the image, not Gaussians in space"
+_FROM_3D = "kgs renders footprints in the image, not Gaussians in space"
 _LENS = "for distorted lenses use kgs.PosedCamera and kgs.GaussianRenderer"
 
 # The unsupported arguments: the default, which changes nothing, and the reason why others are refused.

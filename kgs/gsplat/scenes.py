@@ -119,15 +119,15 @@ def split(
             bands_from_centres = bands
             bands = None
         if bands is None:
-            drawn = torch.cat([means[b, :, :0], *(features[name][b] for name in shared)], 1)
+            gaussian_colors = torch.cat([means[b, :, :0], *(features[name][b] for name in shared)], 1)
             widths = {name: features[name].shape[-1] for name in shared}
         else:
-            drawn = bands
+            gaussian_colors = bands
             widths = {"image": 3}
         unchecked = list(others.values())  # `project` checks the Gaussians' colours alone
         if bands_from_centres is not None:
             unchecked.append(bands_from_centres.flatten(1))
-        gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], unchecked), drawn)
+        gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], unchecked), gaussian_colors)
         cameras = _cameras(viewmats[b], intrinsics[b], size, lens, pixel_centers)
         scenes.append(Scene(gaussians, cameras, widths, others, bands_from_centres))
     return scenes

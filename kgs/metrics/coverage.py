@@ -15,14 +15,14 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.geometry import nearest_pixels, project_points, unproject
 
-Draw = Callable[[PinholeCamera], Tensor]
+RenderView = Callable[[PinholeCamera], Tensor]
 
 MIN_VIEWS = 2  # training views that show a point
 OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
 
 
 @torch.no_grad()
-def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str, float | None] | None:
+def measure_coverage(scene: Scene, render: RenderView, median_depth: RenderView) -> dict[str, float | None] | None:
     """PSNR of the test views, separately for pixels that at least `MIN_VIEWS` training views show and for the rest.
 
     Convention:
