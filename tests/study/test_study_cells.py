@@ -180,6 +180,7 @@ def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
     assert [(config.drop, config.sh_degree) for config in configs] == [(usual, 2), (0.0, 2)]
 
 
+@pytest.mark.slow
 def test_a_scene_on_the_disk_and_its_own_points(folder):
     cell = tiny_cell(start="scene") | {"scene": folder.name, "views": 4, "downscale": 2.0}
     result = sparse_cell(cell, data=str(folder.parent))
