@@ -23,7 +23,7 @@ from kgs.errors import DataError, printable
 from kgs.fit.checkpoint import previous
 from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
-from kgs.fit.measure import measure
+from kgs.fit.measures import measure
 from kgs.fit.plan import expected_memory, make_plan, most_gaussians
 from kgs.fit.probes import decide
 from kgs.fit.prune import prune

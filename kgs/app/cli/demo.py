@@ -78,7 +78,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     from kgs.app.files.staging import Staging
     from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
-    from kgs.fit.measure import measure
+    from kgs.fit.measures import measure
     from kgs.fit.plan import make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
