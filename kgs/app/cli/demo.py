@@ -44,10 +44,10 @@ def demo(
     """
     from kgs.app.files.outputs import check_folder
     from kgs.datasets import synthetic_scene
-    from kgs.machine import check_packages
+    from kgs.machine import check_tools
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    check_packages("matplotlib", "jinja2")
+    check_tools(device, backend, "matplotlib", "jinja2")
     check_folder(out, _files())
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
