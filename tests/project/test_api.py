@@ -155,7 +155,7 @@ SIGNATURES = {
     "kgs.fit.Trainer.resume": {"scene": ..., "config": ..., "path": ...},
     "kgs.fit.choose_points": {"scene": ..., "config": ...},
     "kgs.fit.fit_scene": {"scene": ..., "config": None},
-    "kgs.fit.measures": {"fit": ..., "lpips": None},
+    "kgs.fit.measure": {"fit": ..., "lpips": None},
     "kgs.reference.render": {
         "gaussians": ...,
         "camera": ...,
