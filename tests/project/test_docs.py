@@ -197,6 +197,13 @@ def test_its_links_lead_somewhere(path):
     assert not missing
 
 
+@pytest.mark.parametrize("path", LINKING, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_its_lists_begin_below_an_empty_line(path):
+    """Else the site runs their items together in one paragraph."""
+    text = re.sub(r"^```.*?^```", "", text_of(path), flags=re.M | re.S)
+    assert not re.findall(r"^(?![-*] |\d+\. |[ #|]).+\n(?:[-*]|\d+\.) .*$", text, re.M)
+
+
 def test_links_are_found():
     text = "![a](b.png) [c\nd](e.md#f) `[g](h)` [i](https://j.k) <img alt='' src=\"l.png\">\n\n```\n[m](n)\n```\n"
     assert links(text) == ["b.png", "e.md#f", "l.png"]
