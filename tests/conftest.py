@@ -1,9 +1,9 @@
-"""What every test may rely on."""
+"""Fixtures for all tests, their order, and settings."""
 
+import functools
 import json
 import os
 import signal
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,38 +17,29 @@ from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  
 
 from kgs import backends
 from kgs.app.files import film
-from kgs.datasets import synthetic_scene
+from kgs.datasets import synthetic, synthetic_scene
 from kgs.init_points import InitialPoints
 
 if not torch.cuda.is_available():  # before kernels are imported
     os.environ.setdefault("TRITON_INTERPRET", "1")
-if "PYTEST_XDIST_WORKER" in os.environ:  # pytest -n: a core each, also for the processes that tests start
+if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each worker, and for the processes that its tests start
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
-
-
-if "XDG_CACHE_HOME" not in os.environ:  # what kgs measures of this machine is kept, but not in the user's folder
-    os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "kgs-tests-cache")
 
 settings.register_profile("kgs", deadline=None)  # another program may take the core
 settings.load_profile("kgs")
 
-# What pytest -n hands out first: a file that compiles the kernels, beside it those that use none; then long ones.
-_FIRST = (
-    *("test_resume", "test_study_report", "test_synthetic", "test_wheel", "test_figures", "test_notebooks"),
-    *(
-        "test_cli_process",
-        "test_trainer",
-        "test_study_grid",
-        "test_study_cells",
-        "test_study_runs",
-        "test_bench_speed",
-        "test_faults",
-    ),
-)
+# The files that `pytest -n` hands out first: one that compiles the kernels, beside it those that use none, then long
+# ones, so that no worker ends long before the other.
+_FIRST = [
+    "test_resume",
+    *("test_gpu_projection", "test_synthetic", "test_house", "test_synthetic_room", "test_wheel", "test_gpu_loss"),
+    *("test_page_browser", "test_overflow", "test_extreme_cases", "test_init_points_dense", "test_gpu_compositing"),
+    *("test_trainer", "test_cli_process", "test_backends_compositing", "test_gpu_fit", "test_compositing_slices"),
+]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """What no kernel covers is not run a second time: of float64, of a GPU or of torch alone, by what it asks for."""
+    """Skip the numba variant of tests that only torch can run; under `pytest -n`, put the files of `_FIRST` first."""
     items[:] = [item for item in items if not _runs_on_torch_again(item)]
     if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: _FIRST.index(item.path.stem) if item.path.stem in _FIRST else len(_FIRST))
@@ -56,24 +47,27 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
-    """Files are handed out in this order, not by their number of tests: a long one at the end would run alone."""
+    """Hand files out in this order, not by their number of tests: a long one at the end would run alone."""
     config.option.loadscopereorder = False
 
 
 def _runs_on_torch_again(item: pytest.Function) -> bool:
+    """Whether this is the numba variant of a test in float64, of a GPU, or of torch alone."""
     values = getattr(getattr(item, "callspec", None), "params", {})
     if values.get("each_backend") != "numba":
         return False
-    double = any(value is torch.float64 or (isinstance(value, str) and value == "float64") for value in values.values())
+    double = any(
+        value in ("float64", torch.float64) for value in values.values() if isinstance(value, str | torch.dtype)
+    )
     return double or item.get_closest_marker("cuda") is not None or "torch_alone" in item.fixturenames
 
 
 @pytest.fixture(scope="module", params=sorted({"torch", backends.resolve("auto", torch.device("cpu"))}))
 def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Makes "auto" mean one backend, then the other: what the test says holds for both. Bits differ between them."""
-    kept = ("torch", request.param)
+    """Run a test twice: "auto" means torch, then numba. Their bits differ."""
+    available = tuple(backend for backend in backends.BACKENDS if backend.name in ("torch", request.param))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backends, "BACKENDS", tuple(backend for backend in backends.BACKENDS if backend.name in kept))
+        patch.setattr(backends, "BACKENDS", available)
         yield request.param
 
 
@@ -85,24 +79,24 @@ def kernel_backend(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def torch_alone() -> None:
-    """For a test that comes to no kernel: of errors, of files."""
+    """For a test that calls no kernel (errors, files): it runs once."""
 
 
 @pytest.fixture
 def exactly(each_backend: str) -> tuple[torch.dtype, float]:
-    """The dtype in which a backend is as exact as it can be, and how near its images are to what they should be."""
+    """The dtype in which a backend is most exact, and the largest error of its images."""
     return (torch.float32, 3e-6) if each_backend == "numba" else (torch.float64, 1e-12)
 
 
 @pytest.fixture(autouse=True)
-def _reproducible():
-    """The same global random stream for every test, whatever ran before."""
+def _reproducible() -> None:
+    """Start every test with the same global random stream."""
     torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _signals_arrive() -> None:
-    """Also where nohup, or a shell in the background, has started the suite with some of them ignored."""
+    """Handle signals that nohup, or a shell in the background, had set to be ignored."""
     defaults = {"SIGINT": signal.default_int_handler, "SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL}
     for number, handler in ((getattr(signal, name, None), handler) for name, handler in defaults.items()):
         if number is not None and signal.getsignal(number) == signal.SIG_IGN:
@@ -111,9 +105,17 @@ def _signals_arrive() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _short_films() -> Iterator[None]:
-    """Each fit makes a film: of two frames, where it is not the film that is tested."""
+    """Make films of two frames, unless a test sets more: each fit makes one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(film, "FRAMES", 2)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _synthetic_worlds_are_made_once() -> Iterator[None]:
+    """Keep all of them, not the last two: each takes a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "_make_setup", functools.cache(synthetic._make_setup.__wrapped__))
         yield
 
 
@@ -138,13 +140,13 @@ def kgs_data() -> Path:
     return Path(os.environ["KGS_DATA"])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def scene():
     """Three tiny pictures to train on, two to test."""
     return synthetic_scene(train_views=3, test_views=2, size=(32, 40), seed=1)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def points():
     """150 random points before its cameras."""
     generator = torch.Generator().manual_seed(0)
@@ -152,13 +154,13 @@ def points():
     return InitialPoints(points, torch.rand(150, 3, generator=generator), "random")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def planes():
     """Two painted planes of known depth in three views."""
     return painted_planes()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     """The synthetic orbit scene as a Blender folder."""
     root = tmp_path_factory.mktemp("scene")

@@ -151,7 +151,9 @@ def test_start_goes_back_to_the_first_view(browser: Browser, page: Path) -> None
     assert browser.run("document.querySelector('select').value") == str(CENTRAL)
 
 
-@pytest.mark.parametrize("shape", [(4, 3), (16, 9), (9, 16)])
+@pytest.mark.parametrize(
+    "shape", [(16, 9), *(pytest.param(shape, marks=pytest.mark.slow) for shape in ((4, 3), (9, 16)))]
+)
 def test_what_the_photos_frame_shows_does_not_depend_on_the_canvas(
     browser: Browser, page: Path, scene: Any, shape: tuple[int, int]
 ) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from functools import partial
+from itertools import product
 
 import pytest
 import torch
@@ -23,8 +24,10 @@ def run(kernel_backend):
     return partial(outcome, dtype=torch.float32, backend=kernel_backend)
 
 
-@pytest.mark.parametrize("thresholds", THRESHOLDS)
-@pytest.mark.parametrize("width", [0, 1, 3, 4, 5, 8, 9, 11, 20])
+@pytest.mark.parametrize(
+    ("width", "thresholds"),
+    [*product((0, 1, 3, 4, 5, 8, 9, 11, 20), THRESHOLDS[:1]), *product((0, 3, 11), THRESHOLDS[1:])],
+)
 def test_any_number_of_features_is_torch_in_float64(run, width, thresholds):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     projected, certain = sample(thresholds=thresholds)
@@ -114,7 +117,7 @@ def test_row_slices_change_nothing(kernel_backend, run, width):
         sliced = run(projected, features, certain, max_bytes=max_bytes)
         assert all(torch.equal(a, b) for a, b in zip(sliced[0], whole[0], strict=True))
         assert_close(sliced, whole, certain, 2e-6)
-    with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 3000 for it"):
+    with pytest.raises(ValueError, match="^max_bytes:"):
         composite(projected, features, options=RasterOptions(max_bytes=3000), backend=kernel_backend)
 
 

@@ -121,6 +121,6 @@ def test_backends_by_name(kernel_backend):
     image, target = make_pair((1, 3, 16, 19))
     with pytest.raises(ValueError, match=f"backend: '{kernel_backend}' does not cover this call of loss"):
         photometric_loss(image.double(), target.double(), backend=kernel_backend)
-    with pytest.raises(ValueError, match="backend: expected one of"):
+    with pytest.raises(ValueError, match="^backend:"):
         photometric_loss(image, target, backend="cuda")
     assert torch.equal(photometric_loss(image, target), photometric_loss(image, target, backend=kernel_backend))

@@ -179,7 +179,7 @@ def test_cameras_of_another_form_go_to_torch(kernel_backend, handed_over):
     gaussians, cameras = wide_scene()
     flat = cameras.extrinsics.clone()
     flat[0, 2, :3] = 0.0
-    with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
+    with pytest.raises(ValueError, match="^extrinsics:"):
         project(gaussians, with_camera(cameras, extrinsics=flat), backend=kernel_backend)
     project(gaussians, cameras, options=RasterOptions(near_plane=0.0), backend=kernel_backend)
     assert len(handed_over) == 2

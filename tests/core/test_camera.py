@@ -265,14 +265,6 @@ def test_size_errors():
         image_size(pinhole(size=(0, WIDTH)))
 
 
-@pytest.mark.parametrize(
-    "wrong", [None, torch.eye(4), posed(CameraModelType.PINHOLE).model], ids=["None", "tensor", "model"]
-)
-def test_other_cameras_are_a_type_error(wrong):
-    with pytest.raises(TypeError, match="cameras: expected a kornia PinholeCamera or a kgs.PosedCamera"):
-        image_size(wrong)
-
-
 def test_a_size_that_changes_in_place_or_is_replaced_is_read_again():
     camera = pinhole_cameras(torch.eye(4), torch.eye(3), width=32, height=24)
     assert [image_size(camera) for _ in range(2)] == [(24, 32)] * 2

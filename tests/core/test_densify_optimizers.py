@@ -2,7 +2,6 @@
 
 import copy
 import io
-import math
 
 import pytest
 import torch
@@ -186,12 +185,6 @@ def test_a_state_of_another_size_is_refused():
         other.load_state_dict({})
 
 
-@pytest.mark.parametrize("ceiling", [0.0, 1.0, math.nan])
-def test_a_ceiling_out_of_range_is_refused(ceiling):
-    with pytest.raises(ValueError, match="ceiling: expected"):
-        make([SMALL])[2].reset_opacity(ceiling)
-
-
 def test_an_optimizer_of_something_else_is_refused():
     model, _, _ = make([SMALL])
     with pytest.raises(ValueError, match="got none for quats"):
@@ -237,13 +230,6 @@ def test_state_follows_the_gaussians_in_optimizers_of_every_kind_with_a_schedule
             assert not isinstance(entry, torch.Tensor) or entry.shape in ((), (1,), parameter.shape)
 
 
-@pytest.mark.parametrize("kind", ["LBFGS", "Adafactor", "Rprop"])
-def test_optimizers_whose_state_cannot_follow_are_refused_when_made(kind):
-    model, _, _ = make([SMALL])
-    with pytest.raises(ValueError, match=f"optimizer: expected Adam, SGD or the like, got {kind}"):
-        Densifier(model, getattr(torch.optim, kind)(model.parameters()), 1.0)
-
-
 def test_an_unknown_state_is_refused_before_anything_is_changed():
     class Factored(torch.optim.SGD):
         def step(self):
@@ -267,7 +253,7 @@ def test_a_model_and_its_densifier_take_over_states_of_another_size():
     states = [copy.deepcopy(x.state_dict()) for x in (model, adam, densifier)]
     resumed = make([SMALL])
     resumed[0].load_state_dict(states[0])
-    with pytest.raises(ValueError, match="model: expected 1 Gaussians, got 3"):
+    with pytest.raises(ValueError, match="^model:"):
         resumed[2].step()
     for part, state in zip(resumed, states, strict=True):
         part.load_state_dict(state)

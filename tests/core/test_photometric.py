@@ -216,24 +216,24 @@ def test_nan_in_the_image_reaches_the_loss():
 @pytest.mark.usefixtures("torch_alone")
 def test_wrong_arguments_are_named():
     image, target = make_pair((1, 3, 16, 16))
-    with pytest.raises(TypeError, match=r"image: expected a torch\.Tensor"):
+    with pytest.raises(TypeError, match="^image:"):
         photometric_loss(image.numpy(), target)
-    with pytest.raises(TypeError, match="image: expected float32 or float64"):
+    with pytest.raises(TypeError, match="^image:"):
         photometric_loss(image.half(), target.half())
-    with pytest.raises(TypeError, match=r"target: expected torch\.float32"):
+    with pytest.raises(TypeError, match="^target:"):
         photometric_loss(image, target.double())
-    with pytest.raises(ValueError, match="target: expected shape"):
+    with pytest.raises(ValueError, match="^target:"):
         photometric_loss(image, target[..., 1:])
-    with pytest.raises(ValueError, match="image: expected shape"):
+    with pytest.raises(ValueError, match="^image:"):
         photometric_loss(image[0], target[0])
-    with pytest.raises(ValueError, match="image: expected at least 6 x 6"):
+    with pytest.raises(ValueError, match="^image:"):
         photometric_loss(image[..., :5], target[..., :5])
     for weight in (-0.1, math.nan, math.inf):
         with pytest.raises(ValueError, match="dssim_weight"):
             photometric_loss(image, target, weight)
     with pytest.raises(ValueError, match="moments"):
         photometric_loss(image, target, moments=target_moments(target[..., 1:]))
-    with pytest.raises(ValueError, match="target: expected at least 6 x 6"):
+    with pytest.raises(ValueError, match="^target:"):
         target_moments(target[..., :5])
 
 

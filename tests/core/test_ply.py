@@ -114,7 +114,7 @@ def test_harmonics_of_a_higher_degree_are_zeros_in_the_file(tmp_path, degree):
 
 @pytest.mark.parametrize("degree", [0, 4, -1, 3.0])
 def test_a_degree_below_that_of_the_model_or_above_3_is_refused(tmp_path, degree):
-    with pytest.raises(ValueError, match="sh_degree: expected"):
+    with pytest.raises(ValueError, match="^sh_degree:"):
         save_ply(tmp_path / "a.ply", random_model(sh_degree=1), sh_degree=degree)
     assert not list(tmp_path.iterdir())
 
@@ -205,9 +205,9 @@ def test_other_than_three_finite_numbers_are_no_offset_and_no_origin(tmp_path):
         (lambda x: save_ply(tmp_path / "a.ply", random_model(), x), "offset"),
         (lambda x: load_ply(tmp_path / "a.ply", x), "origin"),
     ):
-        with pytest.raises(ValueError, match=rf"{name}: expected shape \(3,\), got \(1, 3\)"):
+        with pytest.raises(ValueError, match=f"^{name}:"):
             call(torch.zeros(1, 3))
-        with pytest.raises(ValueError, match=f"{name}: expected finite numbers"):
+        with pytest.raises(ValueError, match=f"^{name}:"):
             call(torch.tensor([0.0, math.nan, 0.0]))
 
 

@@ -30,7 +30,7 @@ def test_opacities_of_each_camera():
     together = project(replace(gaussians, opacities=opacities), cameras)
     assert torch.equal(together.opacities, opacities[together.camera_ids, together.gaussian_ids])
     for wrong in (opacities[:2], opacities[:1]):
-        with pytest.raises(ValueError, match=r"opacities: expected shape \(60,\) or \(3, 60\) for 3 cameras, got"):
+        with pytest.raises(ValueError, match="^opacities:"):
             project(replace(gaussians, opacities=wrong), cameras)
 
 

@@ -220,7 +220,7 @@ def test_opacities_of_each_camera_and_gradients_of_everything(exactly):
 def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
     gaussians, cameras = scene()
     named = "colors" if (name, value) == ("sh_degree", 0) else name
-    with pytest.raises(ValueError, match=rf"^{named}: expected .*got"):
+    with pytest.raises(ValueError, match=f"^{named}:"):
         call(gaussians, cameras, **{name: value})
 
 
@@ -228,7 +228,7 @@ def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"])
 def test_what_is_no_tensor_is_named(name):
     gaussians, cameras = scene()
-    with pytest.raises(TypeError, match=rf"^{name}: expected a torch.Tensor, got NoneType"):
+    with pytest.raises(TypeError, match=f"^{name}:"):
         call(gaussians, cameras, **{name: None})
 
 
@@ -258,7 +258,7 @@ def test_depths_need_no_colours(mode):
 @pytest.mark.parametrize("mode", ["RGB", "RGB+D"])
 def test_images_need_colours(mode):
     gaussians, cameras = scene(dtype=torch.float32)
-    with pytest.raises(TypeError, match=r"^colors: expected a torch.Tensor, got NoneType"):
+    with pytest.raises(TypeError, match="^colors:"):
         call(gaussians, cameras, colors=None, render_mode=mode)
 
 
@@ -395,7 +395,7 @@ def test_normals_are_third_axes_towards_the_camera(exactly):
     expected = torch.einsum("lhw,lc->hwc", drawn.weights, axes[drawn.order])
     normals = call(gaussians, cameras, return_normals=True)[2]["normals"]
     assert torch.allclose(normals[0].double(), expected, atol=5 * bound)
-    with pytest.raises(ValueError, match=r"^return_normals: expected False"):
+    with pytest.raises(ValueError, match="^return_normals:"):
         call(gaussians, cameras, return_normals=True, covars=torch.eye(3, dtype=dtype).expand(60, 3, 3))
 
 
@@ -479,7 +479,7 @@ def test_another_dtype_is_named(name, dtype):
         "Ks": cameras.intrinsics[:, :3, :3],
         "covars": torch.eye(3).expand(60, 3, 3),
     }
-    with pytest.raises(TypeError, match=rf"^{name}: expected torch.float32 .* as means, got {dtype}"):
+    with pytest.raises(TypeError, match=f"^{name}:"):
         call(gaussians, cameras, **{name: values[name].to(dtype)})
 
 

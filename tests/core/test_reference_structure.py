@@ -238,13 +238,13 @@ def test_wrong_arguments_are_named():
     two = PinholeCamera(
         *(torch.cat([value, value]) for value in (SMALL.intrinsics, SMALL.extrinsics, SMALL.height, SMALL.width))
     )
-    with pytest.raises(TypeError, match="camera: expected PinholeCamera, got str"):
+    with pytest.raises(TypeError, match="^camera:"):
         render(gaussians, "camera")
-    with pytest.raises(ValueError, match="camera: expected one camera"):
+    with pytest.raises(ValueError, match="^camera:"):
         render(gaussians, two)
     with pytest.raises(ValueError, match="one row of opacities"):
         render(replace(gaussians, opacities=gaussians.opacities.expand(2, 3)), SMALL)
-    with pytest.raises(ValueError, match="background: expected"):
+    with pytest.raises(ValueError, match="^background:"):
         render(gaussians, SMALL, torch.zeros(2, 3))
 
 

@@ -7,8 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from factories import FIELDS, OUTPUTS, batch, leaves, pinhole, posed, random_camera, random_gaussians
-from kornia.sensors.camera import CameraModelType
+from factories import FIELDS, OUTPUTS, batch, leaves, pinhole, random_camera, random_gaussians
 
 import kgs.reference
 from kgs import DropGaussian, GaussianRenderer, Gaussians, RasterOptions, composite, project
@@ -246,43 +245,6 @@ def test_other_dtypes_are_a_type_error_that_names_the_argument(name, dtype):
 
 
 @pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize(
-    ("argument", "error", "change"),
-    [
-        ("outputs", ValueError, {"outputs": ("imag",)}),
-        ("outputs", ValueError, {"outputs": ()}),
-        ("outputs", ValueError, {"outputs": "image"}),
-        ("background", ValueError, {"background": torch.zeros(4)}),
-        ("background", ValueError, {"background": torch.zeros(2, 3)}),
-        ("background", ValueError, {"background": torch.zeros(1, 3, 12, 9)}),
-        ("background", TypeError, {"background": torch.zeros(3).double()}),
-        ("background", TypeError, {"background": (0, 0, 0)}),
-        ("cameras", TypeError, {"cameras": None}),
-        ("cameras", TypeError, {"cameras": random_camera(9, 12, 0, torch.float64)}),
-        ("cameras", TypeError, {"cameras": random_camera(9, 12, 0, torch.float16)}),
-        (
-            "cameras",
-            TypeError,
-            {"cameras": posed(CameraModelType.PINHOLE, [9.0, 9.0, 6.0, 4.0], (24, 32), extrinsics=torch.eye(4)[None])},
-        ),
-        ("cameras", ValueError, {"cameras": batch(*[random_camera(9, w, 0, torch.float32) for w in (12, 13)])}),
-        ("gaussians", TypeError, {"gaussians": None}),
-    ],
-)
-def test_errors_name_the_argument(argument, error, change):
-    arguments = {"gaussians": random_gaussians(3, 0, torch.float32), "cameras": random_camera(9, 12, 0, torch.float32)}
-    with pytest.raises(error, match=rf"^{argument}: expected"):
-        GaussianRenderer()(**{**arguments, **change})
-
-
-@pytest.mark.usefixtures("torch_alone")
-def test_opacities_for_another_number_of_cameras_are_an_error():
-    gaussians = dataclasses.replace(random_gaussians(3, 0), opacities=torch.full((2, 3), 0.5).double())
-    with pytest.raises(ValueError, match="opacities: expected"):
-        GaussianRenderer()(gaussians, random_camera(9, 12, 0))
-
-
-@pytest.mark.usefixtures("torch_alone")
 def test_options_are_given_whole_or_field_by_field():
     options = RasterOptions(near_plane=0.5, alpha_threshold=0.0, max_bytes=2**20)
     assert GaussianRenderer(options=options).options == options
@@ -304,11 +266,11 @@ def test_options_given_twice_or_of_another_kind_are_refused():
         partial(project, gaussians, camera),
         partial(composite, projected, projected.colors),
     ):
-        with pytest.raises(TypeError, match="options: expected RasterOptions, got dict"):
+        with pytest.raises(TypeError, match="^options:"):
             call(options={"eps2d": 0.1})
         with pytest.raises(TypeError, match="last_plane"):
             call(last_plane=10.0)
-    with pytest.raises(TypeError, match=r"options: expected .* got both \(eps2d\)"):
+    with pytest.raises(TypeError, match="^options:"):
         GaussianRenderer(options=RasterOptions(), eps2d=0.1)
 
 
@@ -318,22 +280,3 @@ def test_repr_says_the_options():
     assert "tile_size=16" in text
     assert "alpha_threshold=0.00392157" in text
     assert "DropGaussian" in text
-
-
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize(
-    "option",
-    [
-        {"near_plane": float("nan")},
-        {"near_plane": -1.0},
-        {"eps2d": -1.0},
-        {"eps2d": float("inf")},
-        {"tile_size": 0},
-        {"tile_size": 8.5},
-        {"alpha_threshold": 1.0},
-        {"transmittance_stop": -1e-9},
-    ],
-)
-def test_options_out_of_range_are_refused_when_the_renderer_is_made(option):
-    with pytest.raises(ValueError, match=next(iter(option))):
-        GaussianRenderer(**option)

@@ -62,7 +62,7 @@ def test_tensors_decide_the_device_whatever_the_default_is(kind):
         assert torch.equal(getattr(other, name).grad, value.grad)
 
 
-@pytest.mark.slow  # tests/test_pipelines.py has one in 7 s, with the layer and an optimiser
+@pytest.mark.slow  # tests/properties/test_pipelines.py has one in 7 s, with the layer and an optimiser
 @pytest.mark.parametrize("backend", ["eager", "aot_eager", "inductor"])
 def test_a_compiled_training_step_is_the_plain_one(backend):
     gaussians, camera = random_gaussians(60, 0, torch.float32, 1), random_camera(*SIZE, 0, torch.float32)

@@ -17,7 +17,7 @@ SMALL = (42, 56)
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return synthetic_scene()
+    return synthetic_scene(size=(84, 112))
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,8 @@ def orbit() -> Scene:
 
 
 def test_fields_are_those_of_a_scene_without_first_points(scene):
-    assert scene.train.images.shape == (3, 3, 126, 168)
-    assert scene.test.images.shape == (6, 3, 126, 168)
+    assert scene.train.images.shape == (3, 3, 84, 112)
+    assert scene.test.images.shape == (6, 3, 84, 112)
     assert scene.train.images.dtype == scene.train.cameras.extrinsics.dtype == torch.float32
     assert scene.train.names == ("train_00", "train_01", "train_02")
     assert scene.test.names[-1] == "test_05"
@@ -39,13 +39,13 @@ def test_fields_are_those_of_a_scene_without_first_points(scene):
     assert scene.train.images.min() >= 0.0
     assert scene.train.images.max() <= 1.0
     # integer pixel centres: a centred image has cx = (W - 1) / 2
-    torch.testing.assert_close(scene.train.cameras.cx, torch.full((3,), 83.5))
-    torch.testing.assert_close(scene.train.cameras.cy, torch.full((3,), 62.5))
+    torch.testing.assert_close(scene.train.cameras.cx, torch.full((3,), 55.5))
+    torch.testing.assert_close(scene.train.cameras.cy, torch.full((3,), 41.5))
 
 
 @pytest.mark.parametrize("kind", ["room", pytest.param("orbit", marks=pytest.mark.slow)])
 def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
-    first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (3, 3, 4))
+    first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (0, 0, 1))
     for split in ("train", "test"):
         a, b, c = (getattr(x, split) for x in (first, again, other))
         assert torch.equal(a.images, b.images)
@@ -56,7 +56,7 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
 
 @pytest.mark.slow
 def test_world_does_not_depend_on_the_number_of_views(scene):
-    few = synthetic_scene(train_views=1, test_views=0)
+    few = synthetic_scene(train_views=1, test_views=0, size=(84, 112))
     depth = synthetic_depths(few.train.cameras)
     torch.testing.assert_close(depth, _shown_depth(few.train), rtol=1e-9, atol=0.0)
     # the one camera and the middle one of three see one and the same world
@@ -138,7 +138,7 @@ def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
     """Near and far things move differently by many pixels between neighbours, and some of the scene is hidden."""
     depths = synthetic_depths(scene.train.cameras)
     step = torch.linalg.norm(_centers(scene.train.cameras.extrinsics).diff(dim=0), dim=1).min()
-    assert step * scene.train.cameras.fx[0] * (1 / depths.amin() - 1 / depths.amax()) > 15
+    assert step * scene.train.cameras.fx[0] * (1 / depths.amin() - 1 / depths.amax()) > 0.09 * 112  # pixels
     _, seen, _ = _photo_error(scene.train, 0, scene.train, 1)
     assert 0.6 < seen.double().mean() < 0.95
 
@@ -147,7 +147,7 @@ def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
 def test_views_agree_on_the_colour_of_the_surfaces_they_both_see(scene, source, target):
     """Kornia warps one view into the other by the true depth: pose, depth, intrinsics and images must fit together."""
     warped, seen, error = _photo_error(scene.train, source, scene.train, target)
-    assert seen.sum() > 5000
+    assert seen.double().mean() > 0.24
     assert error[seen].median() < 0.02
     # the same test a pixel beside the truth fails: it can see a wrong convention
     shifted = torch.roll(scene.train.images[target : target + 1], 1, dims=3)

@@ -12,7 +12,7 @@ from kgs.datasets.synthetic.light import daylight, received
 from kgs.datasets.synthetic.pictures import blank, spine, tone
 from kgs.datasets.synthetic.raycast import _candidates, raycast
 
-SIZE = (126, 168)
+SIZE = (84, 112)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ run = partial(outcome, dtype=torch.float32, backend="triton")
 @pytest.mark.parametrize("thresholds", THRESHOLDS)
 def test_an_ordinary_scene_is_torch_in_float64(thresholds):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
-    projected, certain = sample(40, SIZE, thresholds)
+    projected, certain = sample(20, SIZE, thresholds)
     features = random(len(projected), 3)
     assert_close(
         run(projected, features, certain, **options), outcome(projected, features, certain, **options), certain
@@ -29,14 +29,14 @@ def test_an_ordinary_scene_is_torch_in_float64(thresholds):
 
 @pytest.mark.parametrize("width", [0, 1, 9])
 def test_any_number_of_features(width):
-    projected, certain = sample(20, (9, 11))
+    projected, certain = sample(12, (5, 9))
     features = random(len(projected), width)
     assert_close(run(projected, features, certain), outcome(projected, features, certain), certain)
 
 
 def test_it_is_numba_within_rounding():
     pytest.importorskip("numba")
-    projected, certain = sample(40, SIZE)
+    projected, certain = sample(20, SIZE)
     expected = outcome(projected, projected.colors, certain, torch.float32, backend="numba")
     assert_close(run(projected, projected.colors, certain), expected, certain)
 
@@ -47,10 +47,9 @@ def test_several_cameras_in_row_slices():
     projected, exact = project(gaussians, cameras), {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
     features = random(len(projected), 5)
     expected = outcome(projected, features, torch.ones(()), **exact)
-    for max_bytes in (2**30, 2**13):
-        got = run(projected, features, torch.ones(()), **exact, max_bytes=max_bytes)
-        assert_close(got, expected, torch.ones(()))
-    with pytest.raises(ValueError, match=r"max_bytes: one row of tiles needs \d+ bytes, .* got 500 for it"):
+    got = run(projected, features, torch.ones(()), **exact, max_bytes=2**13)
+    assert_close(got, expected, torch.ones(()))
+    with pytest.raises(ValueError, match="^max_bytes:"):
         composite(projected, features, options=RasterOptions(max_bytes=500), backend="triton")
 
 
@@ -86,7 +85,7 @@ def test_no_gaussians_and_no_entries():
 
 @pytest.mark.parametrize("field", ["moments", "absolute", "features"])
 def test_only_what_is_wanted_is_differentiated(field):
-    projected, certain = sample(20, (9, 11))
+    projected, certain = sample(12, (5, 9))
     features = random(len(projected), 3)
     whole = run(projected, features, certain)[1]
     if field == "features":
@@ -98,7 +97,7 @@ def test_only_what_is_wanted_is_differentiated(field):
 
 
 def test_sums_of_absolute_values_are_those_of_torch():
-    projected, _ = sample(20, (9, 11))
+    projected, _ = sample(12, (5, 9))
     found = []
     for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
         values = {k: getattr(projected, k).to(dtype) for k in ("means2d", "factors", "opacities", "depths")}
@@ -111,7 +110,7 @@ def test_sums_of_absolute_values_are_those_of_torch():
 
 
 def test_the_same_bits_in_each_run_and_a_second_backward_pass():
-    projected, _ = sample(20, (9, 11))
+    projected, _ = sample(12, (5, 9))
     moved, inputs = leaves(projected, random(6, len(projected)).t()[:, ::2])
     first, again = (composite(moved, inputs[-1], backend="triton") for _ in range(2))
     assert torch.equal(first.features, again.features)

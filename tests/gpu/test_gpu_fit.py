@@ -81,12 +81,12 @@ def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     assert 1 <= waited <= MOST_WAITS
 
 
-def test_gradients_of_three_steps_are_numbas(scene, few):
+def test_gradients_of_two_steps_are_numbas(scene, few):
     pytest.importorskip("numba")
     fits = [trainer(scene, few, backend) for backend in ("triton", "numba")]
     with torch.no_grad():
         fits[1].model.log_scales += 0.5 * torch.randn(20, 3)  # a sphere has no turn
-    for _ in range(3):
+    for _ in range(2):
         fits[0].model.load_state_dict(fits[1].model.state_dict())  # equal parameters
         found = []
         for fit in fits:
@@ -149,15 +149,18 @@ def unchecked():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_kernels_that_fail_or_differ_are_not_used_and_a_line_says_so(monkeypatch):
+def test_kernels_that_fail_are_not_used_and_a_line_says_so(monkeypatch):
     monkeypatch.setattr(projection, "launch", lambda *a, **k: 1 / 0)
     with pytest.warns(UserWarning, match="Triton's kernels are not used on cpu, torch is: ZeroDivisionError"):
         assert not gpu.self_check(CPU)
     with warnings.catch_warnings():  # once
         warnings.simplefilter("error")
         assert not gpu.self_check(CPU)
-    gpu.self_check.cache_clear()
-    monkeypatch.undo()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
+def test_kernels_that_differ_are_not_used_and_a_line_says_so(monkeypatch):
     monkeypatch.setattr(compositing, "FEATURES", 3)  # blocks of four overlap: what they say is added up twice
     with pytest.warns(UserWarning, match=r"they differ from torch by .*, more than 5e-05"):
         assert not gpu.self_check(CPU)

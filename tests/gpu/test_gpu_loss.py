@@ -8,7 +8,13 @@ from kgs.losses import photometric_loss, target_moments
 
 
 @pytest.mark.parametrize(
-    ("shape", "weight"), [((1, 1, 11, 11), 0.2), ((2, 3, 11, 17), 0.2), ((1, 3, 25, 12), 0.2), ((1, 2, 13, 40), 3.0)]
+    ("shape", "weight"),
+    [
+        ((1, 1, 11, 11), 0.2),
+        ((2, 3, 11, 17), 0.2),
+        pytest.param((1, 3, 25, 12), 0.2, marks=pytest.mark.slow),
+        pytest.param((1, 2, 13, 40), 3.0, marks=pytest.mark.slow),
+    ],
 )
 def test_value_and_gradient_are_kornias(shape, weight):
     image, target = torch.rand(shape), torch.rand(shape)

@@ -21,8 +21,8 @@ def handed_over(monkeypatch):
 
 @pytest.mark.parametrize(("degree", "cameras"), [(None, 1), (0, 1), (1, 2), (2, 1), (3, 2)])
 def test_harmonics_of_every_degree_and_features(degree, cameras, handed_over):
-    got, _ = assert_alike(*wide_scene(degree, cameras=cameras), "triton")
-    assert 100 < len(got) < 300 * cameras
+    got, _ = assert_alike(*wide_scene(degree, 120, cameras), "triton")
+    assert 30 < len(got) < 90 * cameras
     assert not handed_over
 
 
@@ -30,7 +30,7 @@ def test_features_of_any_width_no_colors_and_opacities_of_each_camera():
     gaussians, cameras = wide_scene(None, 100, cameras=2)
     for width in (0, 1, 17):
         assert_alike(replace(gaussians, colors=torch.rand(100, width)), cameras, "triton")
-    got, gradients = assert_alike(*wide_scene(3), "triton", colors=False)
+    got, gradients = assert_alike(*wide_scene(3, 60), "triton", colors=False)
     assert got.colors.shape == (len(got), 0)
     assert gradients["colors"] is None
     assert_alike(replace(gaussians, opacities=torch.rand(2, 100)), cameras, "triton")
@@ -63,7 +63,7 @@ def test_what_is_not_finite_or_overflows_is_left_out(field, value):
 
 
 def test_zero_quaternions_and_flat_gaussians():
-    gaussians, cameras = wide_scene()
+    gaussians, cameras = wide_scene(n=120)
     quats, scales = gaussians.quats.clone(), gaussians.scales.clone()
     quats[::3] = 0.0
     quats[1::3] *= 1e-30
@@ -81,7 +81,7 @@ def test_zero_quaternions_and_flat_gaussians():
         found, expected = slopes[0][1][rows], slopes[1][1][rows]
         assert (found - expected).abs().max() <= 1e-5 * expected.abs().max()
     assert gradients["scales"].isfinite().all()
-    assert len(got) > 100
+    assert len(got) > 30
 
 
 @pytest.mark.parametrize("options", [{"near_plane": 4.0}, {"eps2d": 0.0}, {"frame": (10.0, 8.0, 40.0, 30.0)}])
@@ -91,27 +91,41 @@ def test_options(options):
 
 @pytest.mark.parametrize("block", [[[50.0, 4.0], [0.0, 60.0]], [[-50.0, 0.0], [0.0, 60.0]]])
 def test_cameras_with_skew_and_negative_focal_lengths(block, handed_over):
-    gaussians, cameras = wide_scene()
+    gaussians, cameras = wide_scene(n=100)
     k = cameras.intrinsics[0].clone()
     k[:2, :2] = torch.tensor(block)
     assert_alike(gaussians, with_camera(cameras, intrinsics=k), "triton")
     assert not handed_over
 
 
-def test_poses_that_are_scaled_or_sheared(handed_over):
-    gaussians, cameras = wide_scene(3, 60)
-    for change in (torch.eye(3) * 1.7, torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.9, -0.1], [0.1, 0.0, 1.2]])):
-        pose = cameras.extrinsics[0].clone()
-        pose[:3, :3] = change @ pose[:3, :3]
-        assert_alike(gaussians, with_camera(cameras, extrinsics=pose), "triton")
-        assert_camera_gradients(gaussians, with_camera(cameras, extrinsics=pose), "triton", ("pose", "lens"))
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(torch.eye(3) * 1.7, marks=pytest.mark.slow),
+        torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.9, -0.1], [0.1, 0.0, 1.2]]),
+    ],
+    ids=["scaled", "sheared"],
+)
+def test_poses_that_are_scaled_or_sheared(change, handed_over):
+    gaussians, cameras = wide_scene(3, 30)
+    pose = cameras.extrinsics[0].clone()
+    pose[:3, :3] = change @ pose[:3, :3]
+    assert_alike(gaussians, with_camera(cameras, extrinsics=pose), "triton")
+    assert_camera_gradients(gaussians, with_camera(cameras, extrinsics=pose), "triton", ("pose", "lens"))
     assert not handed_over
 
 
-@pytest.mark.parametrize("degree", [None, 3])
-@pytest.mark.parametrize("wanted", [("pose",), ("pose", "lens", "Gaussians")])
+@pytest.mark.parametrize(
+    ("degree", "wanted"),
+    [
+        (None, ("pose",)),
+        (3, ("pose", "lens", "Gaussians")),
+        pytest.param(None, ("pose", "lens", "Gaussians"), marks=pytest.mark.slow),
+        pytest.param(3, ("pose",), marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_of_cameras(degree, wanted, handed_over):
-    gaussians, cameras = wide_scene(degree, 60, cameras=2)
+    gaussians, cameras = wide_scene(degree, 30, cameras=2)
     assert_camera_gradients(gaussians, cameras, "triton", wanted)
     assert not handed_over
 
@@ -123,7 +137,7 @@ def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
     lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), cameras.extrinsics)
     got, expected = (project(gaussians, lens, backend=backend) for backend in ("triton", "torch"))
     assert torch.equal(got.means2d, expected.means2d)
-    with pytest.raises(ValueError, match="extrinsics: expected poses whose 3x3 block has an inverse"):
+    with pytest.raises(ValueError, match="^extrinsics:"):
         project(gaussians, with_camera(cameras, extrinsics=flat), backend="triton")
     assert len(handed_over) == 2
     assert len(project(gaussians[:0], cameras, backend="triton")) == 0
@@ -131,7 +145,7 @@ def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
 
 
 def test_without_gradients_and_once_differentiable():
-    gaussians, cameras = wide_scene()
+    gaussians, cameras = wide_scene(n=60)
     with torch.inference_mode():
         assert not project(gaussians, cameras, backend="triton").means2d.requires_grad
     moved, inputs = leaves(gaussians)

@@ -22,7 +22,7 @@ from kgs.init_points.sweep_costs import _semi_global, warp
 
 @pytest.fixture(scope="module")
 def garden() -> tuple[Views, torch.Tensor]:
-    return garden_from_above((96, 128))
+    return garden_from_above((72, 96))
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_points_lie_on_the_surfaces(views: Views, truth: torch.Tensor, span: tup
     assert points.shape == colors.shape == (2000, 3)
     assert points.dtype == colors.dtype == torch.float32
     pixels, depths = project_points(points, views.cameras)
-    x, y = (pixels[..., 0].round().long().clamp(0, 127), pixels[..., 1].round().long().clamp(0, 95))
+    x, y = (pixels[..., 0].round().long().clamp(0, 95), pixels[..., 1].round().long().clamp(0, 71))
     errors = torch.stack([(depths[:, v] / truth[v][y[:, v], x[:, v]] - 1).abs() for v in range(3)]).amin(0)
     assert float(errors.median()) < 0.01
     assert float((errors < 0.03).double().mean()) > 0.9
@@ -76,12 +76,12 @@ def test_the_draw_follows_the_seed(views: Views, span: tuple[float, float]) -> N
 
 
 def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float]) -> None:
-    masks = torch.zeros(3, 1, 96, 128)
-    masks[..., 20:70, 30:100] = 1.0
+    masks = torch.zeros(3, 1, 72, 96)
+    masks[..., 15:55, 20:80] = 1.0
     points, *_ = dense_points(replace(views, masks=masks), *span, 2000, generator())
     pixels, _ = project_points(points, views.cameras)
     x, y = pixels.round().long().unbind(-1)
-    inside = (x >= 30) & (x < 100) & (y >= 20) & (y < 70)
+    inside = (x >= 20) & (x < 80) & (y >= 15) & (y < 55)
     assert len(points) > 300
     assert bool((inside.sum(1) >= 2).all())
 
@@ -251,7 +251,7 @@ def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float,
 
 
 def test_another_draw_is_refused(views: Views) -> None:
-    with pytest.raises(ValueError, match="draw: expected one of"):
+    with pytest.raises(ValueError, match="^draw:"):
         initial_points(views, draw="even")
 
 

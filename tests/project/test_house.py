@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import graphlib
 import importlib
 import inspect
 import re
@@ -16,7 +17,24 @@ import kgs.fit
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
-FLOORS = ("core", "io", "metrics", "sfm", "init_points", "fit", "page", "app", "bench", "study", "cli")
+GROUND = {"core", "backends", "compiled"}  # what stands in kgs itself is the core
+LIBRARY = {*GROUND, "gsplat", "losses", "datasets", "metrics", "init_points", "fit", "bench"}
+MAY_IMPORT = {  # a room, and the others that it may import
+    "kgs": {"core", "gsplat"},  # the face, which names what is elsewhere
+    "core": {"backends"},
+    "compiled": set(),
+    "backends": GROUND,
+    "gsplat": GROUND,
+    "losses": {"backends"},
+    "datasets": {"core"},
+    "metrics": GROUND | {"datasets"},
+    "init_points": GROUND | {"datasets"},
+    "fit": GROUND | {"losses", "datasets", "metrics", "init_points"},
+    "bench": GROUND | {"losses"},
+    "app": LIBRARY,
+    "study": LIBRARY | {"app"},
+}
+BELOW_SCENES = {"kgs.errors", "kgs.json_files", "kgs.geometry", "kgs.lazy"}  # the core that datasets may import
 HEAVY = ("cv2", "PIL", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "distributed")
 
 
@@ -52,72 +70,60 @@ def within(name, *modules):
     return any(name == module or name.startswith(module + ".") for module in modules)
 
 
-def floor(name):
-    if name == "kgs":
-        return "face"  # which names what is elsewhere
-    if within(name, "kgs.losses", "kgs.datasets"):
-        return name.split(".")[1]
-    above = [floor for floor in FLOORS[1:] if within(name, f"kgs.{floor}")]
-    return above[0] if above else "core"
+def room(name):
+    first, *rest = name.split(".")
+    if not rest:
+        return first
+    return rest[0] if rest[0] in MAY_IMPORT else "core"
+
+
+def pairs():
+    """Each module with each module of ours that it imports."""
+    return [(name, other) for name in SOURCES for other in sorted(imported_modules(name) - {name})]
+
+
+def cycle(graph):
+    """Names that import each other in a circle, or none."""
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
 
 
 # -- imports -------------------------------------------------------------------------------------------------------
 
 
-def test_there_are_no_circles():
-    done, path = set(), []
+def test_no_files_import_each_other():
+    assert not cycle({name: imported_modules(name) - {name} for name in SOURCES})
 
-    def visit(name):
-        assert name not in path, " -> ".join([*path[path.index(name) :], name])
-        if name not in done:
-            path.append(name)
-            for other in sorted(imported_modules(name) - {name}):
-                visit(other)
-            done.add(path.pop())
 
-    for name in SOURCES:
-        visit(name)
-    assert done == set(SOURCES)
+FOLDERS = [name for name, path in SOURCES.items() if path.stem == "__init__"]
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_no_folders_import_each_other(folder):
+    """Nor a folder and a file beside it: a part of a folder is all that stands below one of its names."""
+    depth = folder.count(".") + 2
+    graph = {}
+    for name, other in pairs():
+        if name.startswith(f"{folder}.") and other.startswith(f"{folder}."):
+            part, imported = (".".join(module.split(".")[:depth]) for module in (name, other))
+            graph.setdefault(part, set()).update({imported} - {part})
+    assert not cycle(graph)
 
 
 def test_imports_go_one_way():
-    ground = {"core", "losses", "datasets", "io"}
-    allowed = {
-        "face": {"core", "io"},
-        "core": {"core"},
-        "losses": {"losses"},
-        "datasets": {"datasets"},
-        "io": ground,
-        "metrics": ground | {"metrics"},
-        "sfm": ground | {"sfm"},
-        "init_points": ground | {"init_points", "sfm"},
-        "fit": ground - {"io"} | {"fit", "init_points", "metrics"},
-        "page": ground | {"page", "fit", "metrics", "app"},
-        "app": ground | {"app", "page", "fit", "init_points", "sfm", "metrics"},
-        "bench": {*FLOORS, "losses", "datasets"} - {"study", "cli"},
-        "study": {*FLOORS, "losses", "datasets"} - {"cli"},
-        "cli": {*FLOORS, "losses", "datasets"},
-    }
-    small = ("kgs.errors", "kgs.json_files", "kgs.backends", "kgs.lazy")  # what losses and datasets may use
-    wrong = [
-        (name, other)
-        for name in SOURCES
-        for other in sorted(imported_modules(name))
-        if floor(other) not in allowed[floor(name)]
-        and not (floor(name) in ("losses", "datasets") and within(other, *small))
-    ]
+    wrong = [pair for pair in pairs() if room(pair[1]) not in MAY_IMPORT[room(pair[0])] | {room(pair[0])}]
     assert not wrong
+    core_of_scenes = {other for name, other in pairs() if room(name) == "datasets" and room(other) == "core"}
+    assert core_of_scenes <= BELOW_SCENES
 
 
-def test_the_application_is_on_top():
-    """The command and the page belong to it; they still stand in folders of their own."""
-    clients = {name for name in SOURCES for other in imported_modules(name) if floor(other) == "app"}
-    assert {floor(name) for name in clients} <= {"app", "cli", "page"}
-
-
-def test_the_command_alone_imports_the_study():
-    clients = {name for name in SOURCES for other in imported_modules(name) if floor(other) == "study"}
-    assert {name for name in clients if floor(name) != "study"} == {"kgs.app.cli.study"}
+def test_the_library_knows_neither_the_application_nor_the_study():
+    """What prints, locks and publishes stands above it; so does one paper's study, on the application."""
+    clients = {top: {room(name) for name, other in pairs() if room(other) == top} for top in ("app", "study")}
+    assert clients == {"app": {"app", "study"}, "study": {"study"}}
 
 
 def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
@@ -160,7 +166,8 @@ def test_no_module_of_one_system_alone(imported):
 
 def test_the_renderer_is_light(imported):
     new = imported[1].split()
-    above = [f"kgs.{name}" for name in ("losses", "datasets", *FLOORS[2:], "reference")]
+    others = {"losses", "datasets", "metrics", "init_points", "fit", "bench", "app", "study", "reference"}
+    above = [f"kgs.{name}" for name in others]
     assert "kgs.renderer" in new
     assert [name for name in new if within(name, *HEAVY, *above)] == []
 

@@ -38,8 +38,8 @@ def copy(tmp_path_factory):
     copy = tmp_path_factory.mktemp("copy")
     for name in FOLDERS:
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "tests").mkdir()
-    for name in (*FILES, "setup.cfg", "pyproject.toml", "MANIFEST.in", "tests/test_wheel.py"):
+    (copy / "tests/project").mkdir(parents=True)
+    for name in (*FILES, "setup.cfg", "pyproject.toml", "MANIFEST.in", "tests/project/test_wheel.py"):
         shutil.copy(ROOT / name, copy / name)
     return copy
 
@@ -84,6 +84,7 @@ def test_what_an_index_shows_of_it(wheel):
     assert metadata["Author"]
 
 
+@pytest.mark.slow  # all modules are imported from the checkout, and all their files are in the wheel
 def test_every_module_can_be_imported_from_it(wheel, tmp_path):
     pytest.importorskip("numba")
     site = tmp_path / "site"

@@ -9,7 +9,6 @@ from factories import drop_layer as at
 from factories import pinhole, random_camera, random_gaussians, random_model
 from factories import random_opacities as draw
 from torch import nn
-from torch._dynamo.testing import CompileCounter
 from torch.utils.checkpoint import checkpoint
 
 from kgs import DropGaussian, GaussianRenderer, Gaussians
@@ -63,6 +62,8 @@ def _check_compiled(backend):
 @pytest.mark.parametrize("seed", [None, 3])
 @pytest.mark.parametrize("schedule", ["linear", "constant", math.sqrt])
 def test_a_rate_that_rises_is_not_compiled_anew(seed, schedule):
+    from torch._dynamo.testing import CompileCounter  # takes a second
+
     def run(compiled):
         torch._dynamo.reset()
         torch.manual_seed(0)

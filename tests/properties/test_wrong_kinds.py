@@ -3,6 +3,7 @@
 What is meant is taken, and what is wrong is an error that names the argument, not one from inside torch.
 """
 
+import functools
 import re
 import sys
 
@@ -26,9 +27,17 @@ from kgs.geometry import camera_extent
 from kgs.losses import photometric_loss, target_moments
 
 UPRIGHT = torch.eye(3)
-SCENE = synthetic_scene(train_views=2, test_views=1, size=(16, 16))
-POINTS = initial_points(SCENE.train, "random", count=30)
 CONFIG = FitConfig(steps=2, evaluations=1, init="random", init_points=50, backend="torch")
+
+
+@functools.cache
+def scene():
+    return synthetic_scene(train_views=2, test_views=1, size=(16, 16))
+
+
+@functools.cache
+def points():
+    return initial_points(scene().train, "random", count=30)
 
 
 def rasterize(**changes):
@@ -40,20 +49,20 @@ def rasterize(**changes):
 
 
 def views(images, names=("a", "b")):
-    return Views(SCENE.train.cameras, images, names)
+    return Views(scene().train.cameras, images, names)
 
 
 MODEL, PHOTO = random_model(5), torch.rand(1, 3, 16, 16)
 WRONG = {
     "a model for Gaussians": (
-        lambda: kgs.GaussianRenderer()(MODEL, SCENE.train.camera(0)),
+        lambda: kgs.GaussianRenderer()(MODEL, scene().train.camera(0)),
         "gaussians: expected Gauss",
     ),
     "and in project": (
-        lambda: kgs.project(MODEL, SCENE.train.camera(0)),
+        lambda: kgs.project(MODEL, scene().train.camera(0)),
         "gaussians: expected Gaussians, got",
     ),
-    "and in the reference": (lambda: reference.render(MODEL, SCENE.train.camera(0)), "gaussians: expected Gaussians"),
+    "and in the reference": (lambda: reference.render(MODEL, scene().train.camera(0)), "gaussians: expected Gaussians"),
     "Gaussians for a model": (lambda: kgs.save_ply("x.ply", MODEL()), "model: expected GaussianModel, got Gaussians"),
     "and in a glb": (lambda: save_glb("x.glb", MODEL(), UPRIGHT), "model: expected GaussianModel, got Gaussians"),
     "and in densification": (lambda: Densifier(MODEL(), None, 1.0), "model: expected GaussianModel, got Gaussians"),
@@ -69,7 +78,7 @@ WRONG = {
     "means as a list": (lambda: rasterize(means=[[0.0, 0.0, 2.0]] * 4), "means: expected a torch.Tensor, got list"),
     "backgrounds as a list": (lambda: rasterize(backgrounds=[[1, 1, 1]]), "backgrounds: expected a torch.Tensor, got"),
     "a list behind the reference": (
-        lambda: reference.render(MODEL(), SCENE.train.camera(0), [0.0, 0.0, 0.0]),
+        lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0]),
         "background: expected a torch.Tensor, got list",
     ),
     "a photo for its moments": (
@@ -77,28 +86,28 @@ WRONG = {
         "moments: expected TargetMoments, got Tensor",
     ),
     "bytes for colours": (
-        lambda: views((255 * SCENE.train.images).byte()),
+        lambda: views((255 * scene().train.images).byte()),
         "images: expected a tensor of floating point RGB in [0, 1], got torch.uint8",
     ),
     "an array of photos": (
-        lambda: views(SCENE.train.images.numpy()),
+        lambda: views(scene().train.images.numpy()),
         "images: expected a tensor of floating point RGB",
     ),
     "cameras for their matrices": (
-        lambda: camera_extent(SCENE.train.cameras),
+        lambda: camera_extent(scene().train.cameras),
         "extrinsics: expected a torch.Tensor, got PinholeCamera",
     ),
-    "a scene for its views": (lambda: initial_points(SCENE), "views: expected Views, got Scene"),
+    "a scene for its views": (lambda: initial_points(scene()), "views: expected Views, got Scene"),
     "views for a scene": (
-        lambda: Trainer(SCENE.train, make_plan(SCENE, CONFIG), POINTS),
+        lambda: Trainer(scene().train, make_plan(scene(), CONFIG), points()),
         "scene: expected Scene, got Views",
     ),
-    "settings for a plan": (lambda: Trainer(SCENE, CONFIG, POINTS), "plan: expected Plan, got FitConfig"),
-    "and in a whole fit": (lambda: fit_scene(SCENE.train, CONFIG), "scene: expected Scene, got Views"),
-    "and in a plan": (lambda: make_plan(SCENE.train, CONFIG), "scene: expected Scene, got Views"),
-    "a dict for settings": (lambda: make_plan(SCENE, {}), "config: expected FitConfig, got dict"),
+    "settings for a plan": (lambda: Trainer(scene(), CONFIG, points()), "plan: expected Plan, got FitConfig"),
+    "and in a whole fit": (lambda: fit_scene(scene().train, CONFIG), "scene: expected Scene, got Views"),
+    "and in a plan": (lambda: make_plan(scene().train, CONFIG), "scene: expected Scene, got Views"),
+    "a dict for settings": (lambda: make_plan(scene(), {}), "config: expected FitConfig, got dict"),
     "a tensor for points": (
-        lambda: Trainer(SCENE, make_plan(SCENE, CONFIG), POINTS.points),
+        lambda: Trainer(scene(), make_plan(scene(), CONFIG), points().points),
         "points: expected InitialPoints, got Tensor",
     ),
 }
@@ -114,7 +123,7 @@ def test_another_kind_is_a_type_error_that_names_the_argument(name):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: views(SCENE.train.images, ("a", "a")), "names: expected each once"),
+        (lambda: views(scene().train.images, ("a", "a")), "names: expected each once"),
         (lambda: rasterize(colors=torch.rand(4, 4, 3), sh_degree=1.0), "sh_degree: expected 0 to 3 or None, got 1.0"),
         (lambda: rasterize(radial_coeffs=np.zeros((1, 4))), "radial_coeffs: expected None .*, got an array"),
         (lambda: synthetic_scene(seed=-1), "seed: expected at least 0, got -1"),
@@ -130,8 +139,8 @@ def test_another_value_is_a_value_error_that_names_the_argument(call, message):
 
 def test_numbers_of_numpy_are_taken(tmp_path):
     write_colmap(tmp_path)
-    scene = load_scene(tmp_path, hold_out=np.int64(2), downscale=np.float32(1))
-    assert scene.train.names == load_scene(tmp_path, hold_out=2).train.names
+    held_out = load_scene(tmp_path, hold_out=np.int64(2), downscale=np.float32(1))
+    assert held_out.train.names == load_scene(tmp_path, hold_out=2).train.names
     MODEL.sh_degree = np.int64(0)
     assert MODEL.sh_degree == 0
     projected = kgs.project(random_gaussians(4, 0, torch.float32), random_views(1).cameras)
@@ -139,13 +148,13 @@ def test_numbers_of_numpy_are_taken(tmp_path):
 
 
 def test_paths_may_be_text(tmp_path):
-    trainer = Trainer(SCENE, make_plan(SCENE, CONFIG), POINTS)
+    trainer = Trainer(scene(), make_plan(scene(), CONFIG), points())
     trainer.train_step()
     trainer.save(str(tmp_path / "c.safetensors"))
-    assert Trainer.resume(SCENE, CONFIG, str(tmp_path / "c.safetensors")).step == 1
+    assert Trainer.resume(scene(), CONFIG, str(tmp_path / "c.safetensors")).step == 1
     render = lambda camera: torch.zeros(1, 3, int(camera.height), int(camera.width))  # noqa: E731
-    assert write_film(str(tmp_path / "a.webm"), render, SCENE.train, 1.0) == "" or not (tmp_path / "a.webm").exists()
-    published = fit_folder(SCENE, CONFIG, str(tmp_path / "out"), SceneRequest("."))
+    assert write_film(str(tmp_path / "a.webm"), render, scene().train, 1.0) == "" or not (tmp_path / "a.webm").exists()
+    published = fit_folder(scene(), CONFIG, str(tmp_path / "out"), SceneRequest("."))
     assert published.folder == tmp_path / "out"
     assert (tmp_path / "out" / "index.html").exists()
 
@@ -159,13 +168,11 @@ def test_moments_of_the_target_are_taken():
 def test_a_package_that_results_need_is_missed_before_the_training(monkeypatch, tmp_path, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ModuleNotFoundError, match=package):
-        fit_folder(SCENE, CONFIG, tmp_path / "out", SceneRequest("."))
+        fit_folder(scene(), CONFIG, tmp_path / "out", SceneRequest("."))
     assert not (tmp_path / "out").exists()
 
 
 def test_points_of_the_right_kind_are_taken():
-    points = InitialPoints(POINTS.points, POINTS.colors, "mine")
-    assert Trainer(SCENE, make_plan(SCENE, CONFIG), points).state.start.init == {
-        "kind": "mine",
-        "points": len(points.points),
-    }
+    mine = InitialPoints(points().points, points().colors, "mine")
+    init = Trainer(scene(), make_plan(scene(), CONFIG), mine).state.start.init
+    assert init == {"kind": "mine", "points": len(mine.points)}

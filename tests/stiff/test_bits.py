@@ -89,7 +89,7 @@ def on_threads(dtype: torch.dtype) -> Iterator[Result]:
     """Enough pairs for two threads; one and two of them, twice each."""
     for count in (1, 2, 1, 2):
         with threads(count):
-            yield render(ordinary(800, (64, 64)), dtype)
+            yield render(ordinary(400, (64, 64)), dtype)
 
 
 def under_a_budget(dtype: torch.dtype) -> Iterator[Result]:
@@ -116,9 +116,12 @@ CASES: dict[str, tuple[str, str, Callable[[torch.dtype], Iterator[Result]]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_the_same_bits(name: str, each_backend: str, record_property: Callable[[str, object], None]) -> None:
     stiff, treatment, variants = CASES[name]
-    found = {str(dtype)[6:]: largest_difference(list(variants(dtype))) for dtype in (torch.float32, torch.float64)}
-    record_property("bits", {"case": f"{name}, {each_backend}", "stiff": stiff, **found, "treatment": treatment})
-    assert set(found.values()) == {0.0}
+    single = largest_difference(list(variants(torch.float32)))
+    double = "as torch" if each_backend == "numba" else largest_difference(list(variants(torch.float64)))
+    row = {"case": f"{name}, {each_backend}", "stiff": stiff, "float32": single, "float64": double}
+    record_property("bits", {**row, "treatment": treatment})
+    assert single == 0.0
+    assert double in (0.0, "as torch")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

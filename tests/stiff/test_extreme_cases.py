@@ -5,18 +5,41 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from kgs.bench import extremes as module
 from kgs.bench.extremes import SCENES, cases, errors, extremes
+from kgs.bench.scenes import Scene
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_every_scene_has_its_line() -> None:
     assert [case["case"] for case in cases()] == list(SCENES)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_reference_for_all_backends() -> Iterator[None]:
+    """The dense reference takes longer than all backends: it is rendered once for a scene and near plane."""
+    references: dict[tuple[float, bytes], object] = {}
+    exact = module.exact
+
+    def remembered(scene: Scene, near_plane: float) -> object:
+        cloud, camera = scene
+        numbers = [*vars(cloud).values(), camera.extrinsics, camera.intrinsics]
+        key = near_plane, torch.cat([x.detach().double().flatten() for x in numbers]).numpy().tobytes()
+        if key not in references:
+            references[key] = exact(scene, near_plane)
+        return references[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "exact", remembered)
+        yield
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -28,6 +51,7 @@ def test_every_bound_is_met(case: dict[str, object], dtype: str) -> None:
     assert math.isfinite(row["gradient"])
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_files_lines_and_a_missed_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -47,6 +71,7 @@ def test_files_lines_and_a_missed_bound(
     assert extremes(out=tmp_path / "new") == 0
 
 
+@pytest.mark.usefixtures("torch_alone")
 def test_an_error_that_is_not_a_number_misses_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoilt(*args: object, **options: object) -> object:
         image, gradients = render(*args, **options)

@@ -61,6 +61,7 @@ def test_places_out_of_range_are_named(out, count):
         views_beyond("room", out, count, (6, 8))
 
 
+@pytest.mark.slow
 def test_the_sky_of_the_arc_is_as_good_as_infinitely_far_away(arc):
     depths = synthetic_depths(arc.train.cameras, "arc")
     assert (depths > 1).all()  # a camera sees ground or sky everywhere
@@ -71,6 +72,7 @@ def test_the_sky_of_the_arc_is_as_good_as_infinitely_far_away(arc):
     assert blue > 0.05
 
 
+@pytest.mark.slow
 def test_all_that_a_training_view_sees_counts_in_it(arc):
     depths = synthetic_depths(arc.train.cameras, "arc")[:, 0]
     count = beyond.views_that_show(depths[2], arc.train.camera(2), list(depths), arc.train.cameras)

@@ -144,8 +144,8 @@ def test_only_the_built_in_scene_is_shown(folder):
 def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
     begun = []
 
-    def trainer(scene, config, first, needs):
-        begun.append((config.drop, first.points))
+    def trainer(scene, plan, first):
+        begun.append((plan.config.drop, first.points))
         raise InterruptedError  # nothing else of the cell is wanted
 
     monkeypatch.setattr(cells_module, "Trainer", trainer)
@@ -162,12 +162,12 @@ def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
 def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
     drops, configs = [], []
 
-    def decide(scene, config, choose):
-        drops.append(config.drop)
-        return replace(config, sh_degree=2), {}
+    def decide(scene, plan, choose):
+        drops.append(plan.config.drop)
+        return plan.with_degree(2, {})
 
-    def trainer(scene, config, first, needs):
-        configs.append(config)
+    def trainer(scene, plan, first):
+        configs.append(plan.config)
         raise InterruptedError  # nothing else of the cell is wanted
 
     monkeypatch.setattr(cells_module, "decide", decide)

@@ -8,6 +8,7 @@ import torch
 
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
+from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.harmonics import SH_C0
 from kgs.init_points import initial_points
@@ -79,7 +80,8 @@ def test_it_is_repeatable_and_says_when_nothing_is_covered():
 def test_counts_by_distance():
     scene = synthetic_scene(train_views=2, test_views=0, size=(24, 32))
     points = initial_points(scene.train, "random", count=600)
-    trainer = Trainer(scene, FitConfig(steps=4, max_gaussians=600), points)
+    plan = make_plan(scene, FitConfig(steps=4, max_gaussians=600))
+    trainer = Trainer(scene, plan, points)
     trainer.fit()
     counts = count_over_threshold(trainer, points.points)
     assert len(counts["distance"]) == BINS + 1
@@ -87,7 +89,7 @@ def test_counts_by_distance():
     assert sum(counts["gaussians"]) == len(trainer.model)
     assert max(counts["gaussians"]) < 1.2 * min(counts["gaussians"])  # quantiles of where they began
     assert all(over <= count for over, count in zip(counts["over"], counts["gaussians"], strict=True))
-    trainer.densifier.grad_threshold = 0.0
+    trainer.state.densifier.grad_threshold = 0.0
     assert count_over_threshold(trainer, points.points)["over"] == counts["gaussians"]
-    trainer.densifier.grad_threshold = math.inf
+    trainer.state.densifier.grad_threshold = math.inf
     assert sum(count_over_threshold(trainer, points.points)["over"]) == 0
