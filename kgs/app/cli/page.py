@@ -56,15 +56,15 @@ def page(
         raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, place, backend)
     few = spread(len(scene.train), MOST_PICTURES)
-    seen = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train  # of another offset
-    shown = replace(seen, cameras=scene.train.camera(few))
-    fit = replace(fit, metrics={"views": evaluate(fit.render, shown), "versions": versions()})
+    pictured = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train
+    pictured = replace(pictured, cameras=scene.train.camera(few))  # in the frame of `scene`, whose offset differs
+    fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
     claim(out.parent, "page", [out.name])
     cost = write_fit_page(
         out,
         f"{ply.stem}, {Path(cameras).resolve().name}",
         {"": fit},
-        shown=shown,
+        beside=pictured,
         words=("photo", "test"),
         notes=["Whether the splat was fitted to these photos is not known here."],
         photos=photos,
