@@ -12,7 +12,8 @@ from kgs.json_files import write_whole
 
 # One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The
 # study has more of them (kgs/study/plots.py); pages show black as the colour of their text.
-DEFAULT, WITHOUT = "#CC79A7", "#000000"
+DEFAULT = "#CC79A7"
+WITHOUT = "#000000"
 
 
 def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:

@@ -27,7 +27,7 @@ class PageSplat:
 
     gaussians: Gaussians
     background: Tensor
-    options: RasterOptions = RasterOptions()
+    options: RasterOptions = field(default_factory=RasterOptions)
     weights: Callable[[], Tensor] | None = None
 
 

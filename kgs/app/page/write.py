@@ -100,16 +100,17 @@ class _Page:
         """
         from markupsafe import Markup
 
-        data = {"scene": self._scene, "settings": self._settings}
+        splat = {}
         words = {}
         if packed is not None:
-            splat = base64.b64encode(packed.content).decode()
-            data |= {"layout": packed.layout, "content": splat}
+            content = base64.b64encode(packed.content).decode()
+            splat = {"layout": packed.layout, "content": content}
             words = {
                 "reduced": packed.left_out,
-                "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(splat))}",
+                "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
                 "page_size": _megabytes(page_bytes),
             }
+        data = {"scene": self._scene, "settings": self._settings, **splat}
         text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
         html: str = self._template.render(**self._context, **words, film=film, data=Markup(text))
         return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
