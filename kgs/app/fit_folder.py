@@ -20,11 +20,11 @@ from kgs.app.files.staging import Staging
 from kgs.app.page.fit_page import write_own_page
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
-from kgs.fit.checkpoint import previous
+from kgs.fit.checkpoint import previous, save_checkpoint
 from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
-from kgs.fit.measure import measure
-from kgs.fit.plan import expected_memory, make_plan, most_gaussians
+from kgs.fit.measures import measure
+from kgs.fit.plan import Plan, expected_memory, make_plan, most_gaussians
 from kgs.fit.probes import decide
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points
@@ -87,20 +87,21 @@ def fit_folder(
     out = Path(out)
     stages = Stages(say) if stages is None else stages
     check_packages("jinja2", "matplotlib")  # even what is used only after training
+    plan = make_plan(scene, config)
     _check_size(scene, config, lpips)
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene, names)
     with locked(out):
         staging = Staging(out)
         staging.complete()
-        trainer, source = _trainer(scene, config, out, resume, say, stages)
+        trainer, source = _trainer(scene, config, plan, out, resume, say, stages)
         notes = _Notes(trainer, say)
         new = staging.unfinished
         is_trained = False
         try:
             if source != new:
                 staging.start()
-                trainer.save(new / CHECKPOINT)  # initial points can take a minute
+                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
             write_json(new / "config.json", _settings(trainer, request))
             stages.begin("fit")
             fit, stopped_by = train(trainer, new / CHECKPOINT)
@@ -152,7 +153,7 @@ def _check_out(out: Path, scene: Scene, names: dict[str, str]) -> None:
 
 
 def _trainer(
-    scene: Scene, config: FitConfig, out: Path, resume: bool, say: Callable[[str], None], stages: Stages
+    scene: Scene, config: FitConfig, plan: Plan, out: Path, resume: bool, say: Callable[[str], None], stages: Stages
 ) -> tuple[Trainer, Path]:
     """A trainer that begins, or one that continues; and the folder of its checkpoint, `out` for one that begins."""
     if resume:
@@ -165,7 +166,6 @@ def _trainer(
         say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
     if is_own(out / "splat.ply"):
         say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
-    plan = make_plan(scene, config)
     stages.begin("initial points")
     points = choose_points(scene, config, each)
     say(f"initial points: {len(points.points)} ({points.kind})")

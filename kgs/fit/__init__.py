@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from kgs.init_points import InitialPoints, initial_points
 
     from .fit import Fit
-    from .measure import measure
+    from .measures import measure
     from .plan import Plan, make_plan
     from .run import choose_points, fit_scene
     from .trainer import Trainer
@@ -50,6 +50,6 @@ __getattr__, __dir__ = lazy_names(
         "kgs.fit.trainer": ("Trainer",),
         "kgs.fit.fit": ("Fit",),
         "kgs.fit.run": ("choose_points", "fit_scene"),
-        "kgs.fit.measure": ("measure",),
+        "kgs.fit.measures": ("measure",),
     },
 )

@@ -9,6 +9,7 @@ import torch
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
 from kgs.machine import check_device
+from kgs.types import check_kind
 
 from .config import FitConfig
 
@@ -70,9 +71,12 @@ def make_plan(scene: Scene, config: FitConfig) -> Plan:
         config: the settings as they were asked for.
 
     Raises:
+        TypeError: an argument is of another type.
         ValueError: the device cannot be used, or the backend does not run on it.
         ModuleNotFoundError: the backend is numba or triton, and it is not installed.
     """
+    check_kind("scene", scene, Scene)
+    check_kind("config", config, FitConfig)
     device = check_device(config.device)
     backend = resolve(config.backend, device)
     config = with_pace(config, len(scene.train))

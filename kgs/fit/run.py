@@ -30,9 +30,9 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = s
         ValueError: images are too small, points too few, or the device or backend is not available.
     """
     config = FitConfig() if config is None else config
+    plan = make_plan(scene, config)
     points = choose_points(scene, config, stage)
-    plan = decide(scene, make_plan(scene, config), choose_points, stage)
-    return prune(Trainer(scene, plan, points).fit())
+    return prune(Trainer(scene, decide(scene, plan, choose_points, stage), points).fit())
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:

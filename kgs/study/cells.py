@@ -18,7 +18,7 @@ from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.fit import Fit
-from kgs.fit.measure import measure
+from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
 from kgs.fit.probes import decide
 from kgs.fit.prune import prune

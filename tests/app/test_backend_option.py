@@ -10,8 +10,10 @@ from kgs import DataError, backends
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import fit_folder
 from kgs.app.saved_fit import load_fit
+from kgs.app.scene_request import SceneRequest
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.plan import make_plan
+from kgs.fit.prune import prune
 from kgs.json_files import read_json
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
@@ -50,17 +52,16 @@ def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
 
 
 @pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch"), ("numba", "numba")])
-def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, asked, made):
-    request = {"scene": "somewhere", "train_views": None, "downscale": None, "background": "black"}
-    metrics, _ = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, request=request)
-    assert metrics["backend"] == made
+def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, monkeypatch, asked, made):
+    monkeypatch.setattr(SceneRequest, "load", lambda *_: scene)
+    published = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, SceneRequest("somewhere"))
+    assert published.fit.metrics["backend"] == made
     assert read_json(tmp_path / "config.json")["fit"]["backend"] == asked
-    saved = load_fit(tmp_path)
-    assert saved.backend == made
-    assert torch.equal(
-        saved.render(scene.test.camera(0), scene.background),
-        Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT).render(scene.test.camera(0)),
-    )
+    fit = load_fit(tmp_path)[1]
+    assert fit.backend == made
+    camera = scene.test.camera(0)
+    resumed = Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT).fit()
+    assert torch.equal(fit.render(camera), prune(resumed).render(camera))
 
 
 @pytest.mark.parametrize(("begun", "other"), [("torch", "numba"), ("numba", "torch")])

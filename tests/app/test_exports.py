@@ -17,11 +17,13 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
 from kgs.app.cli.render import render
-from kgs.app.files import film
+from kgs.app.files import exports, film
 from kgs.app.files.cameras import camera_list, upright
 from kgs.app.files.outputs import EXPORTS, film_in
 from kgs.app.files.ownership import is_own
-from kgs.fit import exports
+from kgs.app.files.staging import Staging
+from kgs.datasets import Scene
+from kgs.fit import Fit, exports
 from kgs.geometry import typical_depths
 from kgs.json_files import write_json
 
@@ -53,7 +55,6 @@ def test_a_viewers_camera_sees_what_ours_does(tmp_path: Path) -> None:
     """With the reader of the reference viewers in mind: pixel = f R^T (x - position) + the middle."""
     views, offset = random_views(3), torch.tensor([1e6, 2e6, -5.0]).double()
     write_json(tmp_path / "cameras.json", camera_list([views.select([2, 0]), views.select([1])], offset, POINTS))
-    assert is_own(tmp_path / "cameras.json")
     listed = json.loads((tmp_path / "cameras.json").read_text())
     assert [(each["id"], each["img_name"]) for each in listed] == [
         (0, views.names[2]),
@@ -87,73 +88,47 @@ def test_upright() -> None:
         torch.testing.assert_close(found @ found.T, torch.eye(3).double())
 
 
-def test_the_film_that_cannot_be_is_a_note(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-
-    class Fitted:
-        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
-        scene.background = torch.zeros(3)
-        shown, notes = random_model(), list[str]()
-        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
-
-        def note(self, text: str) -> None:
-            self.notes.append(text)
-
+@pytest.fixture
+def fit(monkeypatch: Any) -> Fit:
+    """A fit whose film has three frames."""
     monkeypatch.setattr(film, "FRAMES", 3)
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    none = torch.zeros(0, 3)
+    origin = torch.zeros(3, dtype=torch.float64)
+    scene = Scene(random_views(2), random_views(1), none, none, "none", origin, torch.zeros(3), Path())
+    return Fit(scene, random_model(), kgs.RasterOptions())
+
+
+def test_the_film_that_cannot_be_is_a_note(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert exports.write_exports(fit, tmp_path) == []
     assert {path.name for path in tmp_path.iterdir()} == set(EXPORTS) - {"turntable.mp4"}
-    assert all(is_own(path) for path in tmp_path.iterdir())
     assert film_in(tmp_path) == tmp_path / "turntable.webm"
     (tmp_path / "turntable.webm").unlink()
     assert film_in(tmp_path) is None
     monkeypatch.setattr(exports, "write_film", lambda *_: "no turntable.webm: a reason")
     monkeypatch.setenv("KGS_H264", "libx264")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    assert Fitted.notes == [
+    assert exports.write_exports(fit, tmp_path) == [
         "no turntable.webm: a reason",
         "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)",
     ]
 
 
-def test_the_film_leaves_out_what_is_right_before_its_camera(tmp_path: Path, monkeypatch: Any) -> None:
-    class Fitted:
-        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
-        scene.background = torch.ones(3)
-        shown = random_model()
-        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
-
-    given: list[Any] = []
-    monkeypatch.setattr(exports, "write_film", lambda path, render, views, *_: given.extend([render, views]) or "")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    render, views = given
-    camera = views.camera(0)
-    nearest = float(typical_depths(Fitted.shown.means, views.cameras)[0])
-    camera.extrinsics[0, 2, 3] -= 0.6 * nearest  # among the Gaussians
-    with torch.no_grad():
-        images = [
-            kgs.GaussianRenderer(near_plane=near).eval()(Fitted.shown(), camera, Fitted.scene.background).image
-            for near in (0.01, nearest / 2)
-        ]
-    assert (images[0] - images[1]).abs().max() > 0.01
-    torch.testing.assert_close(render(camera), images[1])
-
-
-def test_one_film_takes_the_place_of_the_other(tmp_path: Path, monkeypatch: Any) -> None:
-    class Fitted:
-        scene = type("Scene", (), {"train": random_views(2), "test": random_views(1), "offset": torch.zeros(3)})()
-        scene.background = torch.zeros(3)
-        shown = random_model()
-        renderer, device, backend = kgs.GaussianRenderer(), "cpu", "auto"
-
+def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
     pytest.importorskip("av")
-    monkeypatch.setattr(film, "FRAMES", 3)
+    staging = Staging(tmp_path)
+
+    def publish() -> list[str]:
+        staging.start()
+        exports.write_exports(fit, staging.unfinished)
+        staging.seal()
+        staging.complete()
+        return sorted(path.name for path in tmp_path.glob("turntable.*"))
+
+    assert publish() == ["turntable.webm"]
     monkeypatch.setenv("KGS_H264", "libx264")
-    (tmp_path / "turntable.webm").write_bytes(b"made by kgs")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
-    assert [path.name for path in tmp_path.glob("turntable.*")] == ["turntable.mp4"]
-    assert is_own(tmp_path / "turntable.mp4")
+    assert publish() == ["turntable.mp4"]
     (tmp_path / "turntable.webm").write_bytes(b"mine")
-    exports.write_exports(Fitted(), tmp_path)  # type: ignore[arg-type]
+    assert publish() == ["turntable.mp4", "turntable.webm"]
     assert (tmp_path / "turntable.webm").read_bytes() == b"mine"
 
 
@@ -166,8 +141,9 @@ def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_
     kgs.save_ply(tmp_path / "splat.ply", model)
     render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "clear", background="transparent")
     render(tmp_path / "splat.ply", cameras=folder, out=tmp_path / "opaque", background=background)
-    names = sorted(path.name for path in (tmp_path / "opaque").iterdir())
-    assert names == sorted(path.name for path in (tmp_path / "clear").iterdir())
+    names = sorted(path.name for path in (tmp_path / "opaque").glob("*.png"))
+    assert names == sorted(path.name for path in (tmp_path / "clear").glob("*.png"))
+    assert len(names) == 6
     for name in names:
         clear = cv2.imread(str(tmp_path / "clear" / name), cv2.IMREAD_UNCHANGED).astype(float)
         opaque = cv2.imread(str(tmp_path / "opaque" / name)).astype(float)
@@ -178,3 +154,18 @@ def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_
         composed = share * clear[:, :, :3] + (1 - share) * (255 if background == "white" else 0)
         assert np.abs(composed - opaque).max() <= 1.6  # three values, each rounded to 8 bits
         assert is_own(tmp_path / "clear" / name)
+
+
+def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
+    renders: list[Any] = []
+    monkeypatch.setattr(exports, "write_film", lambda path, render, views, *_: renders.append(render) or "")
+    exports.write_exports(fit, tmp_path)
+    camera = fit.scene.train.camera(0)
+    nearest = float(typical_depths(fit.model.means, fit.scene.train.cameras)[0])
+    camera.extrinsics[0, 2, 3] -= 0.6 * nearest  # among the Gaussians
+    with torch.no_grad():
+        images = [
+            kgs.GaussianRenderer(near_plane=near).eval()(fit.model(), camera).image for near in (0.01, nearest / 2)
+        ]
+    assert (images[0] - images[1]).abs().max() > 0.01
+    torch.testing.assert_close(renders[0](camera), images[1])

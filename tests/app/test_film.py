@@ -17,7 +17,6 @@ from torch import Tensor
 from kgs import GaussianRenderer, Gaussians
 from kgs.app.files import encoders, film
 from kgs.app.files.film import tour, write_film
-from kgs.app.files.ownership import is_own
 from kgs.datasets.scene import Views, pinholes
 
 
@@ -204,7 +203,6 @@ def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: st
     views, path = views_of(size), tmp_path / f"film{suffix}"
     assert write_film(path, kept, views, 1.0) == ""
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
-    assert is_own(path)
     video, frames = cv2.VideoCapture(str(path)), []
     while (found := video.read())[0]:
         frames.append(torch.from_numpy(np.ascontiguousarray(found[1][:, :, ::-1])).permute(2, 0, 1) / 255)
@@ -287,7 +285,6 @@ def test_a_phone_plays_the_mp4(tmp_path: Path, monkeypatch: Any) -> None:
     kinds = [kind for kind, _ in boxes(content)]
     assert kinds[0] == b"ftyp"
     assert kinds.index(b"moov") < kinds.index(b"mdat")
-    assert boxes(content)[-1] == (b"free", b"made by kgs")
     configuration = content[content.index(b"avcC") + 4 :]
     assert configuration[1] in (66, 77)  # baseline, main (ISO/IEC 14496-15)
     assert configuration[3] <= 31  # level 3.1: 1280x720 at 30 frames per second
@@ -315,7 +312,6 @@ def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: A
     smaller = tmp_path / f"smaller{suffix}"
     smaller.write_bytes(film.film_within(path, size // 3))
     assert 0 < smaller.stat().st_size <= size // 3
-    assert is_own(smaller)
     video, count = cv2.VideoCapture(str(smaller)), 0
     while (found := video.read())[0]:
         count += 1
@@ -386,7 +382,6 @@ def test_a_render_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_film(tmp_path / "film.webm", failing, views_of((12, 16)), 1.0)
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("film.webm", b"before")]
-    assert not is_own(tmp_path / "film.webm")
 
 
 @pytest.mark.slow

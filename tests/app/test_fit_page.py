@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,18 +13,20 @@ import pytest
 import torch
 from factories import random_views
 
+from kgs.app import fit_folder as app
 from kgs.app.cli.evaluate import evaluate
+from kgs.app.files.ownership import is_own
 from kgs.app.page import fit_page
-from kgs.app.page.fit_page import refresh_page, spread, write_own_page
+from kgs.app.page.fit_page import spread, write_own_page
 from kgs.app.saved_fit import load_fit
-from kgs.datasets import Views, load_scene, synthetic_scene
-from kgs.fit import run
+from kgs.app.scene_request import SceneRequest
+from kgs.datasets import Views, synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.init_points import InitialPoints
 from kgs.metrics.lpips import Lpips
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
-REQUEST = {"train_views": 3, "downscale": None, "background": "black"}
+REQUEST = SceneRequest("/photos/mine/room", train_views=3)
 REPORT = {
     "photos": {"a.jpg": {"points": 70, "blurred": True}, "b.jpg": {"points": 90, "blurred": False}},
     "matches": [["a.jpg", "b.jpg", 123]],
@@ -36,15 +39,27 @@ REPORT = {
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: Any) -> Any:
-    out, scene = tmp_path_factory.mktemp("fitted"), synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0)
-    scene = replace(scene, root=out)
+    """A folder, and the fit in it."""
+    out = tmp_path_factory.mktemp("fitted")
+    scene = replace(synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0), root=out)
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "choose_points", lambda *_: InitialPoints(points, torch.full((150, 3), 0.5), "random"))
-        request = REQUEST | {"scene": "/photos/mine/room"}
-        run.fit_scene(scene, CONFIG, out, request=request, before_publish=write_own_page, say=lambda line: None)
-    return out, scene
+        patch.setattr(app, "choose_points", lambda *_: InitialPoints(points, torch.full((150, 3), 0.5), "random"))
+        return out, app.fit_folder(scene, CONFIG, out, REQUEST, say=lambda line: None).fit
+
+
+@pytest.fixture
+def rewritten(fitted: Any, tmp_path: Path) -> Any:
+    """Writes the page of the same fit with another scene or measures into another folder; its text."""
+    out, fit = fitted
+    shutil.copyfile(out / "config.json", tmp_path / "config.json")
+
+    def text(**changes: Any) -> str:
+        write_own_page(tmp_path, out, replace(fit, **changes), REQUEST)
+        return (tmp_path / "index.html").read_text(encoding="utf-8")
+
+    return text
 
 
 def test_it_says_what_the_fit_knows(fitted: Any) -> None:
@@ -67,63 +82,38 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert "0123abcd" not in text
 
 
-def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any) -> None:
-    out, scene = fitted
-    own, metrics = (out / "index.html").read_bytes(), json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-    refresh_page(out, load_fit(out), replace(scene, root=out / "elsewhere"), metrics)
-    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", (out / "index.html").read_text(encoding="utf-8")))
+def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any, rewritten: Any) -> None:
+    out, fit = fitted
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", rewritten(scene=replace(fit.scene, root=out / "other"))))
     assert "blurred" not in facts
     assert "time" not in facts
-    (out / "index.html").write_bytes(own)
 
 
-def test_measures_that_come_later_are_on_it(fitted: Any, tmp_path: Path) -> None:
-    out, scene = fitted
-    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+def test_measures_that_come_later_are_on_it(fitted: Any, rewritten: Any) -> None:
+    metrics = json.loads(json.dumps(fitted[1].metrics))
     for view in (metrics["test"], *metrics["test"]["views"]):
         view["lpips_vgg"] = 0.4321
-    refresh_page(out, load_fit(out), scene, metrics)
-    assert ">LPIPS</th>" in (out / "index.html").read_text(encoding="utf-8")
-    own = (out / "index.html").read_bytes()
-    (out / "index.html").write_text("mine")
-    refresh_page(out, load_fit(out), scene, metrics)
-    assert (out / "index.html").read_text(encoding="utf-8") == "mine"
-    (out / "index.html").write_bytes(own)
+    assert ">LPIPS</th>" in rewritten(metrics=metrics)
 
 
-def flat_views(masks: Any = None, light: Any = None) -> Views:
-    """Two photos of 20 x 30 pixels: grey inside, of two colours at the border."""
-    images = torch.full((2, 3, 20, 30), 0.5)
-    for image, colour in zip(images, ([0.2, 0.4, 0.6], [0.4, 0.4, 0.8]), strict=True):
-        image[:, [0, -1], :] = torch.tensor(colour)[:, None, None]
-        image[:, :, [0, -1]] = torch.tensor(colour)[:, None, None]
-    return replace(random_views(2, 20, 30), images=images, masks=masks, light=light)
-
-
-def test_the_ground_is_the_mean_of_the_photos_border() -> None:
-    black = torch.zeros(3)
-    torch.testing.assert_close(fit_page._ground(flat_views(), black), torch.tensor([0.3, 0.4, 0.7]))
-    assert torch.equal(fit_page._ground(flat_views(masks=torch.ones(2, 1, 20, 30)), black), black)
-    assert torch.equal(fit_page._ground(flat_views(), torch.ones(3)), torch.ones(3))
-    light = torch.zeros(20, 30)
-    light[3:-3, 3:-3] = 1.0  # a dark border that no photo shows the scene in
-    torch.testing.assert_close(fit_page._ground(flat_views(light=light), black), torch.full((3,), 0.5))
-
-
-def test_without_a_photo_held_out_training_views_are_shown(fitted: Any) -> None:
-    out, scene = fitted
-    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8")) | {"test": None, "seen": None}
-    refresh_page(out, load_fit(out), replace(scene, test=scene.test.select([])), metrics)
-    text = (out / "index.html").read_text(encoding="utf-8")
+def test_without_a_photo_held_out_training_views_are_shown(fitted: Any, rewritten: Any) -> None:
+    fit = fitted[1]
+    scene = replace(fit.scene, test=fit.scene.test.select([]))
+    text = rewritten(scene=scene, metrics=fit.metrics | {"test": None, "seen": None})
     assert "No photo was held out" in text
     assert "The training photos." in text
     assert text.count('class="render"') == 3
 
 
-def test_a_page_without_photos_shows_none(folder: Path, tmp_path: Path) -> None:
-    request = REQUEST | {"scene": str(folder), "photos": False}
+def fit_of(folder: Path, out: Path, **changes: Any) -> None:
+    """A fit of few steps and points."""
+    request = SceneRequest(str(folder), 3, **changes)
     config = replace(CONFIG, init="random", init_points=50)
-    run.fit_scene(load_scene(folder, 3), config, tmp_path, request=request, before_publish=write_own_page)
+    app.fit_folder(request.load(out), config, out, request, say=lambda line: None)
+
+
+def test_a_page_without_photos_shows_none(folder: Path, tmp_path: Path) -> None:
+    fit_of(folder, tmp_path, photos=False)
     for again in (False, True):
         if again:
             evaluate(tmp_path)
@@ -144,6 +134,25 @@ def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None
     evaluate(tmp_path)
     assert (tmp_path / "index.html").stat().st_size > 50_000
     assert "LPIPS" not in capsys.readouterr().out
+    assert is_own(tmp_path / "index.html")
+    assert is_own(tmp_path / "metrics.json")
+
+
+def test_eval_keeps_a_page_that_the_user_changed(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    fit_of(folder, tmp_path)
+    (tmp_path / "index.html").write_text("mine")
+    evaluate(tmp_path)
+    assert (tmp_path / "index.html").read_text(encoding="utf-8") == "mine"
+    assert "index.html was not written by kgs and is kept" in capsys.readouterr().out
+    assert not is_own(tmp_path / "index.html")
+
+
+def test_the_scene_and_the_fit_come_back(folder: Path, tmp_path: Path) -> None:
+    fit_of(folder, tmp_path, background="white", roll=90.0)
+    request, fit = load_fit(tmp_path)
+    assert request == SceneRequest(str(folder), 3, background="white", roll=90.0)
+    assert fit.scene.background.tolist() == [1.0, 1.0, 1.0]
+    assert fit.psnr(fit.scene.test) == pytest.approx(fit.metrics["test"]["psnr"], abs=1e-4)
 
 
 class Half:
@@ -159,10 +168,7 @@ class Half:
 
 
 def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
-    config = replace(CONFIG, init="random", init_points=50)
-    request = REQUEST | {"scene": str(folder)}
-    scene = load_scene(folder, 3)
-    run.fit_scene(scene, config, tmp_path, request=request, before_publish=write_own_page, say=lambda line: None)
+    fit_of(folder, tmp_path)
     before = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     monkeypatch.setattr(Lpips, "load", lambda weights: Half())
     evaluate(tmp_path, lpips_weights=tmp_path)
@@ -179,3 +185,22 @@ def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monk
 def test_pictures_are_spread_over_the_views() -> None:
     assert spread(3, 6) == [0, 1, 2]
     assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
+
+
+def flat_views(masks: Any = None, light: Any = None) -> Views:
+    """Two photos of 20 x 30 pixels: grey inside, of two colours at the border."""
+    images = torch.full((2, 3, 20, 30), 0.5)
+    for image, colour in zip(images, ([0.2, 0.4, 0.6], [0.4, 0.4, 0.8]), strict=True):
+        image[:, [0, -1], :] = torch.tensor(colour)[:, None, None]
+        image[:, :, [0, -1]] = torch.tensor(colour)[:, None, None]
+    return replace(random_views(2, 20, 30), images=images, masks=masks, light=light)
+
+
+def test_the_ground_is_the_mean_of_the_photos_border() -> None:
+    black = torch.zeros(3)
+    torch.testing.assert_close(fit_page._ground(flat_views(), black), torch.tensor([0.3, 0.4, 0.7]))
+    assert torch.equal(fit_page._ground(flat_views(masks=torch.ones(2, 1, 20, 30)), black), black)
+    assert torch.equal(fit_page._ground(flat_views(), torch.ones(3)), torch.ones(3))
+    light = torch.zeros(20, 30)
+    light[3:-3, 3:-3] = 1.0  # a dark border that no photo shows the scene in
+    torch.testing.assert_close(fit_page._ground(flat_views(light=light), black), torch.full((3,), 0.5))

@@ -1,17 +1,16 @@
-"""Files for the user: names of their own, marks by which kgs knows its own files, and nothing of the user's lost."""
+"""Files for the user: names of their own, the list by which kgs knows its own files, and nothing of the user's lost."""
 
 import json
 import os
+from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 import torch
 
-import kgs
-from kgs.app.files.figures import write_curve
 from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.ownership import is_own, remove_own_images
+from kgs.app.files.ownership import LIST, claim, holds_only_own, is_own, read_list, record
+from kgs.app.files.staging import Staging
 from kgs.errors import DataError
 from kgs.json_files import write_json, write_whole
 
@@ -39,24 +38,79 @@ def test_long_names_can_be_written(tmp_path):
     assert len(os.listdir(tmp_path)) == 1
 
 
-def test_a_png_keeps_its_pixels_and_bears_a_mark(tmp_path):
+def test_a_png_keeps_its_pixels(tmp_path):
     image = torch.arange(60).reshape(3, 4, 5) / 255
     write_png(tmp_path / "a.png", image)
     pixels = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
     assert torch.equal(torch.from_numpy(pixels).permute(2, 0, 1), (image * 255).round().byte())
-    assert is_own(tmp_path / "a.png")
 
 
-def test_kgs_knows_its_own_files(tmp_path):
-    model = kgs.GaussianModel.from_points(torch.rand(5, 3), torch.rand(5, 3), 0)
-    kgs.save_ply(tmp_path / "splat.ply", model)
-    write_curve(tmp_path / "curve.png", {"": CURVE})
-    write_json(tmp_path / "metrics.json", {"versions": {"kgs": kgs.__version__}})
-    assert all(is_own(tmp_path / name) for name in ("splat.ply", "curve.png", "metrics.json"))
-    cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((4, 4, 3), np.uint8))
-    (tmp_path / "other.ply").write_text("ply\nformat ascii 1.0\ncomment made by hand\n")
-    (tmp_path / "other.json").write_text('{"name": "not of kgs"}')
-    assert not any(is_own(tmp_path / name) for name in ("photo.png", "other.ply", "other.json", "none.png", ""))
+# -- the list of own files -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def listed(tmp_path):
+    """A folder whose list has `a.txt` and `deeper/b.txt`."""
+    (tmp_path / "deeper").mkdir()
+    for name in ("a.txt", "deeper/b.txt"):
+        (tmp_path / name).write_text("kgs")
+    record(tmp_path, "fit", ["a.txt", "deeper/b.txt"])
+    return tmp_path
+
+
+def test_what_is_in_the_list_is_own_and_nothing_else(listed, monkeypatch):
+    (listed / "mine.txt").write_text("mine")
+    monkeypatch.chdir(listed)
+    assert is_own(listed / "a.txt")
+    assert is_own(listed / "deeper" / "b.txt")
+    assert is_own(Path("deeper/b.txt"))
+    assert not is_own(listed / "mine.txt")
+    assert not is_own(listed / "none.txt")
+    assert holds_only_own(listed / "deeper")
+    assert not holds_only_own(listed)
+
+
+@pytest.mark.parametrize("change", ["content", "time", "link"])
+def test_an_own_file_that_was_changed_is_the_users(listed, change):
+    path = listed / "a.txt"
+    if change == "content":
+        path.write_text("mine, longer")
+    elif change == "time":
+        os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+    else:
+        path.rename(listed / "other.txt")
+        (listed / "photo").write_text("mine")
+        path.symlink_to(listed / "photo")
+    assert not is_own(path)
+    with pytest.raises(DataError, match="was not written by kgs"):
+        check_folder(listed, ["a.txt"])
+    assert is_own(listed / "deeper" / "b.txt")
+
+
+def test_what_is_about_to_be_written_is_own_and_kinds_do_not_touch_each_other(listed):
+    claim(listed, "renders", ["a.txt", "new.png"])
+    write_png(listed / "new.png", torch.zeros(3, 4, 5))
+    assert is_own(listed / "new.png")  # a kill may come before its entry
+    record(listed, "renders", ["new.png"])
+    (listed / "new.png").write_text("mine")
+    assert not is_own(listed / "new.png")
+    assert set(read_list(listed)["fit"]) == {"a.txt", "deeper/b.txt"}
+
+
+@pytest.mark.parametrize("content", ["", "[]", "null", '{"fit": 3}', '{"fit": {"a.txt": 3}}'])
+def test_a_damaged_list_names_nothing(listed, content):
+    (listed / LIST).write_text(content)
+    assert not is_own(listed / "a.txt")
+
+
+def test_a_folder_is_own_with_a_list_or_empty(tmp_path):
+    (tmp_path / "empty").mkdir()
+    Staging(tmp_path).start()
+    (tmp_path / "finished").mkdir()
+    (tmp_path / "finished" / "thesis.txt").write_text("mine")
+    assert is_own(tmp_path / "empty")
+    assert is_own(tmp_path / "unfinished")
+    assert not is_own(tmp_path / "finished")
 
 
 @pytest.mark.parametrize("name", ["splat.ply", "config.json", "metrics.json", "curve.png", "test/a.png"])
@@ -88,6 +142,7 @@ def test_no_results_among_the_files_of_a_scene(tmp_path):
         check_folder(scene, ["other.png"], tmp_path / "another scene")
     check_folder(scene / "results", ["a.png"], scene)
     write_png(scene / "results" / "a.png", torch.zeros(3, 4, 5))
+    record(scene / "results", "renders", ["a.png"])
     check_folder(scene / "results", ["a.png"], scene)  # again: those pictures are kgs's
 
 
@@ -116,15 +171,6 @@ def test_a_file_in_the_place_of_a_folder_is_kept(tmp_path):
     (tmp_path / "test").write_text("mine")
     with pytest.raises(DataError, match="was not written by kgs"):
         check_folder(tmp_path, ["test/a.png"])
-
-
-def test_pictures_of_a_former_run_go_and_no_others(tmp_path):
-    for name in ("now.png", "before.png"):
-        write_png(tmp_path / name, torch.zeros(3, 4, 5))
-    cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((4, 4, 3), np.uint8))
-    (tmp_path / "note.txt").write_text("mine")
-    remove_own_images(tmp_path, ["now.png"])
-    assert sorted(os.listdir(tmp_path)) == ["note.txt", "now.png", "photo.png"]
 
 
 def test_files_are_whole_or_as_they_were(tmp_path, monkeypatch):

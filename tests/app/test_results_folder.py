@@ -16,17 +16,19 @@ from typing import Any
 import pytest
 import torch
 
+from kgs.app import fit_folder as app
 from kgs.app.files import staging
-from kgs.app.files.ownership import make_own_folder
+from kgs.app.files.ownership import is_own
 from kgs.app.files.results_folder import CHECKPOINT, locked
-from kgs.app.fit_folder import fit_folder
 from kgs.app.saved_fit import load_fit
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError, TrainingDiverged
-from kgs.fit import run
+from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
-from kgs.fit.config import FitConfig, Recipe, with_pace
-from kgs.fit.plan import make_plan
+from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.plan import make_plan, with_pace
+from kgs.fit.prune import prune
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 
@@ -40,11 +42,13 @@ def scene() -> Any:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_points() -> Any:
+def _few_points(scene: Any) -> Any:
+    """Random initial points; and every folder's scene is the one of these tests."""
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     first = InitialPoints(points, torch.full((150, 3), 0.5), "random")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "choose_points", lambda *_: first)
+        patch.setattr(app, "choose_points", lambda *_: first)
+        patch.setattr(SceneRequest, "load", lambda *_: scene)
         yield
 
 
@@ -65,8 +69,7 @@ def done(first_fit: Path, tmp_path: Path) -> Path:
 def fit(scene: Any, config: FitConfig, out: Path, **options: Any) -> list[str]:
     """Fit; the lines that were said."""
     lines: list[str] = []
-    request = {"scene": "/photos", "train_views": 3, "downscale": None, "background": "black"}
-    fit_folder(scene, config, out, say=lines.append, request=request, **options)
+    app.fit_folder(scene, config, out, SceneRequest("/photos", 3), say=lines.append, **options)
     return lines
 
 
@@ -76,9 +79,10 @@ def contents(out: Path) -> dict[str, bytes]:
 
 def seed_of(out: Path) -> int:
     """The seed of the set of files, the same in all of them."""
-    config, metrics = (json.loads((out / name).read_text()) for name in ("config.json", "metrics.json"))
+    config = json.loads((out / "config.json").read_text())
+    metrics = json.loads((out / "metrics.json").read_text())
     assert config["fit"]["seed"] == metrics["seed"] == load_checkpoint(out / CHECKPOINT)["config"]["seed"]
-    assert load_fit(out).model.means.shape[0] == metrics["gaussians"]
+    assert len(load_fit(out)[1].model) == metrics["gaussians"]
     return int(metrics["seed"])
 
 
@@ -119,18 +123,18 @@ def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkey
     assert "unfinished" not in os.listdir(done)
 
 
-@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "evaluate", "write_json"])
+@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "measure", "write_json"])
 def test_results_that_cannot_be_written_leave_the_old_ones(
     scene: Any, done: Path, monkeypatch: Any, failing: str
 ) -> None:
-    plain = getattr(run, failing)
+    plain = getattr(app, failing)
 
     def full(path: Any, *arguments: Any, **options: Any) -> Any:
         if failing == "write_json" and path.name != "metrics.json":
             return plain(path, *arguments, **options)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(run, failing, full)
+    monkeypatch.setattr(app, failing, full)
     with pytest.raises(OSError, match="space"):
         fit(scene, OTHER, done)
     assert seed_of(done) == 0
@@ -148,10 +152,10 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr(Trainer, "save", full)
-    monkeypatch.setattr(run, "write_png", full)
+    monkeypatch.setattr(app, "write_png", full)
     lines: list[str] = []
     with pytest.raises(OSError, match="space") as error:
-        fit_folder(scene, CONFIG, tmp_path, say=lines.append)
+        app.fit_folder(scene, CONFIG, tmp_path, SceneRequest("/photos"), say=lines.append)
     unfinished = tmp_path / "unfinished"
     assert error.value.filename == str(unfinished / "test" / "test_00.png")
     assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(unfinished))
@@ -163,22 +167,23 @@ def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
     scene: Any, done: Path, monkeypatch: Any, failures: int
 ) -> None:
     """What it shows and what is evaluated later would differ; the last checkpoint is tried again at the end."""
-    failed, save = [], Trainer.save
+    failed = []
+    plain = trainer_module.save_checkpoint
 
-    def full_at_the_end(trainer: Trainer, path: Any) -> None:
-        if trainer.step == 3 and len(failed) < failures:
+    def full_at_the_end(path: Path, state: dict[str, Any]) -> None:
+        if state["step"] == 3 and len(failed) < failures:
             failed.append(1)
             raise OSError(28, "No space left on device", str(path))
-        save(trainer, path)
+        plain(path, state)
 
-    monkeypatch.setattr(Trainer, "save", full_at_the_end)
+    monkeypatch.setattr(trainer_module, "save_checkpoint", full_at_the_end)
     lines: list[str] = []
     if failures == 2:
-        fit_folder(scene, OTHER, done, say=lines.append)
+        app.fit_folder(scene, OTHER, done, SceneRequest("/photos"), say=lines.append)
         assert load_checkpoint(done / CHECKPOINT)["step"] == 3
         return
     with pytest.raises(OSError, match="No space"):
-        fit_folder(scene, OTHER, done, say=lines.append)
+        app.fit_folder(scene, OTHER, done, SceneRequest("/photos"), say=lines.append)
     assert any(line.startswith(f"{done / 'unfinished'}: holds the results") for line in lines)
     assert seed_of(done) == 0
     monkeypatch.undo()
@@ -194,7 +199,7 @@ def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
         ({"step": -5}, "step"),
         ({"backend": "foo"}, "backend"),
         ({"poses": {"extrinsics": [1.0]}}, "poses"),
-        ({"poses": "none"}, "model"),
+        ({"poses": "none"}, "poses"),
     ],
 )
 def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], field: str) -> None:
@@ -208,8 +213,9 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
 
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
 def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, moves: int) -> None:
-    make_own_folder(done / "finished")  # half removed
-    plain, calls = os.replace, []
+    (done / "finished").mkdir()  # half removed
+    plain = os.replace
+    calls = []
 
     def killed(source: Any, target: Any) -> None:
         if Path(source).name == "unfinished" or calls:
@@ -222,9 +228,50 @@ def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, 
     with pytest.raises(KeyboardInterrupt):
         fit(scene, OTHER, done)
     monkeypatch.undo()
+    assert all(is_own(path) for path in done.rglob("*") if path.is_file() and path.name[0] != ".")
     load_fit(done)  # ends the move
     assert seed_of(done) == (0 if moves == 0 else 1)
     assert not (done / "finished").exists()
+    fit(scene, CONFIG, done)
+    assert seed_of(done) == 0
+
+
+def test_a_kill_between_seal_and_complete(scene: Any, done: Path, monkeypatch: Any) -> None:
+    fewer = replace(scene, test=scene.test.select([1]))
+    with monkeypatch.context() as patch:
+        patch.setattr(staging.Staging, "complete", lambda self: None)
+        fit(fewer, OTHER, done)
+    assert json.loads((done / "metrics.json").read_text())["seed"] == 0
+    assert len(list((done / "test").iterdir())) == 2
+    assert fit(fewer, OTHER, done, resume=True)[0] == "resumed at step 3"  # of what was sealed
+    assert seed_of(done) == 1
+    assert len(list((done / "test").iterdir())) == 1
+    assert not (done / "finished").exists()
+
+
+def test_a_file_of_kgs_that_the_user_changed_is_the_users(scene: Any, done: Path) -> None:
+    (done / "cameras.json").write_text("[]")
+    with pytest.raises(DataError, match="not written by kgs"):
+        fit(scene, OTHER, done)
+    assert (done / "cameras.json").read_text() == "[]"
+    assert "unfinished" not in os.listdir(done)
+
+
+def test_what_the_new_results_lack_goes_unless_the_user_changed_it(scene: Any, done: Path) -> None:
+    names = sorted(os.listdir(done / "test"))
+    fit(replace(scene, test=scene.test.select([1])), OTHER, done)
+    assert os.listdir(done / "test") == names[1:]
+    fit(scene, CONFIG, done)
+    (done / "test" / names[0]).write_text("mine")
+    fit(replace(scene, test=scene.test.select([1])), OTHER, done)
+    assert (done / "test" / names[0]).read_text() == "mine"
+    fit(replace(scene, test=scene.test.select([])), CONFIG, done)
+    assert os.listdir(done / "test") == names[:1]
+
+
+def test_a_folder_that_becomes_empty_goes(scene: Any, done: Path) -> None:
+    fit(replace(scene, test=scene.test.select([])), OTHER, done)
+    assert not (done / "test").exists()
 
 
 def test_no_pictures_or_checkpoints_of_the_former_fit_stay(scene: Any, done: Path) -> None:
@@ -257,8 +304,8 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done:
 def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one_is_resumed(
     scene: Any, done: Path
 ) -> None:
-    unfinished = Trainer(scene, make_plan(scene, OTHER), run.choose_points(scene, OTHER))
-    make_own_folder(done / "unfinished")
+    unfinished = Trainer(scene, make_plan(scene, OTHER), app.choose_points(scene, OTHER))
+    staging.Staging(done).start()
     path = done / "unfinished" / CHECKPOINT
     unfinished.save(path)
     kept = path.read_bytes()
@@ -321,8 +368,10 @@ def test_what_can_be_known_is_said_before_any_work(scene: Any, tmp_path: Path) -
 
 
 def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
-    saved, trainer = load_fit(done), Trainer.resume(scene, CONFIG, done / CHECKPOINT)
+    request, saved = load_fit(done)
+    trainer = Trainer.resume(scene, CONFIG, done / CHECKPOINT)
     assert trainer.plan.config == with_pace(CONFIG, len(scene.train))
-    assert (saved.config, saved.step, saved.request["scene"]) == (trainer.plan.config, 3, "/photos")
+    assert (saved.settings, request) == (trainer.plan.config, SceneRequest("/photos", 3))
+    assert saved.metrics == json.loads((done / "metrics.json").read_text())
     camera = scene.test.camera(0)
-    assert torch.equal(saved.render(camera, scene.background), trainer.render(camera))
+    assert torch.equal(saved.render(camera), prune(trainer.result()).render(camera))

@@ -9,9 +9,9 @@ import PIL.Image
 import pytest
 from photo_folders import exif, planes, with_exif
 
-from kgs.app.console import silent
 from kgs.app.sfm.read import Exif, open_photos, read_photos
 from kgs.datasets.image_file import ImageFile
+from kgs.progress import silent
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 

@@ -15,15 +15,15 @@ from photo_folders import close, exif, planes, with_exif, write_photos, write_pl
 
 from kgs.app.cli import main
 from kgs.app.cli.unposed import settle
-from kgs.app.console import silent
 from kgs.app.files.outputs import write_png
-from kgs.app.files.ownership import MARK
+from kgs.app.files.ownership import record
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
 from kgs.app.sfm.place import photo_staging
 from kgs.app.sfm.read import blurred, open_photos, read_photos
 from kgs.errors import DataError
 from kgs.json_files import write_json
+from kgs.progress import silent
 
 pytest.importorskip("pycolmap")
 
@@ -228,6 +228,7 @@ def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
 def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
     write_planes(folder)
     (tmp_path / "scene" / "sparse").mkdir(parents=True)
+    (tmp_path / "scene" / "sparse" / "images.bin").write_bytes(b"mine")
     save(tmp_path / "other" / "images", planes())
     for out, said in (
         (folder, "the photos themselves"),
@@ -253,9 +254,10 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     refused(images, "choose another folder", out=tmp_path)
     for path in images.iterdir():  # as renders of kgs are
         write_png(path, torch.rand(3, 8, 8))
+    record(images, "renders", [path.name for path in images.glob("*.png")])
     with pytest.raises(DataError, match="holds the photos themselves"):
         pose_photos(images, tmp_path)
-    assert len(list(images.iterdir())) == 3
+    assert len(list(images.glob("*.png"))) == 3
 
 
 def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
@@ -277,16 +279,30 @@ def test_pycolmap_that_is_not_there(folder, monkeypatch):
 def test_a_move_that_was_stopped_is_ended(tmp_path):
     """A kill between the renaming of the new folder and the last of its parts."""
     staging = photo_staging(tmp_path)
-    staging.start()
-    (staging.unfinished / "sparse" / "0").mkdir(parents=True)
-    (staging.unfinished / "sparse" / "0" / "cameras.bin").touch()
-    save(tmp_path / "images", planes()[:1], ["old.png"])
-    save(staging.unfinished / "images", planes()[:1], ["new.png"])
-    write_json(staging.unfinished / "photos.json", {})
-    staging.seal()
-    staging.complete()
-    left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*"))
+    for name in ("old.png", "new.png"):
+        staging.start()
+        (staging.unfinished / "sparse" / "0").mkdir(parents=True)
+        (staging.unfinished / "sparse" / "0" / "cameras.bin").touch()
+        save(staging.unfinished / "images", planes()[:1], [name])
+        write_json(staging.unfinished / "photos.json", {})
+        staging.seal()
+        if name == "new.png":
+            os.replace(staging.finished / "photos.json", tmp_path / "photos.json")
+        staging.complete()
+    left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.name[0] != ".")
     assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0", "sparse/0/cameras.bin"]
+
+
+def test_a_users_photos_among_pictures_of_kgs_stay(folder, tmp_path):
+    """As where `kgs render` wrote into the folder of the photos."""
+    out = tmp_path / "project"
+    images = save(out / "images", planes()[:1], ["IMG_1.png"])
+    write_png(images / "render.png", torch.rand(3, 8, 8))
+    record(images, "renders", ["render.png"])
+    before = (images / "IMG_1.png").read_bytes()
+    with pytest.raises(DataError, match="kgs did not write"):
+        pose_photos(write_planes(folder), out)
+    assert (images / "IMG_1.png").read_bytes() == before
 
 
 def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch):
@@ -299,7 +315,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         (new / "images").mkdir()
         (new / "sparse" / "0").mkdir(parents=True)
         for path in paths:
-            (new / "images" / path.name).write_bytes(MARK)
+            (new / "images" / path.name).write_bytes(b"photo")
         for name in ("cameras", "images", "points3D"):
             (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
         return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from photo_folders import write_planes
 
-from kgs.app.console import silent
 from kgs.app.sfm.find import find_photos, list_photos, notes_on
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import folders
 from kgs.datasets.image_file import is_heic
 from kgs.errors import DataError
+from kgs.progress import silent
 
 pi_heif = pytest.importorskip("pi_heif")
 

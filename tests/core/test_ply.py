@@ -273,6 +273,7 @@ def test_what_takes_a_splat_takes_flat_discs(tmp_path):
     assert weights[2] > 0
     densifier = Densifier(model, torch.optim.Adam(model.parameters()), extent=10.0, grad_threshold=0.0)
     render = GaussianRenderer()(model(), camera)
+    render.projected.means2d.retain_grad()
     render.image.sum().backward()
     densifier.observe(render.projected)
     report = densifier.step()

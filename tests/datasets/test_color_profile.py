@@ -13,9 +13,9 @@ import PIL.Image
 import pytest
 from PIL import ImageCms
 
-from kgs.app.console import silent
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets.image_file import read_image
+from kgs.progress import silent
 
 # The primaries of Display P3 adapted to D50 (SMPTE EG 432-1, Bradford), and their linear light in that of sRGB.
 P3_COLORANTS = ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407))

@@ -84,8 +84,8 @@ def test_a_fit_resumes_bit_for_bit_and_goes_to_the_cpu_and_back(device, scene, p
     assert all(bool(value.isfinite().all()) for value in bits(other).values())
 
 
-def test_scores_opacity_penalty_and_coarse_steps(device, scene, points, config):
-    done = fitted(scene, points, replace(config, coarse=0.5, growth=0.8))
+def test_coarse_steps(device, scene, points, config):
+    done = fitted(scene, points, replace(config, coarse=0.5))
     assert all(bool(value.isfinite().all()) for value in bits(done).values())
 
 

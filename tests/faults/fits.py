@@ -13,14 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from kgs.fit.config import FitConfig, Recipe, timetable
+from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.plan import timetable
 
 __all__ = ["PATIENCE", "Fit", "memory_of"]
 
 SIZE = (48, 64)
 PATIENCE = 300.0  # seconds after which a process is taken to hang
 _PROCESSES = multiprocessing.get_context("forkserver")  # which has imported what they need once for all of them
-_PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.fit.run", "torch._dynamo", "matplotlib.figure", "trimesh"])
+_PROCESSES.set_forkserver_preload(
+    ["kgs.datasets", "kgs.app.fit_folder", "torch._dynamo", "matplotlib.figure", "trimesh"]
+)
 
 
 def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
@@ -77,8 +80,9 @@ class Fit:
 def _fit(fit: Fit, limit: int | None) -> None:
     import torch
 
+    from kgs.app.fit_folder import fit_folder
+    from kgs.app.scene_request import SceneRequest
     from kgs.datasets import synthetic_scene
-    from kgs.fit import run
     from kgs.fit.trainer import Trainer
 
     torch.set_num_threads(1)
@@ -90,15 +94,16 @@ def _fit(fit: Fit, limit: int | None) -> None:
         fit.started.touch()
         if limit is not None and trainer.step >= fit.steps // 5:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-        return evaluate(trainer, views) if trainer.step == trainer.config.steps else None
+        return evaluate(trainer, views) if trainer.step == trainer.plan.times.steps else None
 
     Trainer.psnr = psnr  # type: ignore[assignment,method-assign]
     try:
-        _, stopped_by = run.fit_scene(scene, _config(fit.steps, fit.points), fit.out, resume=True, say=lambda _: None)
+        config = _config(fit.steps, fit.points)
+        published = fit_folder(scene, config, fit.out, SceneRequest("."), resume=True, say=lambda _: None)
     except OSError:
         os._exit(1)  # as the command does, with one line
-    if stopped_by:
-        os._exit(128 + stopped_by)
+    if published.signal:
+        os._exit(128 + published.signal)
 
 
 def memory_of(folder: Path, steps: int) -> tuple[float, int, int]:
@@ -117,7 +122,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.config import most_gaussians
+    from kgs.fit.plan import make_plan, most_gaussians
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
 
@@ -125,7 +130,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     scene = synthetic_scene(train_views=3, test_views=1, size=SIZE, seed=0)
     config = replace(_config(steps, points, max_bytes=2**22), evaluations=1)
     points = choose_points(scene, config)
-    trainer = Trainer(scene, config, points)
+    trainer = Trainer(scene, make_plan(scene, config), points)
     before, resident = _resident(), []
 
     def note(trainer: Trainer, _: float) -> bool:

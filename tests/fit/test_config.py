@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from kgs import RasterOptions
-from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, timetable, with_pace
+from kgs.datasets import synthetic_scene
+from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
+from kgs.fit.plan import expected_memory, make_plan, most_gaussians, timetable, with_pace
 
 
 def test_full_length_is_the_release():
@@ -71,6 +74,7 @@ WRONG = {
     "drop": (1.0, -0.1, math.nan, None, "0.2", True),
     "sh_degree": (4, -1),
     "evaluations": (0,),
+    "coarse": (1.5, -0.1, math.nan),
     "max_gaussians": (0, -5, True, 1.5),
     "seed": (2**59, 1.5),
     "init": ("points", None, ["dense"], "file"),
@@ -116,11 +120,42 @@ def test_the_coarse_share_is_counted_in_steps():
     assert timetable(FitConfig(steps=1000, coarse=0.5)).coarse == 500
 
 
-@pytest.mark.parametrize("name", ["coarse", "growth"])
-@pytest.mark.parametrize("value", [1.5, -0.1, float("nan")])
-def test_shares_are_from_0_to_1(name, value):
-    with pytest.raises(ValueError, match=name):
-        FitConfig(**{name: value})
+# -- the plan ------------------------------------------------------------------------------------------------------
+
+
+SCENE = synthetic_scene(train_views=2, test_views=0, size=(16, 16))
+
+
+def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
+    plan = make_plan(SCENE, FitConfig(seed=3))
+    assert plan.config == with_pace(FitConfig(seed=3), 2)
+    assert plan.config.sh_degree is None
+    assert plan.times == timetable(plan.config)
+    assert (plan.device, plan.needs) == (torch.device("cpu"), {})
+    assert plan.backend in ("numba", "torch")
+
+
+def test_a_degree_changes_the_timetable_and_says_why():
+    first = make_plan(SCENE, FitConfig(steps=100))
+    plan = first.with_degree(2, {"by": "rule"})
+    assert (plan.config.sh_degree, len(plan.times.sh)) == (2, 2)
+    assert plan.needs == {"sh_degree": {"by": "rule"}}
+    assert (first.config.sh_degree, first.times.sh, first.needs) == (None, (), {})
+
+
+@pytest.mark.parametrize("device", ["foo", "meta", "cuda:99"])
+def test_a_device_that_is_not_there_is_refused_by_the_plan(device):
+    with pytest.raises(ValueError, match="^device: expected"):
+        make_plan(SCENE, FitConfig(device=device))
+
+
+def test_more_gaussians_or_pixels_take_more_memory():
+    larger = synthetic_scene(train_views=2, test_views=0, size=(32, 32))
+    assert expected_memory(SCENE, 1000) < expected_memory(SCENE, 10**6)
+    assert expected_memory(SCENE, 1000) < expected_memory(larger, 1000)
+    assert most_gaussians(FitConfig(max_gaussians=7), 100) == 7
+    assert most_gaussians(FitConfig(steps=100), 100) == 1000
+    assert most_gaussians(FitConfig(steps=100), 10_000) == 15_000
 
 
 def test_the_memory_of_a_render_is_bounded_as_without_a_fit():

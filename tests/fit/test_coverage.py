@@ -58,26 +58,23 @@ def test_a_pixel_without_depth_is_not_shown():
 
 
 @pytest.fixture(scope="module")
-def trainer():
+def fit():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
     config = FitConfig(steps=30, sh_degree=0, init="sift", evaluations=1)
-    trainer = Trainer(scene, make_plan(scene, config), choose_points(scene, config))
-    trainer.fit()
-    return trainer
+    return Trainer(scene, make_plan(scene, config), choose_points(scene, config)).fit()
 
 
-def test_both_parts_together_are_the_whole(trainer):
-    scene = trainer.scene
-    found = measure_coverage(scene, trainer.render, trainer.median_depth)
+def test_both_parts_together_are_the_whole(fit):
+    scene = fit.scene
+    found = measure_coverage(scene, fit.render, fit.median_depth)
     assert 0.3 < found["share"] < 1
     errors = [10 ** (-found[name] / 10) for name in ("psnr", "psnr_rest")]
-    render = trainer.render(scene.test.camera(0)).clamp(0, 1)
+    render = fit.render(scene.test.camera(0)).clamp(0, 1)
     whole = 10 ** (-float(psnr(render, scene.test.images, 1.0)) / 10)
     assert found["share"] * errors[0] + (1 - found["share"]) * errors[1] == pytest.approx(whole, rel=1e-3)
-    assert trainer.renderer.training
     assert all(math.isfinite(value) for value in found.values())
 
 
-def test_without_test_views_there_is_nothing_to_say(trainer):
+def test_without_test_views_there_is_nothing_to_say(fit):
     scene = synthetic_scene(train_views=1, test_views=0, size=(8, 8))
-    assert measure_coverage(scene, trainer.render, trainer.median_depth) is None
+    assert measure_coverage(scene, fit.render, fit.median_depth) is None

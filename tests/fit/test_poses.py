@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -10,17 +11,21 @@ from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
 from kgs.app.cli.evaluate import evaluate
-from kgs.app.page.fit_page import write_own_page
-from kgs.app.saved_fit import SavedFit, load_fit
+from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.fit_folder import fit_folder
+from kgs.app.saved_fit import load_fit
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.errors import DataError
-from kgs.fit import FitConfig, Trainer, fit_scene
+from kgs.fit import FitConfig, Trainer
+from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.plan import make_plan
 from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
 from kgs.fit.run import choose_points
 from kgs.geometry import camera_centers
 
 CONFIG = FitConfig(steps=6, seed=5, init="random", init_points=200, sh_degree=0, evaluations=1, refine_poses=True)
+DEPTH = 1.0
 
 
 def turned(extrinsics, degrees, seed):
@@ -67,7 +72,7 @@ def test_cameras_follow_their_gradient(room):
     given = room.train.cameras.extrinsics
     wrong = turned(given, 0.15, seed=1)  # within reach
     scene = place_cameras(room, wrong)
-    poses = MovingPoses(scene.train.cameras.extrinsics, steps=600)
+    poses = MovingPoses(scene.train.cameras.extrinsics, steps=600, depth=DEPTH)
     scene = pulled(poses, scene, given, 600)
     assert degrees_apart(wrong, given) > 0.15
     assert degrees_apart(scene.train.cameras.extrinsics, given) < 0.02
@@ -76,7 +81,7 @@ def test_cameras_follow_their_gradient(room):
 
 def test_what_cameras_have_in_common_stays(room):
     given = room.train.cameras.extrinsics
-    poses = MovingPoses(given, steps=30)
+    poses = MovingPoses(given, steps=30, depth=DEPTH)
     pulled(poses, room, turned(given, 20.0, seed=2), 30)
     for now, before in zip(in_common(poses.extrinsics), in_common(given), strict=True):
         torch.testing.assert_close(now, before, rtol=0, atol=1e-6)
@@ -88,7 +93,7 @@ def test_what_cameras_have_in_common_stays(room):
 def test_none_goes_farther_than_its_reach(room):
     """However steep: a gradient of 1e12, on the way to 90 degrees."""
     given = room.train.cameras.extrinsics
-    poses = MovingPoses(given, steps=90)
+    poses = MovingPoses(given, steps=90, depth=DEPTH)
     for step in range(90):
         camera = poses.camera(room.train.camera(step % 3), step % 3)
         (1e12 * camera.extrinsics[0, 0, 2]).backward()
@@ -102,7 +107,7 @@ def test_none_goes_farther_than_its_reach(room):
 
 @pytest.mark.parametrize("slope", [math.nan, math.inf, None])
 def test_no_step_without_a_finite_gradient(room, slope):
-    poses = MovingPoses(room.train.cameras.extrinsics, steps=5)
+    poses = MovingPoses(room.train.cameras.extrinsics, steps=5, depth=DEPTH)
     camera = poses.camera(room.train.camera(0), 0)
     if slope is not None:
         (slope * camera.extrinsics.sum()).backward()
@@ -115,10 +120,10 @@ def test_a_fit_turns_wrong_cameras_back():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
     wrong = place_cameras(scene, turned(scene.train.cameras.extrinsics, 0.7, seed=5))
     config = FitConfig(steps=150, seed=1, sh_degree=0, init_points=1500, max_gaussians=2000, evaluations=1)
-    points, fits = choose_points(wrong, config), []
-    for moves in (False, True):
-        fits.append(Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves)), points))
-        fits[-1].fit()
+    points = choose_points(wrong, config)
+    fits = [
+        Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves)), points).fit() for moves in (False, True)
+    ]
     fixed, moved = fits
     given, found = scene.train.cameras.extrinsics, moved.scene.train.cameras.extrinsics
     assert degrees_apart(found, given) < 0.75 * degrees_apart(wrong.train.cameras.extrinsics, given)
@@ -128,8 +133,11 @@ def test_a_fit_turns_wrong_cameras_back():
 
 
 def test_a_resumed_fit_has_the_same_cameras(room, tmp_path):
-    points, path = choose_points(room, CONFIG), tmp_path / "checkpoint.safetensors"
-    whole, half = Trainer(room, make_plan(room, CONFIG), points), Trainer(room, make_plan(room, CONFIG), points)
+    points = choose_points(room, CONFIG)
+    path = tmp_path / CHECKPOINT
+    plan = make_plan(room, CONFIG)
+    whole = Trainer(room, plan, points)
+    half = Trainer(room, plan, points)
     whole.fit()
     half.fit(lambda trainer, _: trainer.step == 3)
     half.save(path)
@@ -145,41 +153,45 @@ def test_a_resumed_fit_has_the_same_cameras(room, tmp_path):
         whole.load_state_dict(state)
 
 
-def test_files_are_about_the_moved_cameras(tmp_path):
+@pytest.fixture(scope="module")
+def refined(tmp_path_factory):
+    """A scene of three photos, and the folder of a fit that moved its cameras."""
+    root = tmp_path_factory.mktemp("scene")
+    out = tmp_path_factory.mktemp("out")
+    write_llff(root)
+    request = SceneRequest(str(root))
+    fit_folder(request.load(out), CONFIG, out, request, say=lambda line: None)
+    return root, out
+
+
+def test_files_are_about_the_moved_cameras(refined):
     """The page, cameras.json and a later `kgs eval` see the training views from where the fit has them."""
-    (tmp_path / "scene").mkdir()
-    write_llff(tmp_path / "scene")
-    request = {"scene": str(tmp_path / "scene"), "train_views": None, "downscale": None, "background": "black"}
-    scene = load_scene(tmp_path / "scene")
-    metrics, _ = fit_scene(
-        scene,
-        CONFIG,
-        tmp_path / "out",
-        request=request | {"points": "none", "hold_out": None},
-        before_publish=write_own_page,
-    )
-    saved = load_fit(tmp_path / "out")
-    given, moved = scene.train.cameras.extrinsics, saved.placed(scene).train.cameras.extrinsics
+    root, out = refined
+    metrics = json.loads((out / "metrics.json").read_text())
+    scene = load_fit(out)[1].scene
+    given = load_scene(root).train.cameras.extrinsics
     assert 0 < metrics["poses"]["degrees"] <= metrics["poses"]["most_degrees"]
-    listed = json.loads((tmp_path / "out" / "cameras.json").read_text())[: len(given)]
+    listed = json.loads((out / "cameras.json").read_text())[: len(given)]
     places = torch.tensor([entry["position"] for entry in listed]) - scene.offset
-    torch.testing.assert_close(places, camera_centers(moved), rtol=0, atol=1e-6)
+    torch.testing.assert_close(places, camera_centers(scene.train.cameras.extrinsics), rtol=0, atol=1e-6)
     assert not torch.allclose(places, camera_centers(given), rtol=0, atol=1e-6)
-    page = (tmp_path / "out" / "index.html").read_text()
-    assert "moved the training cameras by" in page
-    evaluate(tmp_path / "out")
-    again = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert "moved the training cameras by" in (out / "index.html").read_text()
+    evaluate(out)
+    again = json.loads((out / "metrics.json").read_text())
     assert again["train"]["psnr"] == pytest.approx(metrics["train"]["psnr"], abs=1e-6)
-    assert "moved the training cameras by" in (tmp_path / "out" / "index.html").read_text()
+    assert "moved the training cameras by" in (out / "index.html").read_text()
 
 
-def test_poses_of_other_photos_are_refused(room):
+def test_poses_of_other_photos_are_refused(refined, tmp_path):
     """A photo was added to the scene, or removed, after the fit that refined its poses."""
-    poses = room.train.cameras.extrinsics[1:]
-    saved = SavedFit({}, CONFIG, None, near_plane=0.1, step=6, backend="torch", poses=poses)
-    expected = f"has {len(room.train)} training views, but the fit has poses of {len(poses)}: fit again"
-    with pytest.raises(DataError, match=expected):
-        saved.placed(room)
+    out = tmp_path / "out"
+    shutil.copytree(refined[1], out)
+    values = load_checkpoint(out / CHECKPOINT)
+    values["poses"]["extrinsics"] = values["poses"]["extrinsics"][1:]
+    save_checkpoint(out / CHECKPOINT, values)
+    with pytest.raises(DataError, match="training views, but the fit has poses of") as error:
+        load_fit(out)
+    assert error.value.field == "train"
 
 
 def test_decayed():

@@ -12,15 +12,13 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs import GaussianModel
 from kgs.datasets import synthetic_scene
-from kgs.fit import FitConfig, InitialPoints, Trainer
-from kgs.fit import probes as needs
-from kgs.fit.config import with_pace
-from kgs.fit.plan import make_plan
+from kgs.fit import Fit, FitConfig, probes
+from kgs.fit.plan import make_plan, with_pace
 from kgs.fit.probes import decide
 from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
 from kgs.fit.run import choose_points
-from kgs.fit.trainer import Start
 from kgs.reference import render
+from kgs.types import RasterOptions
 
 OPEN = FitConfig(steps=400, init="random", init_points=300)
 
@@ -31,44 +29,51 @@ def eight():
 
 
 class Probes:
-    """Stands for the trainer: notes what it is asked for, and has given levels by the view left out and the degree."""
+    """Stands for the trainer: notes what it is asked for, and its fits have the given levels, one after the other."""
 
     def __init__(self, levels):
-        self.levels, self.seen = levels, []
+        self.levels = levels
+        self.seen = []
 
-    def __call__(self, scene, config, points):
-        self.seen.append((scene, config, points))
-        self.level = self.levels[len(self.seen) - 1]
+    def __call__(self, scene, plan, points):
+        self.seen.append((scene, plan.config))
         return self
 
     def fit(self):
-        pass
+        return self
 
     def psnr(self, views):
-        return self.level
+        return self.levels[len(self.seen) - 1]
+
+
+def decided(scene, config=OPEN, choose=None):
+    """The configuration, and what is said of it."""
+    plan = decide(scene, make_plan(scene, config), choose)
+    assert plan.times == make_plan(scene, plan.config).times
+    return plan.config, plan.needs
 
 
 @pytest.mark.parametrize("views", [1, 3])
 def test_too_few_views_to_leave_one_out_follow_the_rule(views):
     scene = synthetic_scene(train_views=views, size=(48, 64))
-    config, found = decide(scene, OPEN, None)
+    config, found = decided(scene)
     by_rule = {"chosen": 0, "by": "rule", "why": "too few views to leave one out"}
     assert (config, found) == (with_pace(replace(OPEN, sh_degree=0), views), {"sh_degree": by_rule})
 
 
 def test_without_steps_for_probes_the_rule_decides(eight):
     by_rule = {"chosen": 0, "by": "rule", "why": "too few steps for probes"}
-    assert decide(eight, replace(OPEN, steps=20), None)[1] == {"sh_degree": by_rule}
+    assert decided(eight, replace(OPEN, steps=20))[1] == {"sh_degree": by_rule}
 
 
 def test_in_small_pictures_the_rule_decides(eight):
     small = replace(eight, train=eight.train.halved())
-    assert decide(small, OPEN, None)[1]["sh_degree"]["why"] == "too small images for probes"
+    assert decided(small)[1]["sh_degree"]["why"] == "too small images for probes"
 
 
 def test_what_is_given_is_not_decided(eight):
-    config = with_pace(replace(OPEN, sh_degree=2), 8)
-    assert decide(eight, config, None) == (config, {})
+    plan = make_plan(eight, replace(OPEN, sh_degree=2))
+    assert decide(eight, plan, None) == plan
 
 
 @pytest.mark.parametrize(
@@ -82,8 +87,8 @@ def test_what_is_given_is_not_decided(eight):
     ],
 )
 def test_the_dearer_choice_has_to_gain_more_than_noise(monkeypatch, eight, levels, chosen, gain, noise):
-    monkeypatch.setattr(needs, "Trainer", Probes(levels))
-    config, found = decide(eight, OPEN, choose_points)
+    monkeypatch.setattr(probes, "Trainer", Probes(levels))
+    config, found = decided(eight, OPEN, choose_points)
     assert config == with_pace(replace(OPEN, sh_degree=chosen), 8)
     assert found["sh_degree"]["gain"] == pytest.approx(gain, abs=1e-3)
     assert found["sh_degree"]["noise"] == pytest.approx(noise, abs=1e-3)
@@ -92,18 +97,19 @@ def test_the_dearer_choice_has_to_gain_more_than_noise(monkeypatch, eight, level
 
 
 def test_a_probe_knows_nothing_of_the_view_that_is_left_out(monkeypatch, eight):
-    probes, asked = Probes([20.0] * 4), []
-    monkeypatch.setattr(needs, "Trainer", probes)
+    stand_in = Probes([20.0] * 4)
+    asked = []
+    monkeypatch.setattr(probes, "Trainer", stand_in)
 
     def choose(scene, config):
         asked.append(scene.train.names)
         return choose_points(scene, config)
 
-    decide(eight, OPEN, choose)
-    assert sum(config.steps for _, config, _ in probes.seen) <= OPEN.steps / 4
+    decided(eight, OPEN, choose)
+    assert sum(config.steps for _, config in stand_in.seen) <= OPEN.steps / 4
     assert len(asked) == 2  # initial points of each left-out view, for both fits
     left_out = set()
-    for scene, config, _ in probes.seen:
+    for scene, config in stand_in.seen:
         (name,) = scene.test.names
         left_out.add(name)
         assert name in eight.train.names
@@ -117,15 +123,15 @@ def test_a_probe_knows_nothing_of_the_view_that_is_left_out(monkeypatch, eight):
 
 @pytest.mark.slow
 def test_probes_of_many_views_have_a_dozen_of_them(monkeypatch):
-    probes = Probes([20.0] * 4)
-    monkeypatch.setattr(needs, "Trainer", probes)
-    decide(synthetic_scene(train_views=30, size=(48, 64)), OPEN, choose_points)
-    assert {len(scene.train) for scene, _, _ in probes.seen} == {needs.MAX_VIEWS}
+    stand_in = Probes([20.0] * 4)
+    monkeypatch.setattr(probes, "Trainer", stand_in)
+    decided(synthetic_scene(train_views=30, size=(48, 64)), OPEN, choose_points)
+    assert {len(scene.train) for scene, _ in stand_in.seen} == {probes.MAX_VIEWS}
 
 
 def test_the_same_seed_decides_the_same(eight):
-    first, again = (decide(eight, OPEN, choose_points) for _ in range(2))
-    assert first == again
+    first = decided(eight, OPEN, choose_points)
+    assert decided(eight, OPEN, choose_points) == first
     assert first[1]["sh_degree"]["by"] == "probes"
     assert math.isfinite(first[1]["sh_degree"]["gain"])
 
@@ -133,12 +139,10 @@ def test_the_same_seed_decides_the_same(eight):
 # -- what is left out of the result ---------------------------------------------------------------------------------
 
 
-def trained(scene, model, **changes):
-    """A trainer whose Gaussians are these."""
-    points = InitialPoints(torch.rand(8, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(8, 3), "file")
+def as_fit(scene, model, **changes):
+    """A fit whose Gaussians are these."""
     config = FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes)
-    start = replace(Start.from_points(scene, config, points), model=model, near_plane=0.01)
-    return Trainer(scene, make_plan(scene, config), start)
+    return Fit(scene, model, RasterOptions(near_plane=0.01), settings=config, history={"needs": {"other": 1}})
 
 
 def in_front(scene, n, sh_degree=0):
@@ -157,7 +161,6 @@ def in_front(scene, n, sh_degree=0):
 
 def test_contributions_are_sums_of_blending_weights(each_backend, scene):
     model = in_front(scene, 9)
-    trainer = trained(scene, model)
     total = torch.zeros(9, dtype=torch.float64)
     gaussians = model().to(torch.float64)
     one_each = replace(gaussians, colors=torch.eye(9, dtype=torch.float64))
@@ -166,32 +169,35 @@ def test_contributions_are_sums_of_blending_weights(each_backend, scene):
         double = PinholeCamera(camera.intrinsics.double(), camera.extrinsics.double(), camera.height, camera.width)
         total += render(one_each, double, near_plane=0.01).sum((0, 2, 3)).detach()
     assert float(total[:-1].max()) > 1.0
-    np.testing.assert_allclose(
-        contributions(trainer.model, trainer.scene.train, trainer.state.start.near_plane).double(),
-        total,
-        atol=1e-4 * float(total.max()),
-    )
+    found = contributions(model, scene.train, near_plane=0.01).double()
+    np.testing.assert_allclose(found, total, atol=1e-4 * float(total.max()))
 
 
 def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scene):
-    trainer = trained(scene, in_front(scene, 40))
-    before = [trainer.render(scene.train.camera(i)) for i in range(3)]
-    levels = [trainer.psnr(scene.train.select([i])) for i in range(3)]
-    prune(trainer)
-    found = trainer.plan.needs["gaussians"]
-    assert found["fitted"] == 40 == len(trainer.model)
-    assert found["kept"] == len(trainer.shown) < 40
-    assert not bool((trainer.shown.means == trainer.model.means[-1]).all(1).any())
-    for i, level in enumerate(levels):
-        assert abs(trainer.psnr(scene.train.select([i])) - level) <= TOLERANCE
-        assert float((trainer.render(scene.train.camera(i)) - before[i]).abs().mean()) < 0.01
+    fit = as_fit(scene, in_front(scene, 40))
+    pruned = prune(fit)
+    found = pruned.history["needs"]["gaussians"]
+    assert found["fitted"] == 40 == len(fit.model)
+    assert found["kept"] == len(pruned.model) < 40
+    assert not bool((pruned.model.means == fit.model.means[-1]).all(1).any())
+    for i in range(3):
+        view = scene.train.select([i])
+        camera = scene.train.camera(i)
+        assert abs(pruned.psnr(view) - fit.psnr(view)) <= TOLERANCE
+        assert float((pruned.render(camera) - fit.render(camera)).abs().mean()) < 0.01
+
+
+def test_pruning_changes_no_other_fit_and_can_be_repeated_from_its_part(scene):
+    fit = as_fit(scene, in_front(scene, 40))
+    pruned = prune(fit)
+    assert (len(fit.model), fit.part, fit.history["needs"]) == (40, {}, {"other": 1})
+    assert pruned.history["needs"]["other"] == 1
+    assert torch.equal(fit.model.select(**pruned.part).means, pruned.model.means)
 
 
 def test_keep_all_keeps_all(scene):
-    trainer = trained(scene, in_front(scene, 10), keep_all=True)
-    prune(trainer)
-    assert trainer.shown is trainer.model
-    assert "gaussians" not in trainer.plan.needs
+    fit = as_fit(scene, in_front(scene, 10), keep_all=True)
+    assert prune(fit) is fit
 
 
 @pytest.mark.parametrize(("size", "degree"), [(1e-5, 0), (1.0, 2)])
@@ -200,12 +206,11 @@ def test_harmonics_that_no_picture_shows_are_left_out(scene, size, degree):
     with torch.no_grad():
         model.sh_rest *= size / model.sh_rest.abs().max()
         model.sh_rest[:, 8:] = 0.0
-    trainer = trained(scene, model)
-    trainer.model.sh_degree = 3
-    before = trainer.render(scene.train.camera(0))
-    prune(trainer)
-    assert trainer.shown.max_sh_degree == trainer.plan.needs["gaussians"]["sh_degree"] == degree
-    assert float((trainer.render(scene.train.camera(0)) - before).abs().max()) <= QUANTUM + 0.02
+    fit = as_fit(scene, model)
+    pruned = prune(fit)
+    assert pruned.model.max_sh_degree == pruned.history["needs"]["gaussians"]["sh_degree"] == degree
+    camera = scene.train.camera(0)
+    assert float((pruned.render(camera) - fit.render(camera)).abs().max()) <= QUANTUM + 0.02
 
 
 def test_harmonics_without_which_a_view_is_worse_stay(scene):
@@ -213,22 +218,11 @@ def test_harmonics_without_which_a_view_is_worse_stay(scene):
     model = in_front(scene, 12, 1)
     with torch.no_grad():
         model.sh_rest *= 1e-3 / model.sh_rest.abs().max()
-    trainer = trained(scene, model)
-    trainer.model.sh_degree = 1
-    renders = torch.cat([trainer.render(scene.train.camera(i)).clamp(0, 1) for i in range(len(scene.train))])
+    render_of = as_fit(scene, model).render
+    renders = torch.cat([render_of(scene.train.camera(i)).clamp(0, 1) for i in range(len(scene.train))])
     noise = 1e-4 * torch.rand(renders.shape, generator=torch.Generator().manual_seed(0))
-    trainer = trained(replace(scene, train=replace(scene.train, images=renders + noise)), model)
-    trainer.model.sh_degree = 1
-    prune(trainer)
-    assert trainer.plan.needs["gaussians"]["sh_degree"] == 1
-
-
-def test_the_next_step_has_all_gaussians_again(scene):
-    trainer = trained(scene, in_front(scene, 40))
-    prune(trainer)
-    trainer.train_step()
-    assert trainer.shown is trainer.model
-    assert len(trainer.model) == 40
+    pruned = prune(as_fit(replace(scene, train=replace(scene.train, images=renders + noise)), model))
+    assert pruned.model.max_sh_degree == 1
 
 
 def test_select_takes_rows_and_bands():

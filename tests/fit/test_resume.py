@@ -128,13 +128,16 @@ def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, points
     assert [point["step"] for point in again.state.curve] == [6, 9]
     again.save(path)
     many = Trainer.resume(scene, replace(CONFIG, steps=1001), path)
-    assert many.config.recipe == again.plan.config.recipe  # of itself so long a fit would fade more slowly
+    assert many.plan.config.recipe == again.plan.config.recipe  # of itself so long a fit would fade more slowly
 
 
 def test_a_loop_of_ones_own(scene, points):
-    by_hand, whole = Trainer(scene, make_plan(scene, CONFIG), points), Trainer(scene, make_plan(scene, CONFIG), points)
+    plan = make_plan(scene, CONFIG)
+    by_hand = Trainer(scene, plan, points)
+    whole = Trainer(scene, plan, points)
     whole.fit()
-    losses, kept = [], None
+    losses = []
+    kept = None
     while by_hand.step < CONFIG.steps:
         losses.append(by_hand.train_step())
         if by_hand.step == 3:
@@ -142,8 +145,8 @@ def test_a_loop_of_ones_own(scene, points):
     assert_same_bits(by_hand, whole)
     with pytest.raises(ValueError, match="steps"):
         by_hand.train_step()
-    other = Trainer(scene, make_plan(scene, CONFIG), InitialPoints(points.points[:20], points.colors[:20], "random"))
-    for trainer in (other, by_hand):  # a fresh one, and back in time
+    other = Trainer(scene, plan, InitialPoints(points.points[:20], points.colors[:20], "random"))
+    for trainer in (other, by_hand, Trainer(scene, plan, kept)):  # a fresh one, back in time, and from the state
         trainer.load_state_dict(kept)
         assert trainer.step == 3
         assert [trainer.train_step() for _ in range(3)] == losses[3:]
@@ -178,11 +181,8 @@ def test_a_photo_that_is_met_exactly_ends_no_fit(scene, points, tmp_path, photo)
         cameras=PinholeCamera(cameras.intrinsics, away, cameras.height, cameras.width),
         images=torch.full_like(scene.test.images, photo),
     )
-    trainer = Trainer(
-        replace(scene, test=test, background=torch.full((3,), photo)),
-        make_plan(replace(scene, test=test, background=torch.full((3,), photo)), CONFIG),
-        points,
-    )
+    blank = replace(scene, test=test, background=torch.full((3,), photo))
+    trainer = Trainer(blank, make_plan(blank, CONFIG), points)
     trainer.fit()
     assert trainer.state.curve[-1]["test_psnr"] is None
     assert trainer.state.curve[-1]["train_psnr"] > 0

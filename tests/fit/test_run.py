@@ -12,13 +12,16 @@ from typing import Any
 import pytest
 import torch
 
+from kgs.app import fit_folder as app
+from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.fit_folder import Published, train
+from kgs.app.scene_request import SceneRequest
+from kgs.app.stages import Stages
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError
-from kgs.fit import run
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import make_plan
-from kgs.fit.run import CHECKPOINT, train
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 
@@ -34,12 +37,18 @@ def scene() -> Any:
 def _few_points(monkeypatch: Any) -> None:
     points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     first = InitialPoints(points, torch.full((150, 3), 0.5), "random")
-    monkeypatch.setattr(run, "choose_points", lambda *_: first)
+    monkeypatch.setattr(app, "choose_points", lambda *_: first)
+
+
+def fit_folder(scene: Any, config: FitConfig, out: Path, lines: list[str] | None = None, **options: Any) -> Published:
+    """Fit; the lines that are said are added to `lines`."""
+    say = ([] if lines is None else lines).append
+    return app.fit_folder(scene, config, out, SceneRequest("/photos"), say=say, **options)
 
 
 @pytest.fixture
 def trainer(scene: Any) -> Trainer:
-    return Trainer(scene, make_plan(scene, CONFIG), run.choose_points(scene, CONFIG))
+    return Trainer(scene, make_plan(scene, CONFIG), app.choose_points(scene, CONFIG))
 
 
 def at_step(trainer: Trainer, step: int, act: Any) -> None:
@@ -59,7 +68,7 @@ def at_step(trainer: Trainer, step: int, act: Any) -> None:
 def test_a_signal_ends_the_step_and_saves(trainer: Trainer, tmp_path: Path, number: int) -> None:
     handler = signal.getsignal(number)
     at_step(trainer, 9, lambda: os.kill(os.getpid(), number))
-    assert train(trainer, tmp_path / CHECKPOINT) == number
+    assert train(trainer, tmp_path / CHECKPOINT)[1] == number
     assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == trainer.step == 9
     assert signal.getsignal(number) == handler
 
@@ -76,7 +85,7 @@ def test_a_second_signal_acts_at_once(trainer: Trainer, tmp_path: Path) -> None:
 
 
 def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    fit_folder(scene, CONFIG, tmp_path / "whole", say=lambda line: None)
+    fit_folder(scene, CONFIG, tmp_path / "whole")
     plain = Trainer.__init__
 
     def interrupted(self: Trainer, *arguments: Any) -> None:
@@ -84,11 +93,11 @@ def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path:
         at_step(self, 10, lambda: os.kill(os.getpid(), signal.SIGTERM))
 
     monkeypatch.setattr(Trainer, "__init__", interrupted)
-    metrics, stopped_by = fit_folder(scene, CONFIG, tmp_path / "cut", say=lambda line: None)
-    assert (metrics["steps"], stopped_by) == (10, signal.SIGTERM)
+    cut = fit_folder(scene, CONFIG, tmp_path / "cut")
+    assert (cut.fit.metrics["steps"], cut.signal, cut.folder) == (10, signal.SIGTERM, tmp_path / "cut")
     assert (tmp_path / "cut" / "splat.ply").is_file()
-    metrics, stopped_by = fit_folder(scene, CONFIG, tmp_path / "cut", resume=True, say=lambda line: None)
-    assert (metrics["steps"], stopped_by) == (12, 0)
+    ended = fit_folder(scene, CONFIG, tmp_path / "cut", resume=True)
+    assert (ended.fit.metrics["steps"], ended.signal) == (12, 0)
     assert (tmp_path / "cut" / "splat.ply").read_bytes() == (tmp_path / "whole" / "splat.ply").read_bytes()
 
 
@@ -104,7 +113,7 @@ def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
         plain(descriptor)
 
     monkeypatch.setattr("os.fsync", full)
-    assert train(trainer, tmp_path / CHECKPOINT) == 0
+    assert train(trainer, tmp_path / CHECKPOINT)[1] == 0
     assert failed == [6, 9]
     notes = [note for note in trainer.state.notes if "no checkpoint" in note]
     assert len(notes) == 2
@@ -115,42 +124,63 @@ def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
 
 
 def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(run, "_SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(app, "_SAVE_SECONDS", 0.0)
     saved: list[int] = []
     plain = trainer.save
-    monkeypatch.setattr(trainer, "save", lambda path: (saved.append(trainer.step), plain(path)))
+    monkeypatch.setattr(trainer, "save", lambda *given: (saved.append(trainer.step), plain(*given)))
     train(trainer, tmp_path / CHECKPOINT)
     assert saved == [*range(1, 13), 12]
 
 
 def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, tmp_path: Path) -> None:
     lines: list[str] = []
-    fit_folder(scene, CONFIG, tmp_path, say=lines.append)
+    fit_folder(scene, CONFIG, tmp_path, lines=lines)
     whole = (tmp_path / "splat.ply").read_bytes()
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-7])
-    fit_folder(scene, CONFIG, tmp_path, resume=True, say=lines.append)
+    fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
     assert any("went on from the previous checkpoint" in line for line in lines)
     assert (tmp_path / "splat.ply").read_bytes() == whole
     for damaged in (path, previous(path)):
         damaged.write_bytes(b"")
     with pytest.raises(DataError, match=CHECKPOINT):
-        fit_folder(scene, CONFIG, tmp_path, resume=True, say=lines.append)
+        fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
 
 
 def test_where_there_is_nothing_to_resume_it_says_so(scene: Any, tmp_path: Path) -> None:
     lines: list[str] = []
-    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
+    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, lines=lines)
     assert f"{tmp_path}: there is nothing to resume: the fit starts at the beginning" in lines
     lines.clear()
-    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, say=lines.append)
+    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, lines=lines)
     assert not any("nothing to resume" in line for line in lines)
+
+
+def test_stages_are_named_as_they_begin_and_the_memory_is_told(scene: Any, tmp_path: Path) -> None:
+    short = replace(CONFIG, steps=2)
+    lines: list[str] = []
+    fit_folder(scene, short, tmp_path, lines)
+    stages = ["1 of 4: initial points", "2 of 4: fit", "3 of 4: film", "4 of 4: page"]
+    assert [line for line in lines if " of 4: " in line] == stages
+    (memory,) = [line for line in lines if line.endswith(" GiB of memory")]
+    assert lines.index(stages[0]) < lines.index(memory) < lines.index(stages[1])
+    lines.clear()
+    fit_folder(scene, short, tmp_path, lines, resume=True)
+    assert [line for line in lines if " of 4: " in line] == stages[1:]
+
+
+def test_cameras_are_a_stage_of_unposed_photos() -> None:
+    lines: list[str] = []
+    stages = Stages(lines.append, unposed=True)
+    for name in ("cameras", "page"):
+        stages.begin(name)
+    assert lines == ["1 of 5: cameras", "5 of 5: page"]
 
 
 def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) -> None:
     short = replace(CONFIG, steps=2)
-    fit_folder(scene, short, tmp_path, say=lambda line: None)
-    fit_folder(scene, replace(short, seed=1), tmp_path, say=lambda line: None)
+    fit_folder(scene, short, tmp_path)
+    fit_folder(scene, replace(short, seed=1), tmp_path)
     assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
 
 
@@ -158,7 +188,7 @@ def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> 
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
         at_step(trainer, 3, lambda: os.kill(os.getpid(), signal.SIGHUP))
-        assert train(trainer, tmp_path / CHECKPOINT) == 0
+        assert train(trainer, tmp_path / CHECKPOINT)[1] == 0
     finally:
         signal.signal(signal.SIGHUP, before)
     assert trainer.step == 12
@@ -170,6 +200,6 @@ def test_nobody_has_to_listen(scene: Any, tmp_path: Path, monkeypatch: Any) -> N
         reader, writer = os.pipe()
         os.close(reader)
         monkeypatch.setattr(sys, name, open(writer, "w"))  # noqa: SIM115  # closed by nobody, as a shell's
-    fit_folder(scene, replace(CONFIG, steps=2), tmp_path)
+    app.fit_folder(scene, replace(CONFIG, steps=2), tmp_path, SceneRequest("/photos"))
     monkeypatch.undo()
     assert (tmp_path / "metrics.json").is_file()

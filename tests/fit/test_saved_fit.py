@@ -9,13 +9,15 @@ from typing import Any
 import pytest
 
 from kgs.app.saved_fit import read_settings
+from kgs.app.scene_request import SceneRequest
 from kgs.errors import DataError
 from kgs.fit.config import DETAILS, FitConfig
 
-REQUEST: dict[str, Any] = {"scene": "/photos", "train_views": 3, "downscale": 2.0, "background": "black"}
+REQUEST = SceneRequest("/photos", train_views=3, downscale=2.0, roll=-90.0, photos=False, title="mine")
+VALUES = REQUEST.to_dict()
 
 
-def written(path: Path, request: Any = REQUEST, **fit: Any) -> Path:
+def written(path: Path, request: Any = VALUES, **fit: Any) -> Path:
     path.write_text(json.dumps({"request": request, "fit": FitConfig().to_dict() | fit, "extent": 1.0}))
     return path
 
@@ -26,7 +28,12 @@ def written(path: Path, request: Any = REQUEST, **fit: Any) -> Path:
 )
 def test_what_was_written_comes_back(tmp_path: Path, config: FitConfig) -> None:
     path = written(tmp_path / "config.json", **config.to_dict())
-    assert read_settings(path) == (REQUEST | {"points": "none", "hold_out": None}, config)
+    assert read_settings(path) == (REQUEST, config)
+
+
+def test_entries_that_older_files_lack_have_their_defaults(tmp_path: Path) -> None:
+    path = written(tmp_path / "config.json", {"scene": "/photos", "train_views": None, "unknown": 1})
+    assert read_settings(path)[0] == SceneRequest("/photos")
 
 
 @pytest.mark.parametrize(
@@ -34,21 +41,28 @@ def test_what_was_written_comes_back(tmp_path: Path, config: FitConfig) -> None:
     [
         (None, "request"),
         ({}, "request.scene"),
-        (REQUEST | {"scene": ""}, "request.scene"),
-        (REQUEST | {"scene": "a\0b"}, "request.scene"),
-        (REQUEST | {"train_views": 0}, "request.train_views"),
-        (REQUEST | {"train_views": True}, "request.train_views"),
-        (REQUEST | {"downscale": 0.5}, "request.downscale"),
-        (REQUEST | {"downscale": "2"}, "request.downscale"),
-        (REQUEST | {"hold_out": 1}, "request.hold_out"),
-        (REQUEST | {"hold_out": False}, "request.hold_out"),
-        (REQUEST | {"background": "red"}, "request.background"),
-        (REQUEST | {"points": ["none"]}, "request.points"),
+        (VALUES | {"scene": ""}, "request.scene"),
+        (VALUES | {"scene": 3}, "request.scene"),
+        (VALUES | {"scene": "a\0b"}, "request.scene"),
+        (VALUES | {"train_views": 0}, "request.train_views"),
+        (VALUES | {"train_views": True}, "request.train_views"),
+        (VALUES | {"downscale": 0.5}, "request.downscale"),
+        (VALUES | {"downscale": "2"}, "request.downscale"),
+        (VALUES | {"hold_out": 1}, "request.hold_out"),
+        (VALUES | {"hold_out": -2}, "request.hold_out"),
+        (VALUES | {"hold_out": False}, "request.hold_out"),
+        (VALUES | {"background": "red"}, "request.background"),
+        (VALUES | {"points": ["none"]}, "request.points"),
+        (VALUES | {"photos": 1}, "request.photos"),
+        (VALUES | {"roll": "90"}, "request.roll"),
+        (VALUES | {"title": None}, "request.title"),
     ],
 )
 def test_wrong_requests_are_named(tmp_path: Path, request_: Any, field: str) -> None:
-    with pytest.raises(DataError, match=rf"config\.json.*{field}: expected"):
-        read_settings(written(tmp_path / "config.json", request_))
+    path = written(tmp_path / "config.json", request_)
+    with pytest.raises(DataError, match="expected") as error:
+        read_settings(path)
+    assert (error.value.path, error.value.field) == (path, field)
 
 
 @pytest.mark.parametrize(

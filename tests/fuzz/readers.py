@@ -36,8 +36,8 @@ from torch import Tensor
 from kgs.app.saved_fit import read_settings
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
 from kgs.datasets.image_file import read_image
-from kgs.fit.config import FitConfig, timetable
-from kgs.fit.plan import make_plan
+from kgs.fit.config import FitConfig
+from kgs.fit.plan import make_plan, timetable
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.init_points.files import read_points
@@ -120,9 +120,8 @@ def _scene() -> Scene:
 
 def _write_checkpoint(folder: Path) -> None:
     points = torch.rand(_POINTS, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 4.0])
-    trainer = Trainer(
-        _scene(), make_plan(_scene(), _CONFIG), InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random")
-    )
+    first = InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random")
+    trainer = Trainer(_scene(), make_plan(_scene(), _CONFIG), first)
     trainer.fit(lambda trainer, _: trainer.step == 2)
     trainer.save(folder / "checkpoint.safetensors")
 

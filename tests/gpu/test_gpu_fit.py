@@ -58,7 +58,7 @@ def trainer(scene, points, backend, **options):
 
 def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     fit = trainer(scene, few, "triton")
-    fit.look_every = 20  # as on a GPU
+    fit._look_every = 20  # as on a GPU
     fit.train_step()
     kernels, waits, real = collections.Counter(), [], torch.Tensor.tolist
 
@@ -117,7 +117,7 @@ def test_a_resumed_fit_on_another_kind_of_device_draws_anew_and_says_so(scene, f
 
 def test_a_fit_that_looks_seldom_finds_what_is_not_finite_and_never_saves_it(scene, few, tmp_path):
     fit = trainer(scene, few, "torch")
-    fit.look_every = 20
+    fit._look_every = 20
     fit.train_step()
     fit.save(tmp_path / "checkpoint.safetensors")
     with torch.no_grad():

@@ -40,6 +40,18 @@ INVENTORY = {
     ],
     "kgs.losses": ["TargetMoments", "photometric_loss", "target_moments"],
     "kgs.datasets": ["Scene", "Views", "load_scene", "synthetic_scene"],
+    "kgs.fit": [
+        "Fit",
+        "FitConfig",
+        "InitialPoints",
+        "Plan",
+        "Trainer",
+        "choose_points",
+        "fit_scene",
+        "initial_points",
+        "make_plan",
+        "measure",
+    ],
     "kgs.reference": ["Layers", "layers", "render"],
 }
 PUBLIC = [(module, name) for module, names in INVENTORY.items() for name in names]
@@ -129,6 +141,13 @@ SIGNATURES = {
     "kgs.load_ply": {"path": ...},
     "kgs.losses.photometric_loss": {"image": ..., "target": ..., "dssim_weight": 0.2},
     "kgs.datasets.load_scene": {"path": ..., "train_views": None, "downscale": None},
+    "kgs.fit.make_plan": {"scene": ..., "config": ...},
+    "kgs.fit.Trainer": {"scene": ..., "plan": ..., "points": ...},
+    "kgs.fit.Trainer.fit": {"self": ..., "callback": None},
+    "kgs.fit.Trainer.resume": {"scene": ..., "config": ..., "path": ...},
+    "kgs.fit.choose_points": {"scene": ..., "config": ...},
+    "kgs.fit.fit_scene": {"scene": ..., "config": None},
+    "kgs.fit.measures": {"fit": ..., "lpips": None},
     "kgs.reference.render": {
         "gaussians": ...,
         "camera": ...,

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from kgs.fit.config import DETAILS, PRESETS, FitConfig, with_pace
+from kgs.fit.config import DETAILS, PRESETS, FitConfig
+from kgs.fit.plan import with_pace
 from kgs.init_points.dense import FEWEST, MOST, PIXELS_OF_A_POINT
 
 ROOT = Path(__file__).parents[2]

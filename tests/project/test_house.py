@@ -16,7 +16,7 @@ import kgs.fit
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
-FLOORS = ("core", "io", "metrics", "sfm", "init_points", "fit", "page", "bench", "study", "cli")
+FLOORS = ("core", "io", "metrics", "sfm", "init_points", "fit", "page", "app", "bench", "study", "cli")
 HEAVY = ("cv2", "PIL", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "distributed")
 
 
@@ -91,8 +91,9 @@ def test_imports_go_one_way():
         "metrics": ground | {"metrics"},
         "sfm": ground | {"sfm"},
         "init_points": ground | {"init_points", "sfm"},
-        "fit": ground | {"fit", "init_points", "metrics"},
-        "page": ground | {"page", "fit", "metrics"},
+        "fit": ground - {"io"} | {"fit", "init_points", "metrics"},
+        "page": ground | {"page", "fit", "metrics", "app"},
+        "app": ground | {"app", "page", "fit", "init_points", "sfm", "metrics"},
         "bench": {*FLOORS, "losses", "datasets"} - {"study", "cli"},
         "study": {*FLOORS, "losses", "datasets"} - {"cli"},
         "cli": {*FLOORS, "losses", "datasets"},
@@ -106,6 +107,12 @@ def test_imports_go_one_way():
         and not (floor(name) in ("losses", "datasets") and within(other, *small))
     ]
     assert not wrong
+
+
+def test_the_application_is_on_top():
+    """The command and the page belong to it; they still stand in folders of their own."""
+    clients = {name for name in SOURCES for other in imported_modules(name) if floor(other) == "app"}
+    assert {floor(name) for name in clients} <= {"app", "cli", "page"}
 
 
 def test_the_command_alone_imports_the_study():
@@ -142,9 +149,8 @@ print(kgs.machine.peak_rss_mb())
 
 def test_the_package_the_command_and_the_numbers_of_a_fit_are_read_without_heavy_libraries(imported):
     assert imported[0] == "heavy:"
-    assert all(
-        hasattr(kgs.fit, name) for name in ("InitialPoints", "FitConfig", "Trainer", "initial_points", "fit_scene")
-    )
+    importlib.import_module("kgs.app.fit_folder")  # all modules of a fit
+    assert not any(inspect.ismodule(getattr(kgs.fit, name)) for name in kgs.fit.__all__)
 
 
 def test_no_module_of_one_system_alone(imported):

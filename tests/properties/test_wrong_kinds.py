@@ -16,7 +16,8 @@ import kgs
 from kgs import reference
 from kgs.app.files.film import write_film
 from kgs.app.files.glb import save_glb
-from kgs.app.page.fit_page import write_own_page
+from kgs.app.fit_folder import fit_folder
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.densify import Densifier
 from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
@@ -89,9 +90,13 @@ WRONG = {
     ),
     "a scene for its views": (lambda: initial_points(SCENE), "views: expected Views, got Scene"),
     "views for a scene": (
-        lambda: Trainer(SCENE.train, make_plan(SCENE.train, CONFIG), POINTS),
+        lambda: Trainer(SCENE.train, make_plan(SCENE, CONFIG), POINTS),
         "scene: expected Scene, got Views",
     ),
+    "settings for a plan": (lambda: Trainer(SCENE, CONFIG, POINTS), "plan: expected Plan, got FitConfig"),
+    "and in a whole fit": (lambda: fit_scene(SCENE.train, CONFIG), "scene: expected Scene, got Views"),
+    "and in a plan": (lambda: make_plan(SCENE.train, CONFIG), "scene: expected Scene, got Views"),
+    "a dict for settings": (lambda: make_plan(SCENE, {}), "config: expected FitConfig, got dict"),
     "a tensor for points": (
         lambda: Trainer(SCENE, make_plan(SCENE, CONFIG), POINTS.points),
         "points: expected InitialPoints, got Tensor",
@@ -140,8 +145,8 @@ def test_paths_may_be_text(tmp_path):
     assert Trainer.resume(SCENE, CONFIG, str(tmp_path / "c.safetensors")).step == 1
     render = lambda camera: torch.zeros(1, 3, int(camera.height), int(camera.width))  # noqa: E731
     assert write_film(str(tmp_path / "a.webm"), render, SCENE.train, 1.0) == "" or not (tmp_path / "a.webm").exists()
-    metrics, _ = fit_scene(SCENE, CONFIG, str(tmp_path / "out"), before_publish=write_own_page)
-    assert metrics["steps"] == 2
+    published = fit_folder(SCENE, CONFIG, str(tmp_path / "out"), SceneRequest("."))
+    assert published.folder == tmp_path / "out"
     assert (tmp_path / "out" / "index.html").exists()
 
 
@@ -154,10 +159,13 @@ def test_moments_of_the_target_are_taken():
 def test_a_package_that_results_need_is_missed_before_the_training(monkeypatch, tmp_path, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ModuleNotFoundError, match=package):
-        fit_scene(SCENE, CONFIG, tmp_path / "out")
+        fit_folder(SCENE, CONFIG, tmp_path / "out", SceneRequest("."))
     assert not (tmp_path / "out").exists()
 
 
 def test_points_of_the_right_kind_are_taken():
     points = InitialPoints(POINTS.points, POINTS.colors, "mine")
-    assert Trainer(SCENE, make_plan(SCENE, CONFIG), points).init == {"kind": "mine", "points": len(points.points)}
+    assert Trainer(SCENE, make_plan(SCENE, CONFIG), points).state.start.init == {
+        "kind": "mine",
+        "points": len(points.points),
+    }

@@ -45,10 +45,10 @@ def demo(
     """
     from kgs.app.files.outputs import check_folder
     from kgs.datasets import synthetic_scene
-    from kgs.machine import check_packages
+    from kgs.machine import check_tools
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    check_packages("matplotlib", "jinja2")
+    check_tools(device, backend, "matplotlib", "jinja2")
     check_folder(out, _files())
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
@@ -79,7 +79,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     from kgs.app.files.staging import Staging
     from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
-    from kgs.fit.measure import measure
+    from kgs.fit.measures import measure
     from kgs.fit.plan import make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer

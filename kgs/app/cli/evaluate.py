@@ -32,11 +32,11 @@ def evaluate(
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.json_files import write_json
-    from kgs.machine import check_packages
+    from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
 
-    check_packages("jinja2")
+    check_tools(device, backend, "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"

@@ -9,11 +9,13 @@ from kgs.errors import DataError
 from kgs.json_files import read_json
 
 from .outputs import EXPORTS
+from .ownership import is_own
 from .staging import Staging
 
 CHECKPOINT = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
-RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS, CHECKPOINT, PREVIOUS)
+_CHECKPOINTS = (CHECKPOINT, PREVIOUS)
+RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS, *_CHECKPOINTS)
 
 
 @contextmanager
@@ -48,9 +50,14 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def replaced_files(out: Path) -> list[str]:
-    """The files that a fit replaces or removes in its folder, for `check_folder`."""
+    """The files that a fit replaces or removes in its folder, for `check_folder`.
+
+    In the folder of a fit checkpoints are left out: a damaged one is no longer as kgs wrote it.
+    """
     staging = Staging(out)
-    return [*RESULTS, staging.unfinished.name, staging.finished.name]
+    is_of_fit = is_own(out / "config.json")
+    files = [name for name in RESULTS if not (is_of_fit and name in _CHECKPOINTS)]
+    return [*files, staging.unfinished.name, staging.finished.name]
 
 
 def is_finished(out: Path) -> bool:

@@ -29,11 +29,12 @@ def check_place(out: Path, folder: Path) -> None:
     advice = "choose another folder"
     photos = folder.resolve()
     staging = photo_staging(out)
-    replaced = [out / IMAGES, out / "sparse", staging.unfinished, staging.finished]
-    if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in replaced):
+    results = [out / IMAGES, out / "sparse"]
+    temporary = [staging.unfinished, staging.finished]
+    if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in [*results, *temporary]):
         raise DataError(out, "", f"holds the photos themselves: {advice}")
-    for path in filter(os.path.lexists, replaced):
-        if not (is_own(path) or holds_only_own(path)):
+    for path in filter(os.path.lexists, [*results, *temporary]):
+        if not (holds_only_own(path) or (path in temporary and is_own(path))):
             raise DataError(path, "", f"holds files of a scene that kgs did not write: {advice}")
 
 

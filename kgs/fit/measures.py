@@ -23,7 +23,18 @@ _CONVENTIONS = {
 
 
 def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
-    """The content of metrics.json for one fit of kgs; None stands for what was not measured."""
+    """Measure a fit on its test and training views.
+
+    Args:
+        fit: of kgs; a splat alone has no settings.
+        lpips: the perceptual metric, on the device of the fit, or None to leave it out.
+
+    Returns:
+        The content of metrics.json as plain values; None stands for what was not measured.
+
+    Raises:
+        ValueError: the fit has no settings.
+    """
     scene = fit.scene
     config = fit.settings
     if config is None:
