@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.app.console import as_line, say, say_next
-from kgs.errors import printable
+from kgs.errors import DataError, printable
 from kgs.fit.config import Backend
 
 from .options import Existing
@@ -66,4 +66,6 @@ def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: 
     if lpips_weights is not None:
         weight_files(lpips_weights)
     if not Staging(out).finished.exists():
+        if not (out / "config.json").exists():
+            raise DataError(out / "config.json", "", "cannot be read: expected the folder of the results of kgs fit")
         read_json(out / "config.json")

@@ -47,7 +47,7 @@ def fit(
     lpips_weights: Existing | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
-    """Turn a folder of photos into a splat, with a page to look at it, a film, and measures of its quality.
+    """Turn a folder of photos into a splat, a page to look at it, and a film.
 
     For example:
       kgs fit PHOTOS -o OUT
@@ -55,7 +55,7 @@ def fit(
 
     Args:
         scene: a folder of 3 or more photos, or a scene with camera poses (LLFF, COLMAP, Blender or nerfstudio). The
-            cameras of photos are found first (extra sfm), and written to the folder of the results.
+            cameras of photos are found first (extra sfm).
         out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 the film.
         views: number of training views, spread over those that are not held out. Unless given: all of them.
         hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the scene's files say, or every
