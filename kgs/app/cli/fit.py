@@ -117,8 +117,10 @@ def fit(
     loaded = request.load(base, say)
     height, width = loaded.train.images.shape[-2:]
     if max(height, width) < SMALLEST:
-        shrunk_by = "size" if downscale is None else "downscale"
-        raise ValueError(f"{shrunk_by}: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
+        reason = f"expected at least {SMALLEST} pixels, got photos of {width}x{height}"
+        if downscale is None:  # a size that is too small is refused before
+            raise DataError(scene, "images", reason)
+        raise ValueError(f"downscale: {reason}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, stages=stages)
