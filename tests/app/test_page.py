@@ -99,12 +99,19 @@ def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
         write(path, most_bytes=10_000)
 
 
+def test_exif_is_spoken_of_where_there_are_photos(tmp_path: Path) -> None:
+    words = "its photos contain no Exif data"
+    assert words not in write(tmp_path / "index.html")
+    assert words in write(tmp_path / "index.html", pictures=[Picture(NAMES[0], torch.rand(3, *SIZE))])
+
+
 def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
     cited = re.findall(r"@software\{kgs,(.*?)\n\}", write(tmp_path / "index.html"), re.DOTALL)
     assert len(cited) == 1
     assert "a title" not in cited[0]
     assert re.findall(r"(\w+) +=", cited[0]) == ["title", "author", "version"]
-    assert cited[0].rstrip().endswith(f"version = {{{kgs.__version__}}}")
+    assert "\n\n" not in cited[0]
+    assert cited[0].endswith(f"version = {{{kgs.__version__}}}")
 
 
 def test_a_stray_gaussian_costs_no_film_and_is_named(tmp_path: Path) -> None:
