@@ -23,7 +23,7 @@ from kgs.app.files.outputs import EXPORTS, film_in
 from kgs.app.files.ownership import is_own
 from kgs.app.files.staging import Staging
 from kgs.datasets import Scene
-from kgs.fit import Fit, exports
+from kgs.fit import Fit
 from kgs.geometry import typical_depths
 from kgs.json_files import write_json
 

@@ -143,7 +143,7 @@ def test_eval_keeps_a_page_that_the_user_changed(folder: Path, tmp_path: Path, c
     (tmp_path / "index.html").write_text("mine")
     evaluate(tmp_path)
     assert (tmp_path / "index.html").read_text(encoding="utf-8") == "mine"
-    assert "index.html was not written by kgs and is kept" in capsys.readouterr().out
+    assert "index.html was not written by kgs" in capsys.readouterr().out
     assert not is_own(tmp_path / "index.html")
 
 

@@ -48,13 +48,14 @@ CLAIMS = {
     "03_three_views": (
         """
         assert without.step == with_drop.step == STEPS
-        assert with_drop.drop.rate == 0.2 and without.drop is None
-        assert without.curve[-1]["train_psnr"] > without.curve[0]["train_psnr"]
+        assert with_drop.state.drop.rate == 0.2 and without.state.drop is None
+        assert without.state.curve[-1]["train_psnr"] > without.state.curve[0]["train_psnr"]
         """,
         """
-        gaps = [trainer.curve[-1]["train_psnr"] - trainer.curve[-1]["test_psnr"] for trainer in (without, with_drop)]
+        last = [trainer.state.curve[-1] for trainer in (without, with_drop)]
+        gaps = [point["train_psnr"] - point["test_psnr"] for point in last]
         assert gaps[0] > gaps[1] + 0.5 > 2.5
-        assert without.curve[-1]["test_psnr"] > 18
+        assert without.state.curve[-1]["test_psnr"] > 18
         """,
     ),
     "04_error_against_run_time": (

@@ -44,7 +44,7 @@ def evaluate(
     write_json(path, metrics)
     written = [path.name]
     if (out / PAGE).exists() and not is_own(out / PAGE):
-        say(f"{printable(out / PAGE)} was not written by kgs and is kept")
+        say(f"{printable(out / PAGE)} was not written by kgs, or was changed since, and is kept")
     else:
         write_own_page(out, out, replace(fit, metrics=metrics), request)
         written.append(PAGE)

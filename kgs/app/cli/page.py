@@ -95,7 +95,9 @@ def check_page(
     if out.suffix != ".html":
         raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
     if out.exists() and not is_own(out):
-        raise DataError(out, "", "was not written by kgs and would be overwritten: choose another file")
+        raise DataError(
+            out, "", "was not written by kgs, or was changed since, and would be overwritten: choose another file"
+        )
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
     check_scene(cameras)

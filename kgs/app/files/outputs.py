@@ -44,7 +44,9 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):
         if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(path.parent) and not path.parent.is_dir()):
-            raise DataError(path, "", f"was not written by kgs and would be overwritten: {advice}")
+            raise DataError(
+                path, "", f"was not written by kgs, or was changed since, and would be overwritten: {advice}"
+            )
     if make:
         out.mkdir(parents=True, exist_ok=True)
 
