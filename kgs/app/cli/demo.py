@@ -1,4 +1,4 @@
-"""`kgs demo`: the built-in scene, fitted with DropGaussian, and to compare without it from an equal start."""
+"""`kgs demo`: fits the built-in scene with DropGaussian, and to compare without it from the same initial points."""
 
 import math
 from dataclasses import replace
@@ -69,7 +69,7 @@ def demo(
 
 
 def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, float]) -> dict[str, dict[str, Any]]:
-    """Fit a scene once or twice, write its pictures, page, files and the exports; returns what metrics.json holds.
+    """Fit a scene once or twice, and write pictures, page and all other files; returns the content of metrics.json.
 
     `drops` are the rates of dropping by the name of the run; pictures show the last one beside the others.
     """

@@ -1,4 +1,4 @@
-"""Kinds of options that several commands have, and what `--help` says of a command's options."""
+"""Types of options that several commands share, and what `--help` says of a command's options."""
 
 import inspect
 import re
@@ -63,5 +63,5 @@ def describe(function: Callable[..., Any], command: Callable[..., Any], **hints:
 
 
 def _quiet(hint: Any, default: Any) -> Any:
-    """The annotation, such that the help tells no default of None, and none of True where the option is `--no-...`."""
+    """The annotation, such that the help leaves out "(default: None)", and "(default: True)" of a flag `--no-...`."""
     return Annotated[hint, tyro.conf.arg(help_behavior_hint="")] if default is None or default is True else hint

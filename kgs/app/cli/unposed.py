@@ -1,4 +1,4 @@
-"""`kgs fit` of unposed photos: their cameras first, and then a scene like any other, in the folder of the results."""
+"""`kgs fit` of unposed photos: finds their cameras, and makes a scene of them in the folder of the results."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def is_unposed(scene: Path) -> bool:
-    """Whether this can only be photos without cameras, or a video of them: no scene, and none right below or above."""
+    """Whether this is a video, or a folder that is no scene and has none right below or above it."""
     if scene.is_file():
         return scene.suffix.lower() in VIDEO_SUFFIXES
     return scene.is_dir() and nearest_scene(scene) is None

@@ -13,7 +13,7 @@ from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import common_up
 
 _OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
-_DISTANT = 10.0  # times the median distance from the middle: a sky, which the bounds leave out before
+_DISTANT = 10.0  # times the median distance from the middle: Gaussians beyond are a sky, outside the bounds
 
 
 def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[dict[str, Any]]:

@@ -27,7 +27,7 @@ Frame = NDArray[Any]  # of uint8
 
 
 def film_suffix() -> tuple[str, str]:
-    """`MP4` or `WEBM`, what films can be here, and a sentence where the user asked for MP4 and it cannot be."""
+    """The format of films here, `MP4` or `WEBM`, and a sentence if the user asked for an MP4 that cannot be written."""
     asked = os.environ.get(ASKED, "")
     try:
         import av
@@ -81,7 +81,7 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate: flo
 
 
 def _write_webm(path: Path, frames: Iterable[Frame], size: tuple[int, int], _: float) -> tuple[int, str]:
-    """Write frames as VP8; how many there were, and why it failed."""
+    """Write frames as VP8; returns their number, and why it failed or ""."""
     count = 0
     with _stderr_discarded():
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP80"), RATE, size)
@@ -95,7 +95,7 @@ def _write_webm(path: Path, frames: Iterable[Frame], size: tuple[int, int], _: f
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate: float) -> tuple[int, str]:
-    """Write frames as H.264; how many there were, and why it failed."""
+    """Write frames as H.264; returns their number, and why it failed or ""."""
     count = 0
     name = h264_encoder()
     if not name:

@@ -31,7 +31,7 @@ def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indi
 
 
 def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
-    """Plot test and training PSNR against seconds of training; the run "without" has the colour of no dropping."""
+    """Plot test and training PSNR against seconds of training; runs "without ..." have a colour of their own."""
     figure = _figure(6, 4)
     axes = figure.subplots()
     for name, curve in runs.items():

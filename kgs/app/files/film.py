@@ -89,7 +89,7 @@ def path_near_plane(means: Tensor, cameras: PinholeCamera, near_plane: float) ->
 
 
 def film_within(path: Path, most_bytes: int) -> bytes:
-    """The content of a film that was written by `write_film`, encoded again where it has more bytes than these.
+    """The content of a film that `write_film` wrote, encoded again if it has more than `most_bytes`.
 
     H.264 gets fewer bits for a pixel first; then, and VP8 at once, as OpenCV knows no other rate for it, fewer pixels.
     b"" where the film cannot be made so small.
@@ -168,7 +168,7 @@ def paced(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
 
 
 def _speeds(places: Array) -> Array:
-    """Speeds in (0, 1] at places `(M, D)` that are as far from each other along a path; 0 at both ends."""
+    """Speeds in [0, 1] at places `(M, D)` at equal distances along a path; 0 at both ends."""
     part = 1 / (len(places) - 1)
     steps = np.diff(places, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True).clip(1e-12)

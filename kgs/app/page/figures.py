@@ -13,9 +13,9 @@ MEASURES = {
     "ssim_zero_padded": ("SSIM (zero padded)", 3),
     "lpips_vgg": ("LPIPS", 3),
 }
-# What sets of views are called, by their keys in metrics.json; the first one that was measured is told.
+# Names of the sets of views by their keys in metrics.json; `verdict` speaks of the first one that was measured.
 PARTS = {"test": "held out", "train": "training", "views": "photos"}
-# What a PSNR of at least so many dB looks like.
+# What renders look like whose PSNR is at least this many dB.
 _LEVELS = (
     (32.0, "hard to tell from the photos at a glance"),
     (26.0, "close to the photos, without their finest detail"),

@@ -155,7 +155,7 @@ def _remarks(runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def _ground(views: Views, background: Tensor) -> Tensor:
     """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border instead of black.
 
-    Photos with transparency show a thing before `background`; it is returned then, and where it was chosen: not black.
+    `background` itself if the photos have transparency, and so show a thing before it, or if it is not black.
     """
     if views.masks is not None or not len(views) or bool(background.any()):
         return background

@@ -71,7 +71,7 @@ def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -
 
 
 class _Page:
-    """The HTML of a page: of its film and its packed splat, which have to fit into the same limit."""
+    """Makes the HTML of a page, with a film and a splat that vary until the page is small enough."""
 
     def __init__(self, content: PageContent) -> None:
         import jinja2
@@ -96,7 +96,7 @@ class _Page:
         Args:
             film: data URI of the film; "" for none.
             packed: the splat; None leaves it out.
-            page_bytes: the size of the page to tell. Its text is as long for every size below 10 MB.
+            page_bytes: the size that the page says it has. The text is equally long for all sizes below 10 MB.
         """
         from markupsafe import Markup
 
@@ -174,7 +174,7 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:
-    """What renderer.js is told of how to draw."""
+    """The settings of renderer.js."""
     near_plane = splat.options.near_plane
     return {
         "nearPlane": near_plane,

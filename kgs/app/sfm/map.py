@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .aside import check_space
 
 FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
-_MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
+_MAX_ERROR = 1.5  # largest reprojection error, in pixels
 _FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
 _FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one places no pair
 _ROUNDS = 5  # at most, each of placing photos with the lens held and then adjusting it

@@ -25,7 +25,7 @@ def photo_staging(out: Path) -> Staging:
 
 
 def check_place(out: Path, folder: Path) -> None:
-    """A DataError where the results would lie among the user's photos or in place of files of another program."""
+    """Raise a DataError if results would lie among the user's photos, or replace files that kgs did not write."""
     advice = "choose another folder"
     photos = folder.resolve()
     staging = photo_staging(out)

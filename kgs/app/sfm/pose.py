@@ -254,7 +254,7 @@ def _clock() -> Callable[[], float]:
 
 @contextmanager
 def report_full_disk(folder: Path) -> Iterator[None]:
-    """Raise an OSError where pycolmap failed because a disk is full: it does not say so."""
+    """Turn a RuntimeError of pycolmap into an OSError if the disk is full, which pycolmap does not say."""
     try:
         yield
     except RuntimeError:
@@ -264,7 +264,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """One thread for torch and OpenCV: with several, sums are rounded in another order."""
+    """Run torch and OpenCV on one thread: their rounding depends on the number of threads."""
     threads_of_torch = torch.get_num_threads()
     threads_of_opencv = cv2.getNumThreads()
     torch.set_num_threads(1)

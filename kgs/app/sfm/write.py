@@ -44,11 +44,15 @@ def level_and_scale(cameras: Cameras) -> None:
 
 
 def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
-    """Write cameras, images and points with tracks and colours, as COLMAP's binary files; an OSError unless whole."""
+    """Write cameras, images and points with tracks and colours as COLMAP's binary files.
+
+    Raises:
+        OSError: a file was not written whole; COLMAP itself does not say so.
+    """
     folder.mkdir(parents=True)
     cameras.reconstruction.extract_colors_for_all_images(images)
     cameras.reconstruction.write_binary(folder)
-    try:  # COLMAP does not look whether all was written
+    try:
         read_cameras(folder / "cameras.bin")
         read_points(folder / "points3D.bin", set(read_images(folder / "images.bin")))
     except DataError as error:
