@@ -73,9 +73,9 @@ def exit_code(words: list[str]) -> int:
             return stop.code or 0
         message = stop.code
     except ModuleNotFoundError as error:
-        message = _missing_package(error)
+        message = _of_a_missing_package(error)
     except ImportError as error:
-        message = _broken_package(error)
+        message = _of_a_broken_package(error)
     except DataError as error:
         message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
     except ValueError as error:
@@ -109,7 +109,7 @@ def _is_out_of_memory(error: Exception) -> bool:
     return isinstance(error, MemoryError) or any(cause in str(error) for cause in ("allocate", "of memory"))
 
 
-def _missing_package(error: ModuleNotFoundError) -> str:
+def _of_a_missing_package(error: ModuleNotFoundError) -> str:
     """Message for a package that is not installed; it names the extra that brings it."""
     package = (error.name or "").partition(".")[0]
     if package == "kgs":
@@ -134,7 +134,7 @@ def _import(module: str) -> None:
             raise ImportError(str(error), name=module) from error
 
 
-def _broken_package(error: ImportError) -> str:
+def _of_a_broken_package(error: ImportError) -> str:
     """Message for an installed package that fails to import."""
     names = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
     tops = [name.partition(".")[0] for name in [error.name or "", *names]]
