@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from .drop import DropGaussian, drop_gaussian
     from .geometry import camera_extent
     from .gsplat import rasterization
-    from .io.ply import load_ply, save_ply
     from .model import GaussianModel
+    from .ply import load_ply, save_ply
     from .renderer import GaussianRenderer
     from .stages import composite, project
     from .types import Gaussians, ProjectedGaussians, RasterOptions, Rendering

@@ -6,7 +6,7 @@ as in gsplat, it is therefore evaluated at a point clamped to 15 % of the image 
 models without a wide-angle mapping only). The gradient follows the clamp exactly, that of the lens its limits too.
 
 A distorted lens sees only up to the angle where the radius in the image stops growing: what lies beyond this fold of
-the radial polynomial is not drawn.
+the radial polynomial is not rendered.
 """
 
 import math
@@ -61,7 +61,8 @@ class PosedCamera:
         if not hasattr(self.model, "project") or not hasattr(self.model, "params"):
             raise TypeError(f"model: expected a kornia.sensors.camera.CameraModel, got {type(self.model).__name__}")
         check_tensor("extrinsics", self.extrinsics)
-        shape, params = tuple(self.extrinsics.shape), self.model.params
+        shape = tuple(self.extrinsics.shape)
+        params = self.model.params
         if len(shape) != 3 or shape[1:] != (4, 4):
             raise ValueError(f"extrinsics: expected shape (C, 4, 4), got {shape}")
         if not shape[0]:
@@ -118,7 +119,8 @@ def pinhole_cameras(
     if viewmats.ndim not in (2, 3) or viewmats.shape[-2:] != (4, 4):
         raise ValueError(f"viewmats: expected shape (C, 4, 4) or (4, 4), got {tuple(viewmats.shape)}")
     poses = viewmats.reshape(-1, 4, 4)
-    count, shape = poses.shape[0], tuple(Ks.shape)
+    count = poses.shape[0]
+    shape = tuple(Ks.shape)
     if shape[-2:] not in ((3, 3), (4, 4)) or shape[:-2] not in ((), (1,), (count,)):
         raise ValueError(f"Ks: expected shape ({count}, 3, 3), ({count}, 4, 4) or one matrix, got {shape}")
     if pixel_centers not in ("integer", "half"):
@@ -132,8 +134,9 @@ def pinhole_cameras(
     full = torch.eye(4, dtype=Ks.dtype, device=Ks.device).repeat(count, 1, 1)
     full[:, :2, :3] = Ks[..., :2, :3]
     full[:, :2, 2] -= 0.5 if pixel_centers == "half" else 0.0
-    sizes = (torch.full((count,), int(size), device=poses.device) for size in (height, width))
-    cameras = PinholeCamera(full, poses, *sizes)
+    heights = torch.full((count,), int(height), device=poses.device)
+    widths = torch.full((count,), int(width), device=poses.device)
+    cameras = PinholeCamera(full, poses, heights, widths)
     if not traced:
         _remember(cameras, (int(height), int(width)))
     return cameras
@@ -141,18 +144,19 @@ def pinhole_cameras(
 
 def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
     """The same cameras on another device."""
-    return PinholeCamera(*(x.to(device) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)))
+    tensors = (camera.intrinsics, camera.extrinsics, camera.height, camera.width)
+    return PinholeCamera(*(tensor.to(device) for tensor in tensors))
 
 
-class _Known(NamedTuple):
+class _CheckedSize(NamedTuple):
     """The size of a pinhole camera whose tensors have been read and checked."""
 
-    tensors: tuple[Tensor, ...]  # kept alive, so that no other tensor gets their ids
-    state: list[tuple[int, int]]
+    tensors: tuple[Tensor, ...]  # held, so that no other tensor gets their ids
+    versions: list[tuple[int, int]]
     size: tuple[int, int]
 
 
-_known: WeakKeyDictionary[PinholeCamera, _Known] = WeakKeyDictionary()
+_checked_sizes: WeakKeyDictionary[PinholeCamera, _CheckedSize] = WeakKeyDictionary()
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:
@@ -162,28 +166,28 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
     """
     if not isinstance(cameras, PinholeCamera):
         return _model_size(cameras)
-    known = _known.get(cameras)
-    if known is not None and known.state == _state(cameras):
-        return known.size
+    checked = _checked_sizes.get(cameras)
+    if checked is not None and checked.versions == _versions(cameras):
+        return checked.size
     size = _pinhole_size(cameras)
     _remember(cameras, size)
     return size
 
 
 def _remember(cameras: PinholeCamera, size: tuple[int, int]) -> None:
-    """Keep the size of cameras whose tensors have been checked."""
-    state = _state(cameras)
-    if state is not None:
-        _known[cameras] = _Known(_read_tensors(cameras), state, size)
+    """Cache the size of cameras whose tensors have been checked."""
+    versions = _versions(cameras)
+    if versions is not None:
+        _checked_sizes[cameras] = _CheckedSize(_checked_tensors(cameras), versions, size)
 
 
-def _read_tensors(cameras: PinholeCamera) -> tuple[Tensor, ...]:
+def _checked_tensors(cameras: PinholeCamera) -> tuple[Tensor, ...]:
     return cameras.height, cameras.width, cameras.intrinsics
 
 
-def _state(cameras: PinholeCamera) -> list[tuple[int, int]] | None:
-    """Which tensors these are, and their versions; None for tensors of inference mode, which have no version."""
-    tensors = _read_tensors(cameras)
+def _versions(cameras: PinholeCamera) -> list[tuple[int, int]] | None:
+    """The ids and versions of a camera's tensors; None for tensors of inference mode, which have no version."""
+    tensors = _checked_tensors(cameras)
     if any(x.is_inference() for x in tensors):
         return None
     return [(id(x), x._version) for x in tensors]
@@ -202,6 +206,7 @@ def _model_size(cameras: PosedCamera) -> tuple[int, int]:
 
 
 def _one_size(sizes: set[tuple[int, int]]) -> tuple[int, int]:
+    """The only (height, width) of some; a ValueError if there are others, or it is not positive."""
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size (height, width), got {sorted(sizes)}")
     ((height, width),) = sizes
@@ -211,7 +216,7 @@ def _one_size(sizes: set[tuple[int, int]]) -> tuple[int, int]:
 
 
 def with_constant_last_rows(cameras: Cameras) -> Cameras:
-    """The same cameras, whose intrinsics get no gradient in their last rows: these are constants, see `image_size`."""
+    """The same cameras, without gradient in the last rows of the intrinsics: these are constants, see `image_size`."""
     if not isinstance(cameras, PinholeCamera) or not cameras.intrinsics.requires_grad:
         return cameras
     matrices = torch.cat([cameras.intrinsics[:, :2], cameras.intrinsics[:, 2:].detach()], 1)
@@ -244,14 +249,14 @@ def lenses(cameras: Cameras, size: tuple[int, int] | None = None, frame: Frame |
 
 
 def _pinhole(cameras: PinholeCamera, c: int, frame: Frame) -> Lens:
-    with torch.inference_mode(False):  # autograd refuses tensors made in inference mode; clones are fine
-        both = [x.clone() if x.is_inference() else x for x in (cameras.intrinsics, cameras.extrinsics)]
-    matrix, pose = (x[c] for x in both)
+    """Camera c of some pinhole cameras."""
+    matrix = _for_autograd(cameras.intrinsics)[c]
+    pose = _for_autograd(cameras.extrinsics)[c]
     limits = tangent_limits(matrix.diagonal()[:2], matrix[:2, 2], frame)
 
     def pixels(points: Tensor) -> Tensor:
-        found: Tensor = convert_points_from_homogeneous(times(matrix[:3, :3], points))
-        return found
+        projected: Tensor = convert_points_from_homogeneous(times(matrix[:3, :3], points))
+        return projected
 
     def jacobian(points: Tensor) -> Tensor:
         return _perspective_jacobian(matrix[:2, :2], points, limits)
@@ -260,13 +265,14 @@ def _pinhole(cameras: PinholeCamera, c: int, frame: Frame) -> Lens:
 
 
 def _modelled(cameras: PosedCamera, c: int, frame: Frame) -> Lens:
+    """Camera c of a posed camera model."""
     model = cameras.model
-    with torch.inference_mode(False):  # autograd refuses tensors made in inference mode; clones are fine
-        params, poses = (x.clone() if x.is_inference() else x for x in (model.params, cameras.extrinsics))
+    params = _for_autograd(model.params)
+    pose = _for_autograd(cameras.extrinsics)[c]
     if params.ndim == 2:
         params = params[c if params.shape[0] > 1 else 0]
-    height, width = int(model.height), int(model.width)
-    one = CameraModelBase(model.distortion, model.projection, ImageSize(height, width), params)
+    size = ImageSize(int(model.height), int(model.width))
+    one = CameraModelBase(model.distortion, model.projection, size, params)
     k = torch.diag(params[:2])
     limits = tangent_limits(params[:2], params[2:4], frame)
     parallel = isinstance(model.projection, OrthographicProjection)
@@ -283,34 +289,48 @@ def _modelled(cameras: PosedCamera, c: int, frame: Frame) -> Lens:
             return _perspective_jacobian(k, points, limits)
         if brown_conrady:
             z = points[:, 2]
-            points = torch.stack([*(_clamp_keeping_gradient(points[:, i] / z, *limits[i]) * z for i in (0, 1)), z], 1)
+            x = _clamp_keeping_gradient(points[:, 0] / z, *limits[0]) * z
+            y = _clamp_keeping_gradient(points[:, 1] / z, *limits[1]) * z
+            points = torch.stack([x, y, z], 1)
         return _reverse_jacobian(pixels, points)
 
     sees = None if plain else _before_fold(params.tolist(), brown_conrady)
-    return Lens(poses[c], pixels, jacobian, parallel, sees)
+    return Lens(pose, pixels, jacobian, parallel, sees)
+
+
+def _for_autograd(tensor: Tensor) -> Tensor:
+    """The tensor, or a clone of one made in inference mode, which autograd would refuse."""
+    with torch.inference_mode(False):
+        return tensor.clone() if tensor.is_inference() else tensor
 
 
 def _before_fold(params: list[float], brown_conrady: bool) -> Callable[[Tensor], Tensor] | None:
-    """Which points lie at a smaller angle than the first where the radius in the image stops growing; None: all.
+    """Whether points lie at a smaller angle than the fold, where the radius in the image stops growing; None: all do.
 
     The radius is r P(r^2) / Q(r^2) of the tangent r (Brown-Conrady), or t P(t^2) of the angle t (Kannala-Brandt). Its
     derivative has the sign of the polynomial (P + 2 s P') Q - 2 s P Q' in s, the square of r or t.
     """
     if brown_conrady:
         k1, k2, _, _, k3, k4, k5, k6 = params[4:]
-        above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+        p = Polynomial([1.0, k1, k2, k3])
+        q = Polynomial([1.0, k4, k5, k6])
     else:
-        above, below = Polynomial([1.0, *params[4:]]), Polynomial([1.0])
+        p = Polynomial([1.0, *params[4:]])
+        q = Polynomial([1.0])
     s = Polynomial([0.0, 1.0])
-    growth = (above + 2 * s * above.deriv()) * below - 2 * s * above * below.deriv()
+    growth = (p + 2 * s * p.deriv()) * q - 2 * s * p * q.deriv()
     if not np.isfinite(growth.coef).all():
         return None
-    roots = np.concatenate([p.trim().roots() for p in (growth, below)])
+    roots = np.concatenate([growth.trim().roots(), q.trim().roots()])
     fold = min((float(x.real) for x in roots if x.imag == 0 and x.real > 0), default=math.inf)
     if brown_conrady:
-        return None if fold == math.inf else lambda points: points[:, :2].square().sum(1) < fold * points[:, 2].square()
+        if fold == math.inf:
+            return None
+        return lambda points: points[:, :2].square().sum(1) < fold * points[:, 2].square()
     angle = math.sqrt(fold)
-    return None if angle >= math.pi / 2 else lambda points: points[:, :2].norm(dim=1) < math.tan(angle) * points[:, 2]
+    if angle >= math.pi / 2:
+        return None
+    return lambda points: points[:, :2].norm(dim=1) < math.tan(angle) * points[:, 2]
 
 
 def whole_frame(size: tuple[int, int]) -> Frame:
@@ -322,15 +342,17 @@ def tangent_limits(focal: Tensor, centre: Tensor, frame: Frame) -> Tensor:
     """Limits of x/z and y/z as rows (lower, upper), `(2, 2)`; focal lengths may be negative."""
     begin, end = focal.new_tensor([frame[:2], frame[2:]])
     margin = MARGIN * (end - begin)
-    first, last = -(centre - begin + margin) / focal, (end - centre + margin) / focal
+    first = -(centre - begin + margin) / focal
+    last = (end - centre + margin) / focal
     return torch.stack([torch.minimum(first, last), torch.maximum(first, last)], 1)
 
 
 def _perspective_jacobian(k: Tensor, points: Tensor, limits: Tensor) -> Tensor:
     """K [1/z 0 -x/z^2; 0 1/z -y/z^2] with x/z, y/z clamped, for K's whole 2x2 block."""
     inverse = 1.0 / points[:, 2]
-    tangents = [_clamp_keeping_gradient(points[:, i] * inverse, low, high) for i, (low, high) in enumerate(limits)]
-    last = -inverse[:, None] * times(k, torch.stack(tangents, 1))
+    x = _clamp_keeping_gradient(points[:, 0] * inverse, *limits[0])
+    y = _clamp_keeping_gradient(points[:, 1] * inverse, *limits[1])
+    last = -inverse[:, None] * times(k, torch.stack([x, y], 1))
     return torch.cat([inverse[:, None, None] * k, last[:, :, None]], 2)
 
 
@@ -340,6 +362,7 @@ def _clamp_keeping_gradient(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def _reverse_jacobian(pixels: Pixels, points: Tensor) -> Tensor:
+    """The derivative of the pixels by reverse passes; differentiable once more where `pixels` is."""
     differentiable = torch.is_grad_enabled() and pixels(points[:1]).requires_grad
     with torch.inference_mode(False), torch.enable_grad():
         if not (differentiable and points.requires_grad):

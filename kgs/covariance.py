@@ -45,6 +45,8 @@ def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
 
 
 class _FootprintFactors(torch.autograd.Function):
+    """`footprint_factors` of quaternions."""
+
     @staticmethod
     def forward(ctx: Any, rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
         a = columns(rows)
@@ -96,6 +98,8 @@ def half_axes(covariances: Tensor) -> Tensor:
 
 
 class _HalfAxes(torch.autograd.Function):
+    """`half_axes` and its gradient."""
+
     @staticmethod
     def forward(ctx: Any, covariances: Tensor) -> Tensor:
         xx, xy, xz, yx, yy, yz, zx, zy, zz = covariances.double().flatten(1).unbind(1)
@@ -137,14 +141,22 @@ def columns(rows: Tensor) -> Tensor:
 
 
 def _dot(u: Sequence[Tensor] | Tensor, v: Sequence[Tensor] | Tensor) -> Tensor:
+    """The dot products of columns of 3-vectors."""
     return torch.addcmul(torch.addcmul(u[0] * v[0], u[1], v[1]), u[2], v[2])
 
 
 def _rotation_columns(q: Tensor) -> list[Tensor]:
     """The nine entries, row by row, of the rotations of unit quaternions `(4, M)`."""
     w, x, y, z = q
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
+    xx = 2 * x * x
+    yy = 2 * y * y
+    zz = 2 * z * z
+    xy = 2 * x * y
+    xz = 2 * x * z
+    yz = 2 * y * z
+    wx = 2 * w * x
+    wy = 2 * w * y
+    wz = 2 * w * z
     return [1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy]
 
 
@@ -157,7 +169,7 @@ def _quaternion_gradient(q: Tensor, d: Tensor) -> Tensor:
     sxy = d[0, 1] + d[1, 0]
     sxz = d[0, 2] + d[2, 0]
     syz = d[1, 2] + d[2, 1]
-    dx, dy, dz = (2 * (d[i, i] - d[0, 0] - d[1, 1] - d[2, 2]) for i in (0, 1, 2))
+    dx, dy, dz = [2 * (d[i, i] - d[0, 0] - d[1, 1] - d[2, 2]) for i in (0, 1, 2)]
     dw = x * px + y * py + z * pz
     dx = w * px + x * dx + y * sxy + z * sxz
     dy = w * py + y * dy + x * sxy + z * syz
@@ -172,7 +184,7 @@ def variances(factors: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor, Te
     xx = _dot(a, a)
     xy = _dot(a, b)
     yy = _dot(b, b)
-    cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     det = _dot(cross, cross) + eps2d * (xx + yy) + eps2d**2
     return xx + eps2d, xy, yy + eps2d, det
 
@@ -183,7 +195,7 @@ def conics(xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
 
 
 def compensations(factors: Tensor, eps2d: float) -> Tensor:
-    """sqrt(det M M^T / det(M M^T + eps2d I)), `(M,)`: what keeps the sum of a footprint that is widened by eps2d.
+    """sqrt(det M M^T / det(M M^T + eps2d I)), `(M,)`: with this factor, eps2d does not change a footprint's integral.
 
     The numerator is the norm of a x b for the rows a, b of M, so nothing is cancelled; its gradient is 0 where it is 0.
     """
@@ -194,7 +206,7 @@ def compensations(factors: Tensor, eps2d: float) -> Tensor:
 
 
 def reach(xx: Tensor, yy: Tensor) -> Tensor:
-    """How far footprints reach along x and y in pixels, `(M, 2)`: 3.33 standard deviations, rounded up."""
+    """The reach of footprints along x and y in pixels, `(M, 2)`: 3.33 standard deviations, rounded up."""
     return (3.33 * torch.stack([xx, yy], 1).sqrt()).ceil()
 
 

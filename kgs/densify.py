@@ -16,7 +16,7 @@ from .types import ProjectedGaussians, check_kind
 
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
-_NOT_BY_ROWS = (torch.optim.LBFGS, torch.optim.Adafactor, torch.optim.Rprop)
+_UNSUPPORTED_OPTIMIZERS = (torch.optim.LBFGS, torch.optim.Adafactor, torch.optim.Rprop)
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class DensifyReport:
         split: how many were replaced by two smaller ones.
         pruned: how many were removed because their opacity is too low.
         total: how many there are now: those before + cloned + split - pruned.
-        capped: how many above the threshold stayed unchanged because of `max_gaussians`.
+        capped: how many above the threshold were not cloned or split because of `max_gaussians`.
     """
 
     cloned: int
@@ -42,8 +42,8 @@ class Densifier:
     """Adds Gaussians where the loss gradient is large and removes transparent ones, together with their Adam state.
 
     The statistic is the norm of the loss gradient by the projected centre in normalised device coordinates (pixels over
-    half the width and height), averaged over the times a Gaussian was seen since the last `step`. One that
-    `DropGaussian` switched off is seen with gradient 0, as in the method's release.
+    half the width and height), averaged over the renders since the last `step` in which a Gaussian was visible. A
+    dropped Gaussian counts as visible with gradient 0, as in the method's release.
 
     Convention:
         The loss is a mean over cameras; the gradients are multiplied by their number C, so that the threshold means the
@@ -99,11 +99,16 @@ class Densifier:
         ):
             if not fits:
                 raise ValueError(f"{name}: expected {expected}, got {number}")
-        if isinstance(optimizer, _NOT_BY_ROWS):
+        if isinstance(optimizer, _UNSUPPORTED_OPTIMIZERS):
             raise ValueError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
-        self.model, self.optimizer, self.extent = model, optimizer, float(extent)
-        self.grad_threshold, self.percent_dense, self.prune_opacity = grad_threshold, percent_dense, prune_opacity
-        self.max_gaussians, self.absgrad = max_gaussians, absgrad
+        self.model = model
+        self.optimizer = optimizer
+        self.extent = float(extent)
+        self.grad_threshold = grad_threshold
+        self.absgrad = absgrad
+        self.percent_dense = percent_dense
+        self.prune_opacity = prune_opacity
+        self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
         self._restart_statistics(torch.zeros_like(self.model.means[:, 0]))
         self._check()
@@ -116,7 +121,7 @@ class Densifier:
 
     @torch.no_grad()
     def observe(self, projected: ProjectedGaussians) -> None:
-        """Add the gradients of one render to the statistics; each listed pair (camera, Gaussian) counts as seen.
+        """Add the gradients of one render to the statistics; each pair (camera, Gaussian) counts once.
 
         Call `projected.means2d.retain_grad()` between the render and `backward`, and this after `backward`. With
         `absgrad` there is nothing to retain.
@@ -138,7 +143,8 @@ class Densifier:
             >>> optimizer.step()
         """
         self._check()
-        count, expected = projected.num_gaussians, len(self.model)
+        count = projected.num_gaussians
+        expected = len(self.model)
         if count != expected:
             raise ValueError(f"projected: expected a render of the model's {expected} Gaussians, got one of {count}")
         if len(projected) == 0:
@@ -158,9 +164,10 @@ class Densifier:
         without `.grad`, in the model and the optimizer: call it between `optimizer.step` and the next render.
         """
         self._check()
-        model, before = self.model, len(self.model)
+        model = self.model
+        count_before = len(model)
         average = self._statistics["gradient_sums"] / self._statistics["counts"].clamp(min=1)
-        opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # keeps NaN, which the trainer reports
+        opaque = ~(model.opacity_logits.sigmoid() < self.prune_opacity)  # NaN is not pruned: the trainer reports it
         over = (average >= self.grad_threshold) & opaque
         wanted = int(over.sum())
         room = wanted if self.max_gaussians is None else max(0, self.max_gaussians - int(opaque.sum()))
@@ -168,16 +175,23 @@ class Densifier:
             order = torch.where(over, average, -1.0).argsort(descending=True, stable=True)
             over = torch.zeros_like(over).index_fill(0, order[:room], True)
         large = model.log_scales.exp().amax(dim=1) > self.percent_dense * self.extent
-        cloned, split, kept = (x.nonzero().squeeze(1) for x in (over & ~large, over & large, opaque & ~(over & large)))
+        cloned = (over & ~large).nonzero()[:, 0]
+        split = (over & large).nonzero()[:, 0]
+        unchanged = (opaque & ~(over & large)).nonzero()[:, 0]
         added = torch.cat([cloned, split.repeat(CHILDREN)])
         new = {name: parameter.index_select(0, added) for name, parameter in model.named_parameters()}
         new["means"][len(cloned) :] += self._sample_offsets(split.repeat(CHILDREN))
         new["log_scales"][len(cloned) :] -= math.log(SHRINK)
         for name, parameter in list(model.named_parameters()):
-            self._replace(name, torch.cat([parameter.index_select(0, kept), new[name]]), kept)
-        self._restart_statistics(self.mean_gradients[torch.cat([kept, added])])
-        pruned, capped = before - len(kept) - len(split), max(0, wanted - room)
-        return DensifyReport(len(cloned), len(split), pruned, len(model), capped)
+            self._replace(name, torch.cat([parameter.index_select(0, unchanged), new[name]]), unchanged)
+        self._restart_statistics(self.mean_gradients[torch.cat([unchanged, added])])
+        return DensifyReport(
+            cloned=len(cloned),
+            split=len(split),
+            pruned=count_before - len(unchanged) - len(split),
+            total=len(model),
+            capped=max(0, wanted - room),
+        )
 
     @torch.no_grad()
     def reset_opacity(self, ceiling: float = 0.01) -> None:
@@ -186,7 +200,8 @@ class Densifier:
             raise ValueError(f"ceiling: expected a number in (0, 1), got {ceiling}")
         self._check()
         lowered = self.model.opacity_logits.clamp(max=math.log(ceiling / (1.0 - ceiling)))
-        self._replace("opacity_logits", lowered, kept=torch.empty(0, dtype=torch.int64, device=lowered.device))
+        no_rows = torch.empty(0, dtype=torch.int64, device=lowered.device)
+        self._replace("opacity_logits", lowered, no_rows)
 
     @torch.no_grad()
     def decay_opacity(self, factor: float) -> None:
@@ -202,7 +217,8 @@ class Densifier:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned; ValueError if entries are missing or the number of Gaussians differs."""
-        shape, missing = (len(self.model),), {*self._statistics, "generator"} - state.keys()
+        shape = (len(self.model),)
+        missing = {*self._statistics, "generator"} - state.keys()
         if missing:
             raise ValueError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
         for name in self._statistics:
@@ -214,7 +230,7 @@ class Densifier:
         self.generator.set_state(state["generator"].cpu())
 
     def _gradient_of(self, means2d: Tensor) -> Tensor:
-        """What the last backward pass left in projected centres, `(M, 2)`."""
+        """The gradients that the last backward pass stored in projected centres, `(M, 2)`."""
         if not means2d.requires_grad:
             why = "the means need requires_grad=True, and the render has to be made with gradients on"
             raise ValueError(f"projected: expected means2d that need a gradient, got others: {why}")
@@ -228,7 +244,8 @@ class Densifier:
 
     def _check(self) -> None:
         """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
-        count, expected = len(self.model), len(self._statistics["counts"])
+        count = len(self.model)
+        expected = len(self._statistics["counts"])
         if count != expected:
             raise ValueError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
@@ -250,10 +267,10 @@ class Densifier:
         rotations = rotation_matrices(self.model.quats.index_select(0, ids))
         return torch.einsum("nij,nj->ni", rotations, scales * noise.to(means.device))
 
-    def _replace(self, name: str, value: Tensor, kept: Tensor) -> None:
+    def _replace(self, name: str, value: Tensor, old_rows: Tensor) -> None:
         """Replace a parameter by `value` in the model, the param group and the optimizer's state.
 
-        State that has the parameter's shape (Adam's moments) starts with the old rows `kept`, followed by zeros. The
+        State that has the parameter's shape (Adam's moments) starts with its `old_rows`, followed by zeros. The
         parameter is a new object: a live autograd graph would hold the old one to its shape.
         """
         old = self.model.get_parameter(name)
@@ -265,11 +282,12 @@ class Densifier:
             for key, entry in state.items():
                 if isinstance(entry, Tensor) and entry.shape == old.shape:
                     state[key] = entry.new_zeros(value.shape)
-                    state[key][: len(kept)] = entry.index_select(0, kept)
+                    state[key][: len(old_rows)] = entry.index_select(0, old_rows)
             self.optimizer.state[new] = state
         setattr(self.model, name, new)
 
     def _restart_statistics(self, last_gradients: Tensor) -> None:
+        """Begin new means, with the mean gradients so far `(N,)` as their first observation."""
         last = last_gradients.detach()
         counts = torch.zeros_like(last, dtype=torch.int64)
         self._statistics = {"gradient_sums": torch.zeros_like(last), "counts": counts, "last_gradients": last}

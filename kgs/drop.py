@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+_CALLER = 6  # stack level of the line `layer(opacities)`: nn.Module.__call__ takes two levels
+
 
 def drop_gaussian(
     opacities: Tensor, p: float = 0.2, training: bool = True, generator: torch.Generator | None = None
@@ -94,8 +96,7 @@ class DropGaussian(nn.Module):
         super().__init__()
         if schedule not in ("linear", "constant") and not callable(schedule):
             raise ValueError(f"schedule: expected 'linear', 'constant' or a callable, got {schedule!r}")
-        is_integer = isinstance(seed, int | Integral) and not isinstance(seed, bool)
-        if seed is not None and not (is_integer and -(2**63) <= seed < 2**64):
+        if seed is not None and not _is_seed(seed):
             raise ValueError(f"seed: expected None or an integer from -2^63 to 2^64 - 1, got {seed!r}")
         self.p = _fraction("p", p)
         self.schedule = schedule
@@ -142,11 +143,11 @@ class DropGaussian(nn.Module):
         if self._progress is None and self.schedule != "constant":
             advice = "set `drop.progress = step / total_steps` in the loop, or schedule='constant'"
             message = f"progress was never set, so the rate stays at {self.rate:g}; {advice}"
-            warnings.warn(f"DropGaussian: {message}", stacklevel=4)
+            warnings.warn(f"DropGaussian: {message}", stacklevel=_CALLER)
         with contextlib.suppress(RuntimeError):  # in vmap and on the meta device there are no values to read
             if bool(((opacities < 0) | (opacities > 1)).any()):
                 message = "expected opacities in [0, 1]; the layer belongs behind their activation, not on logits"
-                warnings.warn(f"DropGaussian: {message}", stacklevel=4)
+                warnings.warn(f"DropGaussian: {message}", stacklevel=_CALLER)
 
     def get_rng_state(self) -> Tensor:
         """The state of the layer's own stream, a tensor on the CPU; a ValueError where it has none (seed is None)."""
@@ -163,7 +164,7 @@ class DropGaussian(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
-        if self._generator is not None:  # neither a generator nor a short-lived tensor travels to a spawned process
+        if self._generator is not None:  # as bytes: neither generators nor temporary tensors reach a spawned process
             state["_generator"] = (self._generator.device, bytes(self._generator.get_state().tolist()))
         return state
 
@@ -175,15 +176,22 @@ class DropGaussian(nn.Module):
             self._generator.set_state(torch.frombuffer(bytearray(rng_state), dtype=torch.uint8))
 
     def extra_repr(self) -> str:
-        """What `print` shows."""
+        """The settings, as `print` displays them."""
         name = getattr(self.schedule, "__name__", self.schedule)
         progress = "1.0 (never set)" if self._progress is None else f"{self._progress:g}"
         seed = "" if self.seed is None else f", seed={self.seed}"
         return f"p={self.p:g}, schedule={name}, progress={progress}{seed}"
 
 
+def _is_seed(value: Any) -> bool:
+    """Whether `torch.Generator.manual_seed` takes a value; True and False are no seeds."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        return False
+    return -(2**63) <= int(value) < 2**64
+
+
 def _fraction(name: str, value: Any, closed: bool = False) -> float:
-    """A number in [0, 1), or in [0, 1]."""
+    """The value as a float; a ValueError if it is no number in [0, 1), or in [0, 1] where `closed`."""
     number = float(value) if isinstance(value, Real | Tensor) else -1.0
     if not (0.0 <= number < 1.0 or (closed and number == 1.0)):
         raise ValueError(f"{name}: expected a number in [0, 1{']' if closed else ')'}, got {value!r}")

@@ -1,4 +1,4 @@
-"""The errors of kgs that are not a wrong argument: a bad file, and a fit whose numbers are no longer finite."""
+"""Errors beside wrong arguments: a bad file, and a fit whose numbers are no longer finite."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -19,17 +19,19 @@ def listed(names: Sequence[object]) -> str:
 
 
 class DataError(Exception):
-    """A file or folder does not hold what it should.
+    """A file or folder has other contents than expected.
 
     Args:
         path: the file or folder at fault.
         field: the part of it that is wrong (a key, a property, a line), or "" for the file as a whole.
-        reason: what was expected and what was found.
+        reason: what was expected, and what the file holds.
     """
 
     def __init__(self, path: str | PathLike[str], field: str, reason: str) -> None:
         super().__init__(path, field, reason)
-        self.path, self.field, self.reason = path, field, reason
+        self.path = path
+        self.field = field
+        self.reason = reason
 
     def __str__(self) -> str:
         where = f"{self.path}: {self.field}" if self.field else f"{self.path}"

@@ -1,6 +1,9 @@
 """Points, pixels and poses: projection of points, positions of cameras, spacing of points."""
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 import torch
@@ -12,11 +15,6 @@ from .types import check_tensor
 
 NEIGHBOURS = 3
 MIN_RELATIVE_SPACING = 1e-3
-
-
-def camera_matrices(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Intrinsics `(V, 3, 3)` and world-to-camera extrinsics `(V, 4, 4)` in float64 on the CPU."""
-    return cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu()
 
 
 def camera_centers(extrinsics: Tensor) -> Tensor:
@@ -62,7 +60,8 @@ def meeting_point(extrinsics: Tensor) -> Tensor | None:
         World-to-camera extrinsics, OpenCV axes, `(V, 4, 4)`. Axes within about 5 degrees count as parallel.
     """
     poses = torch.linalg.inv(extrinsics.double().cpu())
-    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    centers = poses[:, :3, 3]
+    axes = poses[:, :3, 2]
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     if torch.linalg.eigvalsh(across.mean(0))[0] <= 0.005:
         return None
@@ -77,21 +76,75 @@ def degrees_between(rotations: Tensor, others: Tensor) -> Tensor:
     return 2 * sines.clamp(max=1).asin().rad2deg()
 
 
+@dataclass(frozen=True, eq=False)
+class ViewGeometry:
+    """The matrices of V pinhole cameras, converted once for many projections; float64 on the CPU.
+
+    Convention:
+        World-to-camera extrinsics, OpenCV axes, integer pixel centres. Depth is z in the camera's frame.
+
+    Args:
+        intrinsics: `(V, 3, 3)`.
+        extrinsics: `(V, 4, 4)`.
+        sizes: width and height of the images in pixels, `(V, 2)`.
+    """
+
+    intrinsics: Tensor
+    extrinsics: Tensor
+    sizes: Tensor
+
+    @classmethod
+    def of(cls, cameras: PinholeCamera) -> Self:
+        """The matrices of some cameras."""
+        sizes = torch.stack([cameras.width, cameras.height], -1).double().cpu()
+        return cls(cameras.intrinsics[:, :3, :3].double().cpu(), cameras.extrinsics.double().cpu(), sizes)
+
+    @cached_property
+    def inverse_intrinsics(self) -> Tensor:
+        """From pixels to rays of depth 1, `(V, 3, 3)`."""
+        inverse: Tensor = torch.linalg.inv(self.intrinsics)
+        return inverse
+
+    @cached_property
+    def centers(self) -> Tensor:
+        """The centres of the cameras in the world, `(V, 3)`."""
+        return camera_centers(self.extrinsics)
+
+    def __len__(self) -> int:
+        return len(self.extrinsics)
+
+    def one(self, view: int) -> Self:
+        """A single one of the cameras, V = 1."""
+        row = slice(view, view + 1)
+        return type(self)(self.intrinsics[row], self.extrinsics[row], self.sizes[row])
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels `(P, V, 2)` and depths `(P, V)` of P points in all cameras; pixels are invalid at depth <= 0."""
+        local = torch.einsum("vij,pj->pvi", self.extrinsics[:, :3, :3], points.double()) + self.extrinsics[:, :3, 3]
+        image = torch.einsum("vij,pvj->pvi", self.intrinsics, local)
+        return image[..., :2] / image[..., 2:], local[..., 2]
+
+    def unproject(self, pixels: Tensor, depths: Tensor, views: Tensor) -> Tensor:
+        """World points `(P, 3)` of pixels `(P, 2)` at depths `(P,)`, each in the camera `views (P,)`."""
+        rays = convert_points_to_homogeneous(pixels.double())
+        local = (self.inverse_intrinsics[views] @ rays[..., None])[..., 0] * depths[:, None]
+        world: Tensor = (local - self.extrinsics[views, :3, 3])[:, None] @ self.extrinsics[views, :3, :3]
+        return world[:, 0]
+
+    def inside_images(self, pixels: Tensor, depths: Tensor, near: float = 0.0, far: float = math.inf) -> Tensor:
+        """Whether projected points `(P, V)` lie in the images, in front of the cameras, at depths from near to far."""
+        within = ((pixels > -0.5) & (pixels < self.sizes - 0.5)).all(-1)
+        return within & (depths > 0) & (depths >= near) & (depths <= far)
+
+
 def project_points(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, float64; pixels are invalid at depth <= 0."""
-    intrinsics, extrinsics = camera_matrices(cameras)
-    local = torch.einsum("vij,pj->pvi", extrinsics[:, :3, :3], points.double()) + extrinsics[:, :3, 3]
-    image = torch.einsum("vij,pvj->pvi", intrinsics, local)
-    return image[..., :2] / image[..., 2:], local[..., 2]
+    """Pixels `(P, V, 2)` and depths `(P, V)` of P points in V cameras, see :meth:`ViewGeometry.project`."""
+    return ViewGeometry.of(cameras).project(points)
 
 
 def unproject(pixels: Tensor, depths: Tensor, views: Tensor, cameras: PinholeCamera) -> Tensor:
-    """World points `(P, 3)` of pixels `(P, 2)` at depths `(P,)`, each in the camera `views (P,)`; float64."""
-    intrinsics, extrinsics = camera_matrices(cameras)
-    rays = convert_points_to_homogeneous(pixels.double())
-    local = (torch.linalg.inv(intrinsics)[views] @ rays[..., None])[..., 0] * depths[:, None]
-    world: Tensor = (local - extrinsics[views, :3, 3])[:, None] @ extrinsics[views, :3, :3]
-    return world[:, 0]
+    """World points `(P, 3)` of pixels of some cameras, see :meth:`ViewGeometry.unproject`."""
+    return ViewGeometry.of(cameras).unproject(pixels, depths, views)
 
 
 def nearest_pixels(pixels: Tensor, depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,29 +155,17 @@ def nearest_pixels(pixels: Tensor, depths: Tensor, width: int, height: int) -> t
     Convention:
         Integer pixel centres, rounded half to even.
     """
-    places = pixels.round()
-    inside = ((places >= 0) & (places < torch.tensor([width, height]))).all(1) & (depths > 0)
-    x, y = torch.where(inside[:, None], places, 0.0).long().unbind(1)
+    rounded = pixels.round()
+    inside = ((rounded >= 0) & (rounded < torch.tensor([width, height]))).all(1) & (depths > 0)
+    x, y = torch.where(inside[:, None], rounded, 0.0).long().unbind(1)
     return x, y, inside
-
-
-def inside_images(pixels: Tensor, depths: Tensor, cameras: PinholeCamera, near: float, far: float) -> Tensor:
-    """Whether projected points `(P, V)` lie in the images of their cameras, at depths from near to far."""
-    size = torch.stack([cameras.width, cameras.height], -1).to(pixels)
-    within = ((pixels > -0.5) & (pixels < size - 0.5)).all(-1)
-    return within & (depths >= near) & (depths <= far)
 
 
 def points_in_images(points: Tensor, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
     """Depths of P points in V cameras, and whether they lie in the image, in front of the camera; both `(P, V)`."""
-    pixels, depths = project_points(points, cameras)
-    return depths, inside_images(pixels, depths, cameras, 0.0, torch.inf) & (depths > 0)
-
-
-def depths_in_images(points: Tensor, cameras: PinholeCamera) -> Tensor:
-    """Depths of points in the cameras whose image they lie in, `(D,)`."""
-    depths, inside = points_in_images(points, cameras)
-    return depths[inside]
+    geometry = ViewGeometry.of(cameras)
+    pixels, depths = geometry.project(points)
+    return depths, geometry.inside_images(pixels, depths)
 
 
 def typical_depths(points: Tensor, cameras: PinholeCamera) -> tuple[float, float]:
@@ -141,11 +182,10 @@ def typical_depths(points: Tensor, cameras: PinholeCamera) -> tuple[float, float
         Both over the depths of points inside an image, else of all points in front of a camera; 1.0 where there are
         none.
     """
-    points = points.detach().cpu()
-    depths = depths_in_images(points, cameras)
+    all_depths, inside = points_in_images(points.detach().cpu(), cameras)
+    depths = all_depths[inside]
     if not len(depths):
-        _, depths = project_points(points, cameras)
-        depths = depths[depths > 0]
+        depths = all_depths[all_depths > 0]
     if not len(depths):
         return 1.0, 1.0
     near, median = np.quantile(depths, (0.01, 0.5)).tolist()  # torch.quantile refuses more than 16 million values
@@ -186,6 +226,6 @@ def _mean_squared_distance(points: Tensor) -> Tensor:
 
     data = points.float().cpu().numpy()  # the index refers to this array, it makes no copy
     index = cv2.flann_Index(data, {"algorithm": 4})  # type: ignore[attr-defined]  # an exact k-d tree; not in the stubs
-    found, _ = index.knnSearch(data, min(NEIGHBOURS + 1, len(data)), params={})
-    ids = torch.from_numpy(found[:, 1:]).long().to(points.device)  # the first is the point itself or its double
+    nearest, _ = index.knnSearch(data, min(NEIGHBOURS + 1, len(data)), params={})
+    ids = torch.from_numpy(nearest[:, 1:]).long().to(points.device)  # the first is the point itself or its double
     return (points[ids] - points[:, None, :]).square().sum(dim=-1).mean(dim=-1)

@@ -44,4 +44,4 @@ def evaluate_harmonics(colors: Tensor, directions: Tensor) -> Tensor:
     else:
         basis = harmonics_basis(directions, math.isqrt(colors.shape[1]) - 1)
         value = (basis[:, :, None] * colors).sum(1) + 0.5
-    return value.masked_fill(value < 0, 0.0)  # clamp_min has other gradients at 0 in other versions of torch
+    return value.masked_fill(value < 0, 0.0)  # the gradient of clamp_min at 0 depends on torch's version

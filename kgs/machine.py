@@ -18,7 +18,7 @@ from .version import __version__
 
 
 def check_device(name: str) -> torch.device:
-    """The device of that name; ValueError if torch has no such device, or it cannot hold a number."""
+    """The device of that name; ValueError if torch has no such device, or its tensors hold no numbers."""
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # the meta device has no numbers
@@ -44,32 +44,40 @@ def check_packages(*packages: str) -> None:
 
 def versions() -> dict[str, str]:
     """Versions of everything that affects a result; without numba or triton if they are not installed."""
-    found = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
+    result = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
     for package in ("numba", "triton"):
         with contextlib.suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found | {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+            result[package] = version(package)
+    return result | {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
 
 
 def revision(path: Path) -> str | None:
     """The commit that last changed a file or folder, as "1a2b3c4 of 2026-11-22"; None where git does not know it."""
-    options = (("log", "-1", "--format=%h of %cs"), ("status", "--porcelain"))
-    calls = (["git", "-C", str(path.parent), *arguments, "--", path.name] for arguments in options)
     try:
-        commit, changes = (subprocess.run(c, capture_output=True, text=True, check=True).stdout.strip() for c in calls)
+        commit = _git(path, "log", "-1", "--format=%h of %cs")
+        changes = _git(path, "status", "--porcelain")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return commit + (" and later changes" if changes else "") if commit else None
+    if not commit:
+        return None
+    return f"{commit} and later changes" if changes else commit
+
+
+def _git(path: Path, *arguments: str) -> str:
+    """What a git command prints about a file or folder."""
+    call = ["git", "-C", str(path.parent), *arguments, "--", path.name]
+    return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def peak_rss_mb() -> int:
     """Largest resident memory of this process so far, in MiB; 0 where the system does not report it (Windows)."""
     status = Path("/proc/self/status")
-    if status.exists():  # what getrusage says on Linux can be the peak of the process that started this one
+    if status.exists():  # on Linux, getrusage may return the peak of the parent process
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
         return round(int(line.split()[1]) / 2**10)
     try:
         import resource
     except ModuleNotFoundError:
         return 0
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10))
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)

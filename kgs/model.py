@@ -1,4 +1,4 @@
-"""The model: the parameters of a splat, which an optimiser changes, and their activations, which make Gaussians.
+"""The model: the parameters of a splat, which an optimiser changes, and their activations to Gaussians.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023, section 5:
 exponential for scales, sigmoid for opacities, isotropic start with the mean distance to the three nearest points.
@@ -149,11 +149,11 @@ class GaussianModel(nn.Module):
         self._sh_degree = _check_degree(value, self.max_sh_degree)
 
     def forward(self) -> Gaussians:
-        """The Gaussians: scales and opacities after their activations, and harmonics up to the active degree."""
+        """The Gaussians: activated scales and opacities, and harmonics up to the active degree."""
         colors: Tensor = self.sh_dc
         if self.sh_degree > 0:  # at degree 0 sh_rest gets no gradient, and an optimiser skips it
             colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
-        # A Gaussian whose scale overflows is not drawn. The gradient of exp would be 0 times infinity there.
+        # A Gaussian whose scale overflows is not rendered. The gradient of exp would be 0 times infinity there.
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
         scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
         return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)
@@ -173,7 +173,7 @@ class GaussianModel(nn.Module):
         self.sh_degree = int(state)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Resize the parameters to the values that will be loaded."""
+        """Resize the parameters to the values, then load them."""
         values = [state_dict[prefix + name] for name in PARAMETERS if prefix + name in state_dict]
         if len(values) == len(PARAMETERS):
             highest = _check_shapes(values)
@@ -187,7 +187,7 @@ class GaussianModel(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def extra_repr(self) -> str:
-        """What `print(model)` shows."""
+        """Number, degrees and dtype, as `print(model)` displays them."""
         antialiased = ", antialiased" if self.antialiased else ""
         degrees = f"sh_degree={self.sh_degree} of {self.max_sh_degree}"
         return f"{len(self)} Gaussians, {degrees}, {self.means.dtype}{antialiased}"
@@ -224,7 +224,8 @@ def _check_degree(value: int, highest: int) -> int:
 
 def _check_shapes(values: Sequence[Tensor]) -> int:
     """The highest degree that the harmonics hold; a ValueError if the shapes of the `PARAMETERS` do not match."""
-    means, sh_rest = values[0], values[-1]
+    means = values[0]
+    sh_rest = values[-1]
     n = means.shape[0] if means.ndim else 0
     k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
     if k not in SH_SIZES:

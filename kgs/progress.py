@@ -1,11 +1,11 @@
-"""How functions that take a while show their progress: they are given a wrapper for their loop."""
+"""Progress of long loops: functions take a wrapper for their loop, which may display a bar."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # items, what is done to them, the word for one of them
+Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # items, title, name of one item
 
 
 def silent(items: Sequence[Any], title: str, unit: str) -> Iterable[Any]:
-    """The items, without a word."""
+    """The items, without any output."""
     return items

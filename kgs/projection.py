@@ -1,6 +1,6 @@
-"""What projection is made of, for the backends and for outputs beside colours.
+"""Parts of projection that the backends and outputs beside colours share.
 
-`kgs.backends.torch.projection` puts it together. The footprint is in `kgs.covariance`, the lens in `kgs.camera`.
+`kgs.backends.torch.projection` combines them. The footprint is in `kgs.covariance`, the lens in `kgs.camera`.
 """
 
 import torch
@@ -30,8 +30,8 @@ def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussian
         means = gaussians.means.index_select(0, ids)
         directions = []
         for c, lens in enumerate(lenses(cameras, projected.image_size)):
-            own = select_rows(means, (projected.camera_ids == c).nonzero()[:, 0])
-            directions.append(view_directions(own, lens.extrinsics, lens.parallel))
+            visible = select_rows(means, (projected.camera_ids == c).nonzero()[:, 0])
+            directions.append(view_directions(visible, lens.extrinsics, lens.parallel))
         backwards = (normal * torch.cat(directions)).sum(1, keepdim=True) > 0
     return torch.where(backwards, -normal, normal)
 
@@ -48,12 +48,12 @@ def cut_squared(opacities: Tensor, alpha_threshold: float) -> Tensor:
 
 
 def visibility_cutoff(opacities: Tensor, alpha_threshold: float) -> Tensor:
-    """How many standard deviations wide a footprint counts as visible: one number for all, 0-d.
+    """The number of standard deviations within which a footprint counts as visible: one for all Gaussians, 0-d.
 
     At least 3, and enough for an opacity of 2 or the largest of all, if that is more.
     """
-    two = torch.full((1,), 2.0, dtype=opacities.dtype, device=opacities.device)
-    largest = torch.cat([opacities.flatten(), two]).amax()
+    least = torch.full((1,), 2.0, dtype=opacities.dtype, device=opacities.device)
+    largest = torch.cat([opacities.flatten(), least]).amax()
     return cut_squared(largest, alpha_threshold).clamp_min(9.0).sqrt()
 
 
@@ -64,7 +64,7 @@ def view_directions(means: Tensor, extrinsics: Tensor, parallel: bool = False) -
     """
     inverse = _inverse(extrinsics[:3, :3])
     offsets = inverse[:, 2].expand_as(means) if parallel else means + times(inverse, extrinsics[:3, 3])
-    offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # the squares of 1e20 would overflow
+    offsets = offsets / offsets.detach().abs().amax(dim=1, keepdim=True)  # else the squares of 1e20 overflow
     unit: Tensor = offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True)
     return unit
 
@@ -82,7 +82,7 @@ def _inverse(matrix: Tensor) -> Tensor:
 
 
 def finite_gaussians(gaussians: Gaussians) -> Tensor:
-    """Which Gaussians have only finite parameters, `(N,)`."""
+    """Whether all parameters of a Gaussian are finite, `(N,)`."""
     opacities = gaussians.opacities.detach()
     values = [opacities.T if opacities.ndim == 2 else opacities[:, None]]
     values += [x.detach().flatten(1) for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors)]
@@ -94,5 +94,5 @@ def finite_gaussians(gaussians: Gaussians) -> Tensor:
 
 
 def select_rows(values: Tensor, ids: Tensor) -> Tensor:
-    """Rows of a tensor, contiguous; no copy where all rows, in order, are wanted."""
+    """Rows of a tensor, contiguous; `ids` ascend, so that as many as there are rows are all of them: no copy."""
     return values.contiguous() if ids.shape[0] == values.shape[0] else values.index_select(0, ids)

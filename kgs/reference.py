@@ -60,7 +60,7 @@ def render(
         background: None (black), `(3,)`, `(1, 3)` or `(1, 3, H, W)`.
         alpha_threshold: smaller alphas are skipped; 0 skips none.
         transmittance_stop: transmittance below this counts as 0; the layer that crosses it still counts.
-        near_plane: only centres with z > near_plane are drawn; world units.
+        near_plane: only centres with z > near_plane are rendered; world units.
         eps2d: variance in px^2 added to each footprint; with 0 no footprint may be flat.
 
     Returns:
@@ -73,14 +73,14 @@ def render(
             background of another shape.
         torch.linalg.LinAlgError: `eps2d` is 0 and a footprint is flat.
     """
-    drawn = layers(gaussians, camera, alpha_threshold, transmittance_stop, near_plane, eps2d)
-    image = torch.einsum("lhw,lc->chw", drawn.weights, drawn.colors)
+    stack = layers(gaussians, camera, alpha_threshold, transmittance_stop, near_plane, eps2d)
+    image = torch.einsum("lhw,lc->chw", stack.weights, stack.colors)
     if background is not None:
         check_tensor("background", background)
         if tuple(background.shape) not in {(3,), (1, 3), (1, *image.shape)}:
             raise ValueError(f"background: expected (3,), (1, 3) or (1, 3, H, W), got {tuple(background.shape)}")
         behind = background.double().reshape(3, *(background.shape[2:] or (1, 1)))
-        image = image + behind * drawn.transmittance
+        image = image + behind * stack.transmittance
     return image[None]
 
 
@@ -99,9 +99,12 @@ def layers(
         shape = tuple(gaussians.opacities.shape)
         raise ValueError(f"camera: expected one camera and one row of opacities, got {camera.batch_size} and {shape}")
     check_intrinsics("camera", camera.intrinsics)
-    height, width = int(camera.height), int(camera.width)
-    intrinsics, extrinsics = camera.intrinsics[0, :2, :3].double(), camera.extrinsics[0].double()
-    rotation, translation = extrinsics[:3, :3], extrinsics[:3, 3]
+    height = int(camera.height)
+    width = int(camera.width)
+    intrinsics = camera.intrinsics[0, :2, :3].double()
+    extrinsics = camera.extrinsics[0].double()
+    rotation = extrinsics[:3, :3]
+    translation = extrinsics[:3, 3]
     rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities.reshape(-1, 1), gaussians.colors)
     with torch.no_grad():
         z = gaussians.means.double() @ rotation[2] + translation[2]
@@ -133,7 +136,8 @@ def layers(
 def _jacobians(points: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
     """Derivative of the pixel, with x/z and y/z limited to 15 % of the image size beyond its borders."""
     size = torch.tensor([width, height]).to(points)
-    focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
+    focal = intrinsics.diagonal()[:2]
+    centre = intrinsics[:2, 2]
     ends = torch.stack([(-0.5 - centre - 0.15 * size) / focal, (size - 0.5 - centre + 0.15 * size) / focal])
     tangents = torch.clamp(points[:, :2] / points[:, 2:], ends.amin(0), ends.amax(0))
     plane = torch.cat([torch.eye(2).to(points).expand(len(points), 2, 2), -tangents[:, :, None]], 2)
@@ -146,7 +150,8 @@ def _covariances(quats: Tensor, scales: Tensor) -> Tensor:
         return quats @ torch.diag_embed(scales**2) @ quats.mT
     eye = torch.eye(3).to(quats)
     quats = torch.where((quats == 0).all(1, keepdim=True), torch.eye(4).to(quats)[0], quats)
-    w, v = quats[:, :1, None], quats[:, None, 1:]
+    w = quats[:, :1, None]
+    v = quats[:, None, 1:]
     square = (v * v).sum(2, keepdim=True)
     cross: Tensor = torch.linalg.cross(eye[None], v)
     rotations = ((w * w - square) * eye + 2 * v.mT @ v + 2 * w * cross) / (w * w + square)
@@ -159,14 +164,18 @@ def _harmonics(directions: Tensor, size: int) -> Tensor:
     Y_lm is N_lm P_lm(z) times Re (x + i y)^m or, for m < 0, Im (x + i y)^|m|; P_lm without its factor (1 - z^2)^(m/2).
     """
     x, y, z = directions.unbind(1)
-    basis, degree = [z] * size, math.isqrt(size) - 1
-    power, diagonal = torch.complex(torch.ones_like(x), torch.zeros_like(y)), 1.0
+    basis = [z] * size
+    degree = math.isqrt(size) - 1
+    power = torch.complex(torch.ones_like(x), torch.zeros_like(y))
+    diagonal = 1.0
     for m in range(degree + 1):
-        before, legendre = torch.zeros_like(z), torch.full_like(z, diagonal)
+        before = torch.zeros_like(z)
+        legendre = torch.full_like(z, diagonal)
         for n in range(m, degree + 1):
             square = (1 if m == 0 else 2) * (2 * n + 1) / (4 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
             basis[n * n + n - m] = (-1) ** m * math.sqrt(square) * legendre * power.imag
             basis[n * n + n + m] = (-1) ** m * math.sqrt(square) * legendre * power.real  # the one that stays for m = 0
             before, legendre = legendre, ((2 * n + 1) * z * legendre - (n + m) * before) / (n - m + 1)
-        power, diagonal = power * torch.complex(x, y), (2 * m + 1) * diagonal
+        power = power * torch.complex(x, y)
+        diagonal = (2 * m + 1) * diagonal
     return torch.stack(basis, 1)

@@ -26,8 +26,8 @@ class GaussianRenderer(nn.Module):
     Limits:
         Differentiable once, by `backward` or `torch.autograd.grad`. Second derivatives, forward mode, `torch.func`
         (vmap, jacrev, jvp, ...) and `is_grads_batched` are errors. `torch.compile` breaks its graph at `project` and
-        `composite`, which run as they are. Depth divides by alpha = 1 - T, which in float32 is
-        right to 6e-8: to 6 % where alpha is 1e-6.
+        `composite`, which run as they are. Depth divides by alpha = 1 - T, which in float32 has an error of 6e-8: 6 %
+        where alpha is 1e-6.
 
     Args:
         opacity_layer: applied to the opacities before anything else, e.g. `DropGaussian`; None leaves them.
@@ -76,7 +76,8 @@ class GaussianRenderer(nn.Module):
         super().__init__()
         check_backend(backend)
         self.opacity_layer = nn.Identity() if opacity_layer is None else opacity_layer
-        self.options, self.backend = raster_options(options, fields), backend
+        self.options = raster_options(options, fields)
+        self.backend = backend
 
     def forward(
         self,
@@ -94,7 +95,7 @@ class GaussianRenderer(nn.Module):
             outputs: any of "image", "alpha", "depth", "median_depth", "normal"; what is not named is not computed.
 
         Returns:
-            The outputs asked for, and the Gaussians that were seen.
+            The outputs asked for, and the visible Gaussians.
 
         Raises:
             TypeError: an argument has another type or dtype.
@@ -107,8 +108,8 @@ class GaussianRenderer(nn.Module):
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
             gaussians = dataclasses.replace(gaussians, opacities=opacities)
-        image = "image" in outputs
-        projected = project(gaussians, cameras, options=self.options, colors=image, backend=self.backend)
+        with_image = "image" in outputs
+        projected = project(gaussians, cameras, options=self.options, colors=with_image, backend=self.backend)
         features = {"image": projected.colors}
         if "depth" in outputs:
             features["depth"] = projected.depths[:, None]
@@ -118,20 +119,25 @@ class GaussianRenderer(nn.Module):
         median = "median_depth" in outputs
         result = composite(projected, values, options=self.options, median_depth=median, backend=self.backend)
         ends = accumulate((x.shape[1] for x in features.values()), initial=0)
-        found = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
+        images = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
         if "depth" in outputs:
             alpha = 1.0 - result.transmittance
             covered = alpha >= 1e-6
-            found["depth"] = torch.where(covered, found["depth"] / torch.where(covered, alpha, 1.0), 0.0)
-        picture = blend(found["image"], result.transmittance, background) if image else None
-        shown = 1.0 - result.transmittance if "alpha" in outputs else None
-        return Rendering(picture, shown, found.get("depth"), result.median_depth, projected, found.get("normal"))
+            images["depth"] = torch.where(covered, images["depth"] / torch.where(covered, alpha, 1.0), 0.0)
+        return Rendering(
+            image=blend(images["image"], result.transmittance, background) if with_image else None,
+            alpha=1.0 - result.transmittance if "alpha" in outputs else None,
+            depth=images.get("depth"),
+            median_depth=result.median_depth,
+            projected=projected,
+            normal=images.get("normal"),
+        )
 
     def extra_repr(self) -> str:
-        """What `print` shows."""
+        """The options, as `print` displays them."""
         options = vars(self.options).items()
-        shown = (f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in options)
-        return ", ".join(shown)
+        texts = (f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in options)
+        return ", ".join(texts)
 
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name: str = "background") -> Tensor:
@@ -139,10 +145,11 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
     if background is None:
         return image
     check_tensor(name, background, image, " as the image")
-    full, shape = tuple(image.shape), tuple(background.shape)
+    full = tuple(image.shape)
+    shape = tuple(background.shape)
     if shape in (full[1:2], full[:2]):
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
         raise ValueError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
-    # an infinite background does not show through opaque pixels
+    # 0 where nothing shines through: 0 times an infinite background would be NaN
     return image + transmittance * torch.where(background.isinf() & (transmittance == 0), 0.0, background)

@@ -28,7 +28,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def outside_graphs(stage: F) -> F:
-    """A stage that `torch.compile` runs as it is: what it computes depends on numbers, which a graph cannot follow."""
+    """A stage that `torch.compile` runs outside its graphs: shapes of results depend on values of tensors."""
 
     @functools.wraps(stage)
     def run(*args: Any, **kwargs: Any) -> Any:
@@ -128,7 +128,7 @@ def composite(
         features: what to accumulate, `(M, F)`: colours, depths, anything.
         options: None for the defaults. Only tile_size, alpha_threshold, transmittance_stop, max_bytes and absgrad
             matter here.
-        median_depth: also find the depth at which T falls below one half.
+        median_depth: also return the depth at which the transmittance falls below one half.
         chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
 
@@ -162,7 +162,7 @@ def composite(
 def composite_call(
     call: CompositingCall, backend: str = "auto", absgrad_hook: Callable[[Tensor], None] | None = None
 ) -> Composited:
-    """:func:`composite`; with a hook, that gets the absolute gradients `(M, 2)`, and `means2d.absgrad` is not set."""
+    """:func:`composite`; a hook takes the absolute gradients `(M, 2)`, and `means2d.absgrad` is not set."""
     _check_projected(call.projected, call.features)
 
     def covers(candidate: Backend) -> bool:
@@ -231,7 +231,7 @@ class _Composite(torch.autograd.Function):
             raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         needs = ctx.needs_input_grad[:4]
         inputs = CompositingInputs(*ctx.saved_tensors)
-        # what was kept is freed as soon as it has been used; a second backward computes it again
+        # the state is freed after its first use; a second backward pass computes it again
         gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), grad_sums, grad_transmittance, needs)
         if absgrad is not None and ctx.absgrad_hook is not None:
             ctx.absgrad_hook(absgrad)
@@ -241,7 +241,7 @@ class _Composite(torch.autograd.Function):
 
 
 def _take(ctx: Any) -> Any:
-    """What `forward` kept, which the context then holds no longer."""
+    """Remove the state that `forward` kept from the context, and return it."""
     kept = ctx.kept
     ctx.kept = None
     return kept

@@ -74,13 +74,13 @@ class RasterOptions:
             if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
                 raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
             object.__setattr__(self, name, int(value))
-        ends = {"near_plane": math.inf, "radius_clip": math.inf, "eps2d": math.inf}
-        ends |= {"alpha_threshold": 1, "transmittance_stop": 1}
-        for name, most in ends.items():
+        limits = {"near_plane": math.inf, "radius_clip": math.inf, "eps2d": math.inf}
+        limits |= {"alpha_threshold": 1, "transmittance_stop": 1}
+        for name, limit in limits.items():
             value = getattr(self, name)
-            if not isinstance(value, Real) or not 0.0 <= float(value) < most:
-                raise ValueError(f"{name}: expected a number in [0, {most}), got {value!r}")
-            object.__setattr__(self, name, float(value))  # NumPy's numbers are not for compiled kernels
+            if not isinstance(value, Real) or not 0.0 <= float(value) < limit:
+                raise ValueError(f"{name}: expected a number in [0, {limit}), got {value!r}")
+            object.__setattr__(self, name, float(value))  # kernels are compiled for Python's floats, not NumPy's
         far: Any = self.far_plane
         if not isinstance(far, Real) or not self.near_plane < float(far):
             raise ValueError(f"far_plane: expected more than the near plane, {self.near_plane}, got {far!r}")
@@ -92,6 +92,7 @@ class RasterOptions:
 
 
 def _is_frame(frame: Any) -> bool:
+    """Whether a value is (left, top, right, bottom), finite and of a positive size."""
     if not isinstance(frame, tuple) or len(frame) != 4:
         return False
     if not all(isinstance(edge, Real) and math.isfinite(edge) for edge in frame):
@@ -121,7 +122,7 @@ def raster_options(options: RasterOptions | None, fields: Mapping[str, Any]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """A set of N Gaussians with activated values: what the renderer draws.
+    """A set of N Gaussians with activated values: the input of the renderer.
 
     Convention:
         World coordinates; a quaternion turns local axes into those of the world, the columns of R are local axes.
@@ -133,7 +134,7 @@ class Gaussians:
         scales: standard deviations along the local axes in world units, > 0, shape `(N, 3)`.
         opacities: shape `(N,)`, or `(C, N)` for one value per camera. In [0, 1], or above 1 after `DropGaussian`.
         colors: spherical harmonics `(N, K, 3)` with K = 1, 4, 9 or 16 (degree 0 to 3); or features `(N, D)` that are
-            drawn as they are, RGB for D = 3.
+            rendered as they are, RGB for D = 3.
 
     Raises:
         TypeError: a field is not a tensor, is not float32 or float64, or differs in dtype or device from `means`.
@@ -175,7 +176,8 @@ class Gaussians:
         given: Any = index
         if isinstance(given, Integral):
             raise TypeError(f"index: expected a mask, indices or a slice, got {given}")
-        return replace(self, **{k: v[..., index] if k == "opacities" else v[index] for k, v in vars(self).items()})
+        fields = {name: value[index] for name, value in vars(self).items() if name != "opacities"}
+        return replace(self, **fields, opacities=self.opacities[..., index])
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """The Gaussians on another device or in another dtype; arguments as of `torch.Tensor.to`."""
@@ -184,7 +186,7 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedGaussians:
-    """The M pairs (camera, Gaussian) where the Gaussian is in front of the near plane and touches the image.
+    """The M pairs (camera, Gaussian) where the Gaussian lies beyond the near plane and touches the image.
 
     A Gaussian is listed whatever its opacity, even if `DropGaussian` set it to 0 (it is then not composited).
     The list is ordered by camera, then by Gaussian.
@@ -205,7 +207,7 @@ class ProjectedGaussians:
         image_size: (height, width) in pixels.
         num_cameras: C.
         num_gaussians: N.
-        num_nonfinite: how many Gaussians were left out because a parameter is NaN or infinite; 0-d int64 tensor.
+        num_nonfinite: the number of Gaussians that were left out because a parameter is NaN or infinite; 0-d int64.
         eps2d: the variance in px^2 added to the diagonal.
     """
 
@@ -234,7 +236,7 @@ class ProjectedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Composited:
-    """The sums over layers, before background and normalisation."""
+    """Sums over layers, before background and normalisation."""
 
     features: Tensor  # sum of w times features, (C, F, H, W)
     transmittance: Tensor  # T behind the last layer, (C, 1, H, W)
@@ -252,7 +254,7 @@ class Rendering:
         depth: `(C, 1, H, W)`, the mean depth weighted by contribution; 0 where alpha < 1e-6.
         median_depth: `(C, 1, H, W)`, depth of the first layer behind which the transmittance is below one half;
             0 where there is none. No gradient.
-        projected: the Gaussians that were seen.
+        projected: the visible Gaussians.
         normal: `(C, 3, H, W)`, the sum of contribution times normal: the shortest axis of each Gaussian, of length 1,
             turned towards the camera, in world axes. Not normalised.
     """

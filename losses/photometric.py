@@ -25,10 +25,13 @@ from torch import Tensor
 
 from kgs.backends import Backend, check_backend, choose
 
-WINDOW, SIGMA = 11, 1.5
+WINDOW = 11  # pixels
+SIGMA = 1.5  # pixels, the standard deviation
 RADIUS = WINDOW // 2
 BORDER = [RADIUS] * 4
-C1, C2, EPS = 0.01**2, 0.03**2, 1e-12
+C1 = 0.01**2
+C2 = 0.03**2
+EPS = 1e-12
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def photometric_loss(
     return loss
 
 
-@torch.inference_mode(False)  # else a training step could not save what is made in inference mode
+@torch.inference_mode(False)  # autograd could not save tensors made in inference mode
 @torch.no_grad()
 def target_moments(target: Tensor) -> TargetMoments:
     """The part of the SSIM that depends only on the target, for :func:`photometric_loss`; it carries no gradient.
@@ -130,7 +133,7 @@ def target_moments(target: Tensor) -> TargetMoments:
 
 
 def _belong_to(moments: TargetMoments, image: Tensor) -> bool:
-    """Whether the moments have the size, dtype and device of those of an image like this."""
+    """Whether the moments have the size, dtype and device of the image."""
     batch, channels, height, width = image.shape
     shape = (1, batch * channels, height, width)
     padded = (1, batch * channels, height + 2 * RADIUS, width + 2 * RADIUS)
@@ -149,11 +152,12 @@ def _torch_loss(
 ) -> Tensor:
     """`photometric_loss` in torch, for every call; arguments are already checked."""
     if outside is not None:
-        image, target = image.masked_fill(outside, 0.0), target.masked_fill(outside, 0.0)
+        image = image.masked_fill(outside, 0.0)
+        target = target.masked_fill(outside, 0.0)
     loss = _mean((image - target).abs(), outside)
     if dssim_weight == 0.0:
         return loss
-    if outside is not None:  # from here on a mask of windows: those that touch a pixel outside
+    if outside is not None:  # from here on: the windows that touch a pixel outside
         padded = F.pad(outside.float(), BORDER, mode="reflect")
         outside = F.max_pool2d(F.max_pool2d(padded, (WINDOW, 1), 1), (1, WINDOW), 1) > 0
         if bool(outside.all()):
@@ -203,7 +207,8 @@ class _MeanSsim(torch.autograd.Function):
     ) -> Tensor:
         padded = F.pad(image, BORDER, mode="reflect")
         mean = _blur(padded)
-        mean_squared, mean_product = mean * mean, mean * mean_y
+        mean_squared = mean * mean
+        mean_product = mean * mean_y
         b = _blur(padded * target).sub_(mean_product).mul_(2.0).add_(C2)
         d = _blur(padded * padded).sub_(mean_squared).add_(variance_y).add_(C2)
         a = mean_product.mul_(2.0).add_(C1)
@@ -230,10 +235,12 @@ class _MeanSsim(torch.autograd.Function):
         _refuse_second_derivative()
         padded, target, by_mean, by_square, by_product = ctx.saved_tensors
         pixels = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
-        return _fold(pixels.addcmul_(target, _blur_adjoint(by_product))).mul_(grad / ctx.count), None, None, None, None
+        pixels.addcmul_(target, _blur_adjoint(by_product))
+        return _fold(pixels).mul_(grad / ctx.count), None, None, None, None
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
+    """The mean over the values that are not outside."""
     if outside is None:
         return values.mean()
     outside = outside.expand_as(values)
@@ -242,7 +249,8 @@ def _mean(values: Tensor, outside: Tensor | None) -> Tensor:
 
 def _outside(mask: Tensor, image: Tensor) -> Tensor:
     """The pixels that do not count, bool `(B, 1, H, W)`."""
-    images, size = image.shape[0], tuple(image.shape[-2:])
+    images = image.shape[0]
+    size = tuple(image.shape[-2:])
     shape = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
     if shape not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
         raise ValueError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {shape}")
@@ -290,14 +298,15 @@ def _blur_adjoint(maps: Tensor) -> Tensor:
 
 
 def _check_images(image: Tensor, target: Tensor) -> None:
+    """Raise a TypeError or ValueError unless these are two images of one shape, dtype and device."""
     for name, value in (("image", image), ("target", target)):
         if not isinstance(value, Tensor):
             raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}")
         if value.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
-    wanted, got = (f"{value.dtype} on {value.device}" for value in (image, target))
-    if wanted != got:
-        raise TypeError(f"target: expected {wanted} as image, got {got}")
+    if (target.dtype, target.device) != (image.dtype, image.device):
+        expected = f"{image.dtype} on {image.device}"
+        raise TypeError(f"target: expected {expected} as image, got {target.dtype} on {target.device}")
     if image.ndim != 4 or image.numel() == 0:
         raise ValueError(f"image: expected shape (B, C, H, W) without a zero, got {tuple(image.shape)}")
     if target.shape != image.shape:

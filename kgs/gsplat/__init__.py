@@ -14,10 +14,10 @@ from kgs.stages import composite_call, project
 from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
 from .arguments import check_words, refuse
-from .meta import Pairs, joined, keep_absgrad
+from .meta import Pairs, absgrad_hook, joined
 from .scenes import Scene, batch_shape, split
 
-_FAR = 1e10  # gsplat's default far plane: no plane at all
+_FAR = 1e10  # gsplat's default far plane, which means none
 
 
 def rasterization(  # noqa: D417 - arguments without effect are described together
@@ -109,17 +109,17 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
             :func:`kgs.covariance.half_axes`.
         return_normals: `meta["normals"]` are the sums of w times normal, `(..., C, H, W, 3)`; the normal is the third
             local axis, turned towards the camera, in world axes.
-        extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, drawn into `meta["render_extra_signals"]`.
+        extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, rendered into `meta["render_extra_signals"]`.
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
         backend: "auto", "torch", or in float32 "numba" (on a CPU) or "triton" (on a GPU), see `kgs.backends`.
 
     Returns:
         Renders `(..., C, H, W, D)`, where a depth is the last channel; alphas `(..., C, H, W, 1)`; and a dict `meta`.
-        Of the M pairs (camera, Gaussian) that were seen it has depths and opacities `(M,)`; means2d `(M, 2)` in the
+        Of the M visible pairs (camera, Gaussian) it has depths and opacities `(M,)`; means2d `(M, 2)` in the
         pixels of `Ks`, whose gradient `retain_grad()` keeps, as in gsplat; radii `(M, 2)`, int32, 3.33 standard
         deviations along x and y in pixels, rounded up; conics `(M, 3)`; batch_ids, camera_ids and gaussian_ids `(M,)`.
-        With `packed=False` they are `(..., C, N)` and so on, 0 where a Gaussian is not seen, and the ids are None. Also
-        width, height, tile_size, tile_width, tile_height, n_batches and n_cameras.
+        With `packed=False` they are `(..., C, N)` and so on, 0 where a Gaussian is not visible, and the ids are None.
+        Also width, height, tile_size, tile_width, tile_height, n_batches and n_cameras.
 
     Raises:
         TypeError: an argument is not a tensor, or of another dtype or device.
@@ -174,12 +174,15 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     if image:
         check_tensor("colors", colors)
     else:
-        colors, sh_degree, backgrounds = None, None, None
-    batch, count, n = shape = batch_shape(means, viewmats)
-    seen = (viewmats, Ks, (height, width), camera_model, pixel_centers, shape)
-    scenes = split(means, quats, scales, covars, opacities, colors, extra_signals, sh_degree, *seen)
+        colors = None
+        sh_degree = None
+        backgrounds = None
+    shape = batch_shape(means, viewmats)
+    batch, count, n = shape
+    views = (viewmats, Ks, (height, width), camera_model, pixel_centers, shape)
+    scenes = split(means, quats, scales, covars, opacities, colors, extra_signals, sh_degree, *views)
     projected = [
-        project(s.gaussians, s.cameras, options=options, colors=bool(s.shared), backend=backend) for s in scenes
+        project(s.gaussians, s.cameras, options=options, colors=bool(s.widths), backend=backend) for s in scenes
     ]
     pairs = Pairs(projected, batch, count, n, packed)
     half = 0.5 if pixel_centers == "half" else 0.0
@@ -189,53 +192,53 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         projected[b] = dataclasses.replace(projected[b], means2d=rows - half)
         features = _features(scene, projected[b], render_mode.endswith("D"), return_normals)
         values = torch.cat(list(features.values()), 1)
-        hook = keep_absgrad(means2d, pairs.places(b)) if absgrad else None
+        hook = absgrad_hook(means2d, pairs.places(b)) if absgrad else None
         composited.append(composite_call(CompositingCall(projected[b], values, options), backend, hook))
     transmittance = joined([x.transmittance for x in composited])
     widths = [x.shape[1] for x in features.values()]
-    found = dict(zip(features, joined([x.features for x in composited]).split(widths, 1), strict=True))
-    shown = _over(found, transmittance, backgrounds, (*batch, count))
+    sums = dict(zip(features, joined([x.features for x in composited]).split(widths, 1), strict=True))
+    images = _over(sums, transmittance, backgrounds, (*batch, count))
     alphas = 1.0 - transmittance
-    if "depth" in found:
-        shown["depth"] = found["depth"] / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else found["depth"]
+    if "depth" in sums:
+        images["depth"] = sums["depth"] / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else sums["depth"]
 
     def laid_out(x: Tensor) -> Tensor:
-        images: Tensor = x.permute(0, 2, 3, 1).unflatten(0, (*batch, count))
-        return images
+        channels_last: Tensor = x.permute(0, 2, 3, 1).unflatten(0, (*batch, count))
+        return channels_last
 
     meta = pairs.meta(means2d)
     tile = composited[0].tile_size
     meta |= {"width": width, "height": height, "tile_size": tile}
     meta |= {"tile_width": -(-width // tile), "tile_height": -(-height // tile)}
     if extra_signals is not None:
-        meta["render_extra_signals"] = laid_out(shown["extra"])
+        meta["render_extra_signals"] = laid_out(images["extra"])
     if return_normals:
-        meta["normals"] = laid_out(found["normal"])
-    renders = torch.cat([shown[name] for name in ("image", "depth") if name in shown], 1)
+        meta["normals"] = laid_out(sums["normal"])
+    renders = torch.cat([images[name] for name in ("image", "depth") if name in images], 1)
     return laid_out(renders), laid_out(alphas), meta
 
 
 def _features(scene: Scene, projected: ProjectedGaussians, depth: bool, normal: bool) -> dict[str, Tensor]:
-    """What is composited for a scene, `(M, ...)` each, in this order."""
-    found = scene.features_of(projected)
+    """The features to composite for a scene, `(M, D)` each, in this order."""
+    features = scene.features_of(projected)
     if depth:
-        found["depth"] = projected.depths[:, None]
+        features["depth"] = projected.depths[:, None]
     if normal:
-        found["normal"] = normals(scene.gaussians, scene.cameras, projected, axis=2)
-    return found
+        features["normal"] = normals(scene.gaussians, scene.cameras, projected, axis=2)
+    return features
 
 
 def _over(
-    found: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, images: tuple[int, ...]
+    sums: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, batch: tuple[int, ...]
 ) -> dict[str, Tensor]:
-    """The image and the extra signals over their background."""
-    names = [name for name in ("image", "extra") if name in found]
+    """The image and the extra signals over their background; `batch` are the leading dimensions of `backgrounds`."""
+    names = [name for name in ("image", "extra") if name in sums]
     if backgrounds is None:
-        return {name: found[name] for name in names}
-    widths = [found[name].shape[1] for name in names]
+        return {name: sums[name] for name in names}
+    widths = [sums[name].shape[1] for name in names]
     check_tensor("backgrounds", backgrounds)
-    if tuple(backgrounds.shape) != (*images, sum(widths)):
-        raise ValueError(f"backgrounds: expected shape {(*images, sum(widths))}, got {tuple(backgrounds.shape)}")
+    if tuple(backgrounds.shape) != (*batch, sum(widths)):
+        raise ValueError(f"backgrounds: expected shape {(*batch, sum(widths))}, got {tuple(backgrounds.shape)}")
     behind = backgrounds.reshape(-1, sum(widths))
-    over = blend(torch.cat([found[name] for name in names], 1), transmittance, behind, "backgrounds")
+    over = blend(torch.cat([sums[name] for name in names], 1), transmittance, behind, "backgrounds")
     return dict(zip(names, over.split(widths, 1), strict=True))

@@ -1,15 +1,15 @@
-"""Which arguments of gsplat's call kgs follows, and one line for each that it does not."""
+"""The arguments of gsplat's call that kgs does not support, with the reason for each."""
 
 from typing import Any
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 LENSES = ("pinhole", "fisheye", "ortho")
-_HIT_DISTANCES = ("d", "Ed", "RGB-d", "RGB-Ed")
-_FROM_3D = "kgs draws footprints in the image, not Gaussians in space"
+RAY_DEPTH_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
+_FROM_3D = "kgs renders footprints in the image, not Gaussians in space"
 _LENS = "for distorted lenses use kgs.PosedCamera and kgs.GaussianRenderer"
 
-# What kgs does not do: the value at which each argument does nothing, and why no other is taken.
-_NOT_DONE: dict[str, tuple[Any, str]] = {
+# The unsupported arguments: the default, which changes nothing, and the reason why others are refused.
+_UNSUPPORTED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "the gradients of kgs are dense"),
     "distributed": (False, "kgs renders in one process"),
     "with_ut": (False, "kgs linearises the lens at each centre"),
@@ -29,20 +29,20 @@ _NOT_DONE: dict[str, tuple[Any, str]] = {
 
 
 def refuse(**given: Any) -> None:
-    """Raise a ValueError for an argument whose value asks for what kgs does not do."""
+    """Raise a ValueError for an unsupported argument that differs from its default."""
     for name, value in given.items():
-        nothing, why = _NOT_DONE[name]
+        default, why = _UNSUPPORTED[name]
         if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
             continue
         if hasattr(value, "shape"):
-            raise ValueError(f"{name}: expected {nothing!r} ({why}), got an array {tuple(value.shape)}")
-        if value != nothing:
-            raise ValueError(f"{name}: expected {nothing!r} ({why}), got {value!r}")
+            raise ValueError(f"{name}: expected {default!r} ({why}), got an array {tuple(value.shape)}")
+        if value != default:
+            raise ValueError(f"{name}: expected {default!r} ({why}), got {value!r}")
 
 
 def check_words(render_mode: str, rasterize_mode: str, camera_model: str) -> None:
-    """Raise a ValueError for a word that gsplat does not have, or that kgs does not follow."""
-    if render_mode in _HIT_DISTANCES:
+    """Raise a ValueError for a word that gsplat does not have, or that kgs does not support."""
+    if render_mode in RAY_DEPTH_MODES:
         raise ValueError(f"render_mode: expected one of {RENDER_MODES} ({_FROM_3D}), got {render_mode!r}")
     words = {
         "render_mode": (render_mode, RENDER_MODES),

@@ -1,6 +1,7 @@
 """The scenes of a batch: gsplat's tensors, of any leading dimensions, as Gaussians, cameras and features."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -20,28 +21,33 @@ from kgs.types import SH_SIZES, Gaussians, ProjectedGaussians, check_tensor
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """N Gaussians, C cameras, and what is drawn beside the Gaussians' own colours."""
+    """N Gaussians, C cameras, and the features to render beside the Gaussians' colours."""
 
     gaussians: Gaussians  # their colours are harmonics, or the features that all cameras share, side by side
     cameras: Cameras
-    shared: dict[str, int]  # which these are, and how wide, or {"image": 3}
-    own: dict[str, Tensor]  # other features, (N, D), or one set per camera (C, N, D)
-    harmonics: Tensor | None = None  # (N, K, 3), if they are seen from the cameras' centres though rays are parallel
+    widths: dict[str, int]  # names and widths of the features in the Gaussians' colours, {"image": 3} for harmonics
+    others: dict[str, Tensor]  # other features, (N, D), or one set per camera (C, N, D)
+    harmonics: Tensor | None = (
+        None  # (N, K, 3), of orthographic cameras: gsplat evaluates them from the cameras' centres
+    )
 
     def features_of(self, projected: ProjectedGaussians) -> dict[str, Tensor]:
-        """Image and extra signals of what is drawn, `(M, D)` each."""
-        found = dict(zip(self.shared, projected.colors.split(list(self.shared.values()), 1), strict=True))
+        """Image and extra signals of the projected Gaussians, `(M, D)` each."""
+        features = dict(zip(self.widths, projected.colors.split(list(self.widths.values()), 1), strict=True))
         if self.harmonics is not None:
-            found["image"] = self._seen_from_centres(self.harmonics, projected)
-        for name, values in self.own.items():
-            ids = projected.gaussian_ids
+            features["image"] = self._evaluate_from_centres(self.harmonics, projected)
+        for name, values in self.others.items():
+            rows = projected.gaussian_ids
             if values.ndim == 3:
-                ids, values = projected.camera_ids * len(self.gaussians) + ids, values.flatten(0, 1)
-            found[name] = values.index_select(0, ids)
-        return {name: found[name] for name in ("image", "extra") if name in found}
+                rows = projected.camera_ids * len(self.gaussians) + rows
+                values = values.flatten(0, 1)
+            features[name] = values.index_select(0, rows)
+        return {name: features[name] for name in ("image", "extra") if name in features}
 
-    def _seen_from_centres(self, harmonics: Tensor, projected: ProjectedGaussians) -> Tensor:
-        ids, directions = projected.gaussian_ids, []
+    def _evaluate_from_centres(self, harmonics: Tensor, projected: ProjectedGaussians) -> Tensor:
+        """Colours `(M, 3)` by the directions from the cameras' centres, although rays are parallel."""
+        ids = projected.gaussian_ids
+        directions = []
         for c, pose in enumerate(self.cameras.extrinsics):
             means = self.gaussians.means.index_select(0, ids[projected.camera_ids == c])
             directions.append(view_directions(means, pose))
@@ -49,7 +55,7 @@ class Scene:
 
 
 def batch_shape(means: Any, viewmats: Any) -> tuple[tuple[int, ...], int, int]:
-    """The leading dimensions, how many cameras a scene has, and how many Gaussians."""
+    """The leading dimensions, and the numbers of cameras and of Gaussians of a scene."""
     for name, value, ends in (("means", means, (3,)), ("viewmats", viewmats, (4, 4))):
         check_tensor(name, value, means if isinstance(means, Tensor) else None, " as means")
         if value.ndim <= len(ends) or tuple(value.shape[-len(ends) :]) != ends:
@@ -85,38 +91,52 @@ def split(
     batch, count, n = shape
     flat = partial(_flat, batch=batch, like=means)
     if covars is None:
-        quats, scales = flat("quats", quats, (n, 4)), flat("scales", scales, (n, 3))
+        quats = flat("quats", quats, (n, 4))
+        scales = flat("scales", scales, (n, 3))
     else:
         upper = flat("covars", covars, (n, 3, 3)).triu()  # all that gsplat reads
         whole = upper + upper.triu(1).mT
-        quats, scales = half_axes(whole.flatten(0, 1)).view_as(whole), torch.ones_like(whole[..., 0])
+        quats = half_axes(whole.flatten(0, 1)).view_as(whole)
+        scales = torch.ones_like(whole[..., 0])
     opacities = flat("opacities", opacities, (n,), (count, n))
     intrinsics = flat("Ks", intrinsics, (count, 3, 3))
     harmonics = _harmonics(colors, sh_degree, batch, n, means)
-    given = {"image": ("colors", colors if harmonics is None else None), "extra": ("extra_signals", extra_signals)}
-    plain = {}
-    for kind, (name, value) in given.items():
-        if value is not None:
-            width = value.shape[-1] if isinstance(value, Tensor) and value.ndim else 0
-            plain[kind] = flat(name, value, (n, width), (count, n, width))
-    # what all cameras share goes with the Gaussians, unless these have harmonics
-    shared = {kind: x.shape[-1] for kind, x in plain.items() if x.ndim == 3 and harmonics is None}
-    means, viewmats = flat("means", means, (n, 3)), flat("viewmats", viewmats, (count, 4, 4))
+    features = {}
+    if colors is not None and harmonics is None:
+        features["image"] = _flat_features("colors", colors, flat, n, count)
+    if extra_signals is not None:
+        features["extra"] = _flat_features("extra_signals", extra_signals, flat, n, count)
+    means = flat("means", means, (n, 3))
+    viewmats = flat("viewmats", viewmats, (count, 4, 4))
+    # features that all cameras share become the Gaussians' colours, unless these are harmonics
+    shared = [name for name, x in features.items() if x.ndim == 3 and harmonics is None]
     scenes = []
     for b in range(math.prod(batch)):
-        own = {kind: x[b] for kind, x in plain.items() if kind not in shared}
+        others = {name: x[b] for name, x in features.items() if name not in shared}
         bands = None if harmonics is None else harmonics[b if len(harmonics) > 1 else 0]
-        # gsplat sees harmonics from the centre through every lens; kgs has another direction where rays are parallel
-        bands, centred = (None, bands) if lens == "ortho" else (bands, None)
+        bands_from_centres = None
+        if lens == "ortho":  # gsplat evaluates harmonics from the centre; kgs along the rays, which are parallel
+            bands_from_centres = bands
+            bands = None
         if bands is None:
-            drawn, widths = torch.cat([means[b, :, :0], *(plain[kind][b] for kind in shared)], 1), shared
+            gaussian_colors = torch.cat([means[b, :, :0], *(features[name][b] for name in shared)], 1)
+            widths = {name: features[name].shape[-1] for name in shared}
         else:
-            drawn, widths = bands, {"image": 3}
-        known = [*own.values(), *([] if centred is None else [centred.flatten(1)])]
-        gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], known), drawn)
+            gaussian_colors = bands
+            widths = {"image": 3}
+        unchecked = list(others.values())  # `project` checks the Gaussians' colours alone
+        if bands_from_centres is not None:
+            unchecked.append(bands_from_centres.flatten(1))
+        gaussians = Gaussians(means[b], quats[b], scales[b], _drop_broken(opacities[b], unchecked), gaussian_colors)
         cameras = _cameras(viewmats[b], intrinsics[b], size, lens, pixel_centers)
-        scenes.append(Scene(gaussians, cameras, widths, own, centred))
+        scenes.append(Scene(gaussians, cameras, widths, others, bands_from_centres))
     return scenes
+
+
+def _flat_features(name: str, value: Any, flat: Callable[..., Tensor], n: int, count: int) -> Tensor:
+    """Features `(B, N, D)`, or one set per camera `(B, C, N, D)`, of any width D."""
+    width = value.shape[-1] if isinstance(value, Tensor) and value.ndim else 0
+    return flat(name, value, (n, width), (count, n, width))
 
 
 def _flat(name: str, value: Any, *shapes: tuple[int, ...], batch: tuple[int, ...], like: Tensor) -> Tensor:
@@ -137,7 +157,8 @@ def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: in
     if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
         raise ValueError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree!r}")
     check_tensor("colors", colors, like, " as means")
-    least, shape = SH_SIZES[sh_degree], tuple(colors.shape)
+    least = SH_SIZES[sh_degree]
+    shape = tuple(colors.shape)
     if shape[:-2] not in ((n,), (*batch, n)) or shape[-2] < least or shape[-1] != 3:
         shapes = " or ".join(dict.fromkeys(str((*part, n, "K", 3)) for part in ((), batch)))
         expected = f"{shapes} with K >= {least} for sh_degree {sh_degree}"
@@ -147,7 +168,7 @@ def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: in
 
 
 def _drop_broken(opacities: Tensor, features: list[Tensor]) -> Tensor:
-    """The opacities, NaN for Gaussians with a feature that is not finite: no camera sees them."""
+    """The opacities, NaN for Gaussians with a feature that is not finite: these are not rendered."""
     for values in features:
         finite = values.detach().isfinite().all(-1)
         opacities = opacities.masked_fill(~(finite if values.ndim == 2 else finite.all(0)), torch.nan)
@@ -164,5 +185,6 @@ def _cameras(viewmats: Tensor, intrinsics: Tensor, size: tuple[int, int], lens: 
     params = torch.stack([k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]], 1)
     kind = CameraModelType.ORTHOGRAPHIC
     if lens == "fisheye":
-        kind, params = CameraModelType.KANNALA_BRANDT_K3, torch.nn.functional.pad(params, (0, 4))
+        kind = CameraModelType.KANNALA_BRANDT_K3
+        params = torch.nn.functional.pad(params, (0, 4))
     return PosedCamera(CameraModel(ImageSize(height, width), kind, params), viewmats)

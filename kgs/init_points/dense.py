@@ -1,8 +1,8 @@
 """Dense initial points: points of the training views' depth maps on which two views agree.
 
-The sweep goes on to infinity, where the sky is: without points there a fit paints the sky with Gaussians among the
-things in front of it, which are fog for cameras beside the photos'. They are a minority of the points, so that the
-median of all depths stays that of the scene.
+The sweep reaches infinity, where the sky is: without points there, a fit paints the sky with Gaussians near the scene,
+which fog the view of cameras beside the photos'. Points of the sky are a minority, so that the median of all depths
+stays that of the scene.
 """
 
 import numpy as np
@@ -11,18 +11,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.geometry import ViewGeometry
 from kgs.progress import Stage, silent
 
 from .agreement import agreed_points, average_depths
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
-SCORE = 0.35  # least matching score of a point's patch; noise has scores of up to 0.3 along a smooth surface
-MOST_PIXELS, MOST_PIXELS_OF_ALL = 250_000, 1_600_000  # of one view, and of all views together
-SKY = 2.0  # times the depth where the scene ends: points beyond are those of a sky
-PER_SKY = 2  # points of the scene for each of a sky, at least
-SMALLEST = 64  # side of an image that is not halved just to need fewer planes
-# How many points where no number is given: one for so many pixels with an agreed depth, between two limits.
-PIXELS_OF_A_POINT, FEWEST, MOST = 3, 30_000, 60_000
+SCORE = 0.35  # the least matching score of a point; noise reaches 0.3 along a smooth surface
+MOST_PIXELS = 250_000  # of one view
+MOST_PIXELS_OF_ALL = 1_600_000  # of all views together
+SKY = 2.0  # points farther than this times the scene's largest depth belong to the sky
+PER_SKY = 2  # the least number of points of the scene for each point of the sky
+SMALLEST = 64  # pixels, the least side of an image that was halved to need fewer planes
+# The number of points for a count of None: one for so many pixels with an agreed depth, between two limits.
+PIXELS_OF_A_POINT = 3
+FEWEST = 30_000
+MOST = 60_000
 
 
 def dense_points(
@@ -38,9 +42,9 @@ def dense_points(
 ) -> tuple[Tensor, Tensor, int]:
     """At most `count` points on which two views agree, drawn at random.
 
-    The scene lies between the depths `near` and `far`; what is farther gets points, too.
+    The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
 
-    Returns the points and RGB, both `(P, 3)`, and from how many they were drawn, those of the sky not counted.
+    Returns the points and RGB, both `(P, 3)`, and the number of agreed points without those of the sky.
 
     A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
     `MOST`, in images that have together `pixels` pixels, or those of the views.
@@ -50,22 +54,23 @@ def dense_points(
     together, and move by no more pixels than a sweep has planes.
     """
     pixels = pixels or views.images[:, 0].numel()
-    while (size := views.images[0, 0].numel()) > MOST_PIXELS or len(views) * size > MOST_PIXELS_OF_ALL:
+    while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
         views = views.halved()
     while planes_wanted(views, near, far) > MOST_PLANES and min(views.images.shape[-2:]) >= 2 * SMALLEST:
         views = views.halved()
     maps = sweep_depths(views, near, far, stage, backend, to_infinity=True)
-    certain = [there.is_inner & (there.scores > SCORE) for there in maps]
-    if (usable := views.usable) is not None:
-        certain = [good & there for good, there in zip(certain, usable.cpu(), strict=True)]
-    maps = average_depths(views, maps, certain)
-    found = [_agreed(views, maps, certain, view) for view in range(len(views))]
-    points, colors, places = (torch.cat(parts) for parts in zip(*found, strict=True))
+    certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
+    if views.usable is not None:
+        certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]
+    geometry = ViewGeometry.of(views.cameras)
+    maps = average_depths(geometry, maps, certain)
+    parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
+    points, colors, places = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
         count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), MOST)
     view, x, y = places.unbind(1)
-    is_sky = torch.stack([there.depths for there in maps])[view, y, x] > SKY * far
+    is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
     chosen = torch.randperm(len(points), generator=generator)
     chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     chosen = chosen[_with_less_sky(is_sky[chosen])]
@@ -73,7 +78,7 @@ def dense_points(
 
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:
-    """The rows of all points but those of the sky, and of so many of these that there are `PER_SKY` others for each."""
+    """The rows of all points of the scene, and of the first points of the sky: one for each `PER_SKY` of the scene."""
     most = int((~is_sky).sum()) // PER_SKY
     rows: Tensor = (~is_sky | (is_sky.cumsum(0) <= most)).nonzero()[:, 0]
     return rows
@@ -81,8 +86,9 @@ def _with_less_sky(is_sky: Tensor) -> Tensor:
 
 def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
     """The rows of the first place `(view, x, y)` in each of at most `count` square cells, as small as that allows."""
-    first, across = np.arange(len(places)), places.max(initial=0) + 1
-    least, most = 1.0, float(across)  # side of a cell, in pixels; found by bisection
+    first = np.arange(len(places))
+    across = places.max(initial=0) + 1
+    least, most = 1.0, float(across)  # limits of a cell's side in pixels, for bisection
     while len(first) > count or (len(places) > count and most - least > 1e-3):
         side = 0.5 * (least + most)
         columns, rows = (places[:, 1:] / side).astype(np.int64).T
@@ -93,9 +99,11 @@ def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
     return torch.from_numpy(np.sort(first))[:count]
 
 
-def _agreed(views: Views, maps: list[DepthMap], certain: list[Tensor], view: int) -> tuple[Tensor, Tensor, Tensor]:
+def _agreed(
+    views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
-    points, pixels = agreed_points(views, maps, certain, view)
+    points, pixels = agreed_points(geometry, maps, certain, view)
     columns, rows = pixels.unbind(1)
     places = torch.stack([torch.full_like(rows, view), columns, rows], 1)
     return points, views.images[view].cpu()[:, rows, columns].mT, places

@@ -54,6 +54,7 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
 
 
 def _check_size(path: Path, most: int, why: str = "") -> None:
+    """Raise a DataError for a file of more than `most` bytes."""
     if path.stat().st_size > most:
         raise DataError(path, "", f"is larger than {most // 2**20} MiB{why}")
 

@@ -1,4 +1,4 @@
-"""Checks that initial points lie where the training views look: a fit from other points shows nothing."""
+"""Checks that initial points lie where the training views look: a fit from other points renders nothing."""
 
 import warnings
 from os import PathLike
@@ -11,7 +11,7 @@ from kgs.geometry import points_in_images
 
 
 def check_in_view(points: Tensor, views: Views, path: str | PathLike[str]) -> None:
-    """Refuse points of which no training image shows one; warn of single images that show none.
+    """Raise an error if no point lies in a training image; warn about single images without any.
 
     Args:
         points: in the frame of the views, `(P, 3)`.
@@ -27,6 +27,7 @@ def check_in_view(points: Tensor, views: Views, path: str | PathLike[str]) -> No
         counts = f"got none of {len(points)}, of which {in_front} lie before a camera"
         advice = "are they in the frame of the scene's cameras?"
         raise DataError(path, "initial points", f"expected some in a training image, {counts}: {advice}")
-    blind = [name for name, shown in zip(views.names, inside.any(dim=0).tolist(), strict=True) if not shown]
-    if blind:
-        warnings.warn(f"initial points: none lies in the image of {listed(blind)}", stacklevel=3)
+    has_points = inside.any(dim=0).tolist()
+    empty = [name for name, has_some in zip(views.names, has_points, strict=True) if not has_some]
+    if empty:
+        warnings.warn(f"initial points: none lies in the image of {listed(empty)}", stacklevel=3)

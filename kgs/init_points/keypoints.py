@@ -23,7 +23,7 @@ class Keypoints(NamedTuple):
 
 
 def root_sift(
-    grey: NDArray[Any], most: int, factor: int = 1, mask: NDArray[np.uint8] | None = None, **rules: Any
+    grey: NDArray[Any], most: int, factor: int = 1, mask: NDArray[np.uint8] | None = None, **thresholds: Any
 ) -> Keypoints:
     """The strongest SIFT keypoints of an image, up to `most`; nothing is random.
 
@@ -32,15 +32,17 @@ def root_sift(
         most: the largest number of keypoints.
         factor: the image is enlarged by this whole number first.
         mask: `(H, W)`, keypoints lie where it is not 0; None: everywhere.
-        rules: thresholds, as keyword arguments of `cv2.SIFT_create`.
+        thresholds: of the detector, as keyword arguments of `cv2.SIFT_create`.
     """
     if factor > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
-        mask = None if mask is None else mask.repeat(factor, 0).repeat(factor, 1)
+        if mask is not None:
+            mask = mask.repeat(factor, 0).repeat(factor, 1)
     # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True, **rules)  # type: ignore[attr-defined]  # no stub
-    found, descriptors = sift.detectAndCompute(grey, mask)
-    rows = torch.tensor([(*point.pt, point.size, point.angle) for point in found], dtype=torch.float64).reshape(-1, 4)
+    sift = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True, **thresholds)  # type: ignore[attr-defined]  # no stub
+    keypoints, descriptors = sift.detectAndCompute(grey, mask)
+    rows = [(*keypoint.pt, keypoint.size, keypoint.angle) for keypoint in keypoints]
+    numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, 4)
     vectors = torch.zeros(0, 128) if descriptors is None else torch.from_numpy(descriptors)
     unit = torch.nn.functional.normalize(vectors, p=1.0, dim=1).sqrt()
-    return Keypoints((rows[:, :2] + 0.5) / factor - 0.5, rows[:, 2] / factor, rows[:, 3], unit)
+    return Keypoints((numbers[:, :2] + 0.5) / factor - 0.5, numbers[:, 2] / factor, numbers[:, 3], unit)

@@ -29,11 +29,12 @@ def match(
     from .matching_kernels import mutual_nearest
 
     arrays = (lines.numpy(), places.T.contiguous().numpy(), (descriptors1.numpy(), descriptors2.numpy()))
-    found = mutual_nearest(torch.get_num_threads(), *arrays, MAX_LINE_DISTANCE, MAX_RATIO, MAX_DISTANCE)
-    return tuple(map(torch.from_numpy, found))
+    matches = mutual_nearest(torch.get_num_threads(), *arrays, MAX_LINE_DISTANCE, MAX_RATIO, MAX_DISTANCE)
+    return tuple(map(torch.from_numpy, matches))
 
 
 def _torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
+    """`match` in torch."""
     targets = convert_points_to_homogeneous(places).T
     candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
     for start in range(0, len(lines), CHUNK):
@@ -41,7 +42,7 @@ def _torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descript
         # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
         differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
         candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
-    rows, columns, distances = (torch.cat(parts) for parts in zip(*candidates, strict=True))
+    rows, columns, distances = map(torch.cat, zip(*candidates, strict=True))
     nearest1, rival1 = _nearest(distances, rows, len(lines))
     nearest2, rival2 = _nearest(distances, columns, len(places))
     good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)

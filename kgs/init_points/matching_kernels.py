@@ -1,4 +1,4 @@
-"""Matches of keypoints along epipolar lines, by the rules of `kgs.init_points.matching`; only rounding differs.
+"""Matches of keypoints along epipolar lines, as in `kgs.init_points.matching`; only rounding differs.
 
     lines           (N, 3), of the first view's keypoints in the second, normals of length 1
     places          (2, M), x and y of the second view's keypoints
@@ -19,12 +19,14 @@ INFINITY = f32(np.inf)
 
 def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, most):
     """Descriptor distances and indices in both views, `(K,)`, of mutual nearest neighbours that pass the ratio test."""
-    n, m = len(lines), places.shape[1]
+    n = len(lines)
+    m = places.shape[1]
     near1, rival1 = np.full((2, n), INFINITY)
     near2, rival2 = np.full((2, BANDS, m), INFINITY)
-    match1, match2 = np.zeros(n, np.int64), np.zeros((BANDS, m), np.int64)
-    found = (near1, rival1, match1, near2, rival2, match2)
-    over(threads, BANDS, find_nearest, lines, places, *descriptors, f32(line_distance), *found, pieces=BANDS)
+    match1 = np.zeros(n, np.int64)
+    match2 = np.zeros((BANDS, m), np.int64)
+    results = (near1, rival1, match1, near2, rival2, match2)
+    over(threads, BANDS, find_nearest, lines, places, *descriptors, f32(line_distance), *results, pieces=BANDS)
     if not m:
         return near1[:0], match1[:0], match1[:0]
     rival2 = np.partition(np.concatenate([near2, rival2]), 1, axis=0)[1]
@@ -39,20 +41,26 @@ def find_nearest(
     begin, end, lines, places, descriptors1, descriptors2, line_distance, near1, rival1, match1, near2, rival2, match2
 ):
     """The nearest candidate (the first of equal ones) and the second distance of each row and, by band, each column."""
-    (n, m), x, y = (len(lines), places.shape[1]), places[0], places[1]
-    off, candidates = np.empty(m, np.float32), np.empty(m, np.int32)
+    n = len(lines)
+    m = places.shape[1]
+    x, y = places[0], places[1]
+    off = np.empty(m, np.float32)
+    candidates = np.empty(m, np.int32)
     for band in range(begin, end):
-        near, rival, match = near2[band], rival2[band], match2[band]
+        near = near2[band]
+        rival = rival2[band]
+        match = match2[band]
         for i in range(band * n // BANDS, (band + 1) * n // BANDS):
             a, b, c = lines[i, 0], lines[i, 1], lines[i, 2]
             for j in range(m):
                 off[j] = abs(a * x[j] + b * y[j] + c)
             count = 0
-            for j in range(m):  # without a branch: one in about a hundred is kept
+            for j in range(m):  # without a branch: about one in a hundred is a candidate
                 candidates[count] = j
                 count += off[j] < line_distance
             for k in range(count):
-                j, distance = candidates[k], ZERO
+                j = candidates[k]
+                distance = ZERO
                 for f in range(descriptors1.shape[1]):
                     difference = descriptors1[i, f] - descriptors2[j, f]
                     distance += difference * difference

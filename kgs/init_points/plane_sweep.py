@@ -9,25 +9,25 @@ from dataclasses import dataclass
 
 import torch
 from kornia.color import rgb_to_grayscale
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.geometry import camera_centers, camera_matrices
+from kgs.geometry import ViewGeometry
 from kgs.progress import Stage, silent
 
 from .sweep_costs import sweep_costs
 
-PLANES, MOST_PLANES = 128, 256  # limits; between them one plane for each pixel by which an image moves
+PLANES = 128  # fewest planes; above, one plane for each pixel by which an image moves
+MOST_PLANES = 256
 MOST_TO_INFINITY = 384  # planes of a sweep to infinity: these bound its memory
-NEIGHBOURS = 4  # at most
-BASELINE = 0.15  # of a neighbour, in units of the depth: shorter gives vague depths, longer more occlusion
-FARTHEST = 100.0  # what a sweep to infinity finds there is placed at so many times the depth where other sweeps end
+NEIGHBOURS = 4  # the most views that a view is compared with
+BASELINE = 0.15  # the best distance of a neighbour, over the depth: shorter is less precise, longer more occluded
+FARTHEST = 100.0  # the largest depth of a sweep to infinity, in units of `far`
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What is known of each pixel of one view, `(H, W)`."""
+    """Depths and scores of the pixels of one view, `(H, W)`."""
 
     depths: Tensor  # z in the camera's frame (OpenCV axes), in world units; pixels have integer centres
     scores: Tensor  # how well the patch matches there, from -1 to 1
@@ -60,10 +60,12 @@ def sweep_depths(
     if to_infinity:
         spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MOST_TO_INFINITY - 2))
         inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
+    geometry = ViewGeometry.of(views.cameras)
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
-        if others := _neighbours(views, view, typical):
-            homographies = torch.stack([_homographies(views.cameras, view, other, inverse) for other in others])
+        others = _neighbours(geometry, view, typical)
+        if others:
+            homographies = torch.stack([_homographies(geometry, view, other, inverse) for other in others])
             costs, scores = sweep_costs(grey[view], grey[others], homographies, backend)
             maps.append(_refine(costs, scores, inverse, FARTHEST * far))
         else:
@@ -76,32 +78,34 @@ def planes_wanted(views: Views, near: float, far: float) -> float:
     """By how many pixels the middle of a view moves in a neighbour from one depth to the other: the median."""
     inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
     middle = torch.tensor([views.images.shape[-1] / 2, views.images.shape[-2] / 2, 1.0], dtype=torch.float64)
+    geometry = ViewGeometry.of(views.cameras)
     steps = []
     for view in range(len(views)):
-        for other in _neighbours(views, view, 1 / float(inverse.mean())):
-            mapped = _homographies(views.cameras, view, other, inverse) @ middle
+        for other in _neighbours(geometry, view, 1 / float(inverse.mean())):
+            mapped = _homographies(geometry, view, other, inverse) @ middle
             mapped = mapped[mapped[:, 2] > 0]
             if len(mapped) > 1:
-                steps.append((mapped[1:, :2] / mapped[1:, 2:] - mapped[:-1, :2] / mapped[:-1, 2:]).norm(dim=1).median())
+                pixels = mapped[:, :2] / mapped[:, 2:]
+                steps.append((pixels[1:] - pixels[:-1]).norm(dim=1).median())
     return PLANES * float(torch.stack(steps).median()) if steps else 0.0
 
 
-def _neighbours(views: Views, view: int, depth: float) -> list[int]:
+def _neighbours(geometry: ViewGeometry, view: int, depth: float) -> list[int]:
     """The views to compare with, those first whose distance is nearest to `BASELINE`."""
-    centers = camera_centers(views.cameras.extrinsics)
-    baselines = (centers - centers[view]).norm(dim=1) / depth
+    baselines = (geometry.centers - geometry.centers[view]).norm(dim=1) / depth
     order = (baselines / BASELINE).log().abs().argsort(stable=True).tolist()
     return [other for other in order if baselines[other] > 0][:NEIGHBOURS]
 
 
-def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
+def _homographies(geometry: ViewGeometry, view: int, other: int, inverse: Tensor) -> Tensor:
     """From pixels of a view to those of another, for each plane, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
-    intrinsics, extrinsics = camera_matrices(cameras)
-    rotation = extrinsics[other, :3, :3] @ extrinsics[view, :3, :3].mT
-    shift = extrinsics[other, :3, 3] - rotation @ extrinsics[view, :3, 3]
+    pose = geometry.extrinsics[view]
+    other_pose = geometry.extrinsics[other]
+    rotation = other_pose[:3, :3] @ pose[:3, :3].mT
+    shift = other_pose[:3, 3] - rotation @ pose[:3, 3]
     turns = rotation.repeat(len(inverse), 1, 1)
     turns[:, :, 2] += inverse[:, None] * shift
-    homographies: Tensor = intrinsics[other] @ turns @ torch.linalg.inv(intrinsics[view])
+    homographies: Tensor = geometry.intrinsics[other] @ turns @ geometry.inverse_intrinsics[view]
     return homographies
 
 
@@ -112,7 +116,9 @@ def _refine(cost: Tensor, scores: Tensor, inverse: Tensor, most: float) -> Depth
     """
     best = cost.argmin(0)
     inner = best.clamp(1, len(cost) - 2)
-    left, middle, right = (cost.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
+    left = cost.gather(0, (inner - 1)[None])[0]
+    middle = cost.gather(0, inner[None])[0]
+    right = cost.gather(0, (inner + 1)[None])[0]
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
     depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0])).clamp_min(1.0 / most)

@@ -14,7 +14,8 @@ from kgs.backends import takes_kernels
 
 WINDOW = 7  # pixels, the side of the patches that are compared
 # Prices of the smoothing, in units of 1 - NCC: of a step by one plane, and of a jump where the image has no edge.
-STEP, JUMP = 0.1, 2.0
+STEP = 0.1
+JUMP = 2.0
 EDGE = 0.02  # the difference of grey values that halves the price of a jump
 LEAST_JUMP = 1.5 * STEP
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
@@ -37,11 +38,15 @@ def sweep_costs(image: Tensor, others: Tensor, homographies: Tensor, backend: st
 
 
 def _compiled_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
+    """`sweep_costs` by the kernels."""
     from .sweep_kernels import add_scores, semi_global
 
-    threads, planes = torch.get_num_threads(), homographies.shape[1]
-    best, second = (np.full((*image.shape, planes), -np.inf, np.float32) for _ in range(2))
-    grey, mean, variance = (layer.numpy() for layer in (image, *_moments(image)))
+    threads = torch.get_num_threads()
+    planes = homographies.shape[1]
+    best = np.full((*image.shape, planes), -np.inf, np.float32)
+    second = np.full_like(best, -np.inf)
+    grey = image.numpy()
+    mean, variance = (moment.numpy() for moment in _moments(image))
     for other, turns in zip(others, homographies, strict=True):
         layers = (other, torch.ones_like(other))
         for first, some in enumerate(turns.split(_AT_ONCE)):
@@ -59,13 +64,15 @@ def _compiled_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tupl
 def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
     """NCC of the patches of each plane and pixel, `(D, H, W)`; 0 where the patch leaves the other image."""
     mean, variance = _moments(image)
-    found = torch.empty(len(homographies), *image.shape)
+    scores = torch.empty(len(homographies), *image.shape)
     for plane, homography in enumerate(homographies):
-        warped, inside = (warp(layer, homography) for layer in (target, torch.ones_like(target)))
-        there, spread = _moments(warped)
-        score = (_box(image * warped) - mean * there) * ((variance + VARIANCE) * (spread + VARIANCE)).rsqrt()
-        found[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
-    return found
+        warped = warp(target, homography)
+        inside = warp(torch.ones_like(target), homography)
+        warped_mean, warped_variance = _moments(warped)
+        inverse_deviation = ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
+        score = (_box(image * warped) - mean * warped_mean) * inverse_deviation
+        scores[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
+    return scores
 
 
 def warp(image: Tensor, homography: Tensor) -> Tensor:
@@ -79,7 +86,8 @@ def warp(image: Tensor, homography: Tensor) -> Tensor:
     return torch.where(x * torch.arange(width) + (y * torch.arange(height))[:, None] + one > 0, warped, 0.0)
 
 
-def _box(image: Tensor) -> Tensor:  # mean over the window
+def _box(image: Tensor) -> Tensor:
+    """The mean over the window around each pixel."""
     return torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
 
 
@@ -91,9 +99,11 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
 
 def _combine(scores: Iterator[Tensor]) -> Tensor:
     """Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the place."""
-    best, second = next(scores), None
+    best = next(scores)
+    second = None
     for score in scores:
-        lower, best = torch.minimum(best, score), torch.maximum(best, score)
+        lower = torch.minimum(best, score)
+        best = torch.maximum(best, score)
         second = lower if second is None else torch.maximum(second, lower)
     return best if second is None else 0.75 * best + 0.25 * second
 
@@ -103,7 +113,7 @@ def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
     total = torch.zeros_like(cost)
     for volume, image, result in ((cost, grey, total), (cost.mT, grey.mT, total.mT)):
         for flip in (False, True):
-            for slant in (-1, 0, 1) if volume is cost else (0,):
+            for slant in (-1, 0, 1) if volume is cost else (0,):  # diagonals once
                 _add_paths(volume, image, result, flip, slant)
     return total
 
@@ -111,11 +121,13 @@ def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
 def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
     """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right per row."""
     rows = range(cost.shape[1])
-    before, last = torch.empty(0), -1
+    before = torch.empty(0)
+    last = -1
     for row in reversed(rows) if flip else rows:
         path = cost[:, row].clone()
         if last >= 0:
-            previous, edge = before.roll(slant, 1), (grey[row] - grey[last].roll(slant)).abs()
+            previous = before.roll(slant, 1)
+            edge = (grey[row] - grey[last].roll(slant)).abs()
             least = previous.amin(0)
             cheapest = torch.minimum(previous, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(LEAST_JUMP))
             cheapest[1:] = torch.minimum(cheapest[1:], previous[:-1] + STEP)
@@ -125,4 +137,5 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
                 more[:, 0 if slant > 0 else -1] = 0.0  # paths begin at the border
             path += more
         total[:, row] += path
-        before, last = path, row
+        before = path
+        last = row

@@ -46,7 +46,8 @@ def row_sum(a, x):
 @exact
 def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, second):
     """Normalised cross-correlation of windows, in bands of rows; 0 where a window leaves the other image."""
-    (height, width), planes = image.shape, warped.shape[0]
+    height, width = image.shape
+    planes = warped.shape[0]
     sums = np.empty((planes, 4, width + 2 * HALO))  # of columns: warped, its square, its product with the image, inside
     scores = np.empty((planes, width), np.float32)
     share = 1.0 / (2 * HALO + 1) ** 2
@@ -54,32 +55,38 @@ def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, s
         sums[:] = 0.0
         for y in range(band * BAND - 2 * HALO - 1, min((band + 1) * BAND, height)):
             # The row that enters the window below and, once the window is full, the one that leaves it above.
-            below, above = min(max(y + HALO, 0), height - 1), min(max(y - HALO - 1, 0), height - 1)
-            kept = 1.0 if y >= band * BAND else 0.0
+            below = min(max(y + HALO, 0), height - 1)
+            above = min(max(y - HALO - 1, 0), height - 1)
+            is_full = 1.0 if y >= band * BAND else 0.0
             for p in range(planes):
                 s0, s1, s2, s3 = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3]
                 for x in range(width):
-                    s0[HALO + x] += np.float64(warped[p, 0, below, x]) - kept * np.float64(warped[p, 0, above, x])
-                    s3[HALO + x] += np.float64(warped[p, 1, below, x]) - kept * np.float64(warped[p, 1, above, x])
+                    s0[HALO + x] += np.float64(warped[p, 0, below, x]) - is_full * np.float64(warped[p, 0, above, x])
+                    s3[HALO + x] += np.float64(warped[p, 1, below, x]) - is_full * np.float64(warped[p, 1, above, x])
                 for x in range(width):
                     new, old = warped[p, 0, below, x], warped[p, 0, above, x]
-                    s1[HALO + x] += np.float64(new * new) - kept * np.float64(old * old)
-                    s2[HALO + x] += np.float64(image[below, x] * new) - kept * np.float64(image[above, x] * old)
+                    s1[HALO + x] += np.float64(new * new) - is_full * np.float64(old * old)
+                    s2[HALO + x] += np.float64(image[below, x] * new) - is_full * np.float64(image[above, x] * old)
                 if y < band * BAND:
                     continue
                 for x in range(HALO):
-                    for s in range(4):
-                        sums[p, s, x], sums[p, s, HALO + width + x] = sums[p, s, HALO], sums[p, s, HALO + width - 1]
+                    for s in range(4):  # the border is replicated
+                        sums[p, s, x] = sums[p, s, HALO]
+                        sums[p, s, HALO + width + x] = sums[p, s, HALO + width - 1]
                 for x in range(width):
-                    there, product = f32(row_sum(s0, x) * share), f32(row_sum(s2, x) * share)
-                    spread = f32(row_sum(s1, x) * share) - there * there
+                    warped_mean = f32(row_sum(s0, x) * share)
+                    product = f32(row_sum(s2, x) * share)
+                    spread = f32(row_sum(s1, x) * share) - warped_mean * warped_mean
                     spread = spread if spread > ZERO else ZERO
-                    score = (product - mean[y, x] * there) * (ONE / np.sqrt((variance[y, x] + flat) * (spread + flat)))
+                    inverse_deviation = ONE / np.sqrt((variance[y, x] + flat) * (spread + flat))
+                    score = (product - mean[y, x] * warped_mean) * inverse_deviation
                     scores[p, x] = score if f32(row_sum(s3, x) * share) > f32(0.99) else ZERO
             if y >= band * BAND:
                 for x in range(width):
                     for p in range(planes):
-                        score, first, other = scores[p, x], best[y, x, plane + p], second[y, x, plane + p]
+                        score = scores[p, x]
+                        first = best[y, x, plane + p]
+                        other = second[y, x, plane + p]
                         lower = score if score < first else first
                         best[y, x, plane + p] = first if score < first else score
                         second[y, x, plane + p] = lower if lower > other else other
@@ -91,10 +98,11 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
 
     A path continues that of the same plane, of one beside it for a price, or of any for another, lower at edges.
     """
-    (height, width, planes), (step, jump, edge, least_jump) = cost.shape, prices
+    height, width, planes = cost.shape
+    step, jump, edge, least_jump = prices
     size = (planes + LANES - 1) // LANES * LANES
-    # Costs of the paths so far, between infinite ones; the lowest of each path.
-    memory, lowest = np.full((2, PATHS, size + 2), INFINITY), np.empty(PATHS, np.float32)
+    memory = np.full((2, PATHS, size + 2), INFINITY)  # costs of the paths so far, between infinite ones
+    lowest = np.empty(PATHS, np.float32)  # of each path
     lanes = np.empty(LANES, np.float32)
     length, across = (height, width) if dy else (width, height)
     for group in range(begin, end):
@@ -105,13 +113,17 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
                     y, x = (i if dy > 0 else height - 1 - i), (group * PATHS + k + dx * i) % width
                 else:
                     y, x = group * PATHS + k, (i if dx > 0 else width - 1 - i)
-                previous, path, here, out = before[k], after[k], cost[y, x], total[y, x]
+                previous = before[k]
+                path = after[k]
+                here = cost[y, x]
+                out = total[y, x]
                 if i == 0 or not 0 <= x - dx < width:
                     for d in range(planes):
                         path[1 + d] = here[d]
                 else:
                     slope = abs(grey[y, x] - grey[y - dy, x - dx])
-                    least, price = lowest[k], ONE / (edge + slope) * jump
+                    least = lowest[k]
+                    price = ONE / (edge + slope) * jump
                     anywhere = least + (price if price > least_jump else least_jump)
                     for d in range(planes):
                         cheapest = previous[1 + d] if previous[1 + d] < anywhere else anywhere

@@ -28,11 +28,11 @@ class Tracks:
     """T scene points as V views see them; on the CPU."""
 
     pixels: Tensor  # `(T, V, 2)`, float64; the first pixel's centre is (0, 0)
-    seen: Tensor  # `(T, V)`: whether a view sees a point
+    visible: Tensor  # `(T, V)`: whether a view sees a point
 
     def select(self, rows: Tensor) -> Self:
         """Some of the points, by a mask or by indices."""
-        return type(self)(self.pixels[rows], self.seen[rows])
+        return type(self)(self.pixels[rows], self.visible[rows])
 
 
 def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> Tracks:
@@ -49,28 +49,30 @@ def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> T
     nodes, pixels, owners = _places([places for places, _ in features])
     links = list[tuple[float, int, int]]()
     for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
-        (places1, descriptors1), (places2, descriptors2) = features[i], features[j]
+        places1, descriptors1 = features[i]
+        places2, descriptors2 = features[j]
         lines = _lines(places1, projections[i], projections[j])
         distances, rows, columns = match(lines, places2.float(), descriptors1, descriptors2, backend)
         links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
     tracks = _join(links, owners)
-    table = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
-    seen = torch.zeros(len(tracks), len(views), dtype=torch.bool)
+    track_pixels = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
+    visible = torch.zeros(len(tracks), len(views), dtype=torch.bool)
     for row, track in enumerate(tracks):
         columns = torch.tensor(list(track))
-        table[row, columns] = pixels[torch.tensor(list(track.values()))]
-        seen[row, columns] = True
-    return Tracks(table, seen)
+        track_pixels[row, columns] = pixels[torch.tensor(list(track.values()))]
+        visible[row, columns] = True
+    return Tracks(track_pixels, visible)
 
 
 def detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
     """Places `(N, 2)` in float64 and RootSIFT descriptors `(N, 128)` of the strongest keypoints of one view."""
     image = views.images[index].permute(1, 2, 0).cpu().numpy()
     grey = cv2.cvtColor((image.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    mask = None if (usable := views.usable) is None else usable[index].cpu().numpy().astype(np.uint8)
+    usable = views.usable
+    mask = None if usable is None else usable[index].cpu().numpy().astype(np.uint8)
     factor = 2 if grey.size < SMALL_IMAGE else 1
-    found = root_sift(grey, limit, factor, mask, nOctaveLayers=4, contrastThreshold=0.005)
-    return found.places, found.descriptors
+    keypoints = root_sift(grey, limit, factor, mask, nOctaveLayers=4, contrastThreshold=0.005)
+    return keypoints.places, keypoints.descriptors
 
 
 def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
@@ -86,7 +88,9 @@ def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
 
     SIFT repeats a keypoint for each of its orientations: these share one place.
     """
-    numbers, distinct, owners = list[Tensor](), list[Tensor](), list[int]()
+    numbers = list[Tensor]()
+    distinct = list[Tensor]()
+    owners = list[int]()
     for view, all_places in enumerate(places):
         unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)
         numbers.append(inverse + len(owners))
@@ -107,7 +111,8 @@ def _join(links: list[tuple[float, int, int]], owners: list[int]) -> list[dict[i
         return place
 
     for _, place1, place2 in sorted(links):
-        one, other = root(place1), root(place2)
+        one = root(place1)
+        other = root(place2)
         if one != other and not tracks[one].keys() & tracks[other].keys():
             parents[other] = one
             tracks[one] |= tracks[other]

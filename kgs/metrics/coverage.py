@@ -1,6 +1,6 @@
 """PSNR of held-out views, separately where at least two training views show the scene and elsewhere.
 
-A single training view does not determine depth, and what no view shows is a guess: a mean over all pixels says little.
+A single training view does not determine depth, and what no view shows is guessed: a mean over all pixels says little.
 """
 
 import math
@@ -15,14 +15,14 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.geometry import nearest_pixels, project_points, unproject
 
-Draw = Callable[[PinholeCamera], Tensor]
+RenderView = Callable[[PinholeCamera], Tensor]
 
 MIN_VIEWS = 2  # training views that show a point
-OCCLUDED = 1.05  # a point farther than this times a training view's depth is hidden from that view
+OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
 
 
 @torch.no_grad()
-def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str, float | None] | None:
+def measure_coverage(scene: Scene, render: RenderView, median_depth: RenderView) -> dict[str, float | None] | None:
     """PSNR of the test views, separately for pixels that at least `MIN_VIEWS` training views show and for the rest.
 
     Convention:
@@ -48,12 +48,13 @@ def measure_coverage(scene: Scene, render: Draw, median_depth: Draw) -> dict[str
     shares = []
     for view in range(len(test)):
         camera = test.camera(view)
-        shown = views_that_show(median_depth(camera), camera, depths, train.cameras) >= MIN_VIEWS
+        covered = views_that_show(median_depth(camera), camera, depths, train.cameras) >= MIN_VIEWS
         image = test.as_photo(render(camera)[0].cpu())
         errors = (image - test.images[view].cpu().to(image)).square().mean(dim=0)
-        shares.append(float(shown.float().mean()))
-        for name, where in (("psnr", shown), ("psnr_rest", ~shown)):
-            if where.any() and (error := float(errors[where].mean())) > 0:
+        shares.append(float(covered.float().mean()))
+        for name, where in (("psnr", covered), ("psnr_rest", ~covered)):
+            error = float(errors[where].mean()) if where.any() else 0.0
+            if error > 0:
                 levels[name].append(-10 * math.log10(error))
     means: dict[str, Any] = {name: round(fmean(values), 4) if values else None for name, values in levels.items()}
     return {"share": round(fmean(shares), 4), **means}
@@ -73,12 +74,12 @@ def views_that_show(depth: Tensor, camera: PinholeCamera, depths: Sequence[Tenso
     """
     height, width = depth.shape
     pixels = torch.ones_like(depth).nonzero().flip(1)  # (x, y), row by row
-    values = depth.reshape(-1).double()
-    points = unproject(pixels, values, torch.zeros(len(pixels), dtype=torch.int64), camera)
-    places, distances = project_points(points, cameras)
+    own_depths = depth.reshape(-1).double()
+    points = unproject(pixels, own_depths, torch.zeros(len(pixels), dtype=torch.int64), camera)
+    other_pixels, other_depths = project_points(points, cameras)
     count = torch.zeros(len(pixels), dtype=torch.int64)
-    for view, there in enumerate(depths):
-        distance = distances[:, view]
-        x, y, inside = nearest_pixels(places[:, view], distance, *there.mT.shape)
-        count += (values > 0) & inside & (distance <= OCCLUDED * there[y, x])
+    for view, surface in enumerate(depths):
+        point_depths = other_depths[:, view]
+        x, y, inside = nearest_pixels(other_pixels[:, view], point_depths, *surface.mT.shape)
+        count += (own_depths > 0) & inside & (point_depths <= OCCLUDED * surface[y, x])
     return count.reshape(height, width)

@@ -69,24 +69,37 @@ def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float 
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
-    """The content of a metrics.json, measured again; without `lpips` its LPIPS stays. DataError if views differ."""
+    """The content of a metrics.json, measured again; without `lpips`, the old values of LPIPS are copied.
+
+    DataError if the views differ.
+    """
     fresh: dict[str, Any] = {}
     for part, views in (("test", scene.test), ("train", scene.train)):
         old = metrics.get(part) or {"views": []}
         try:
-            known = {row["name"]: row for row in old["views"]}
+            old_rows = {row["name"]: row for row in old["views"]}
         except (KeyError, TypeError) as error:
             raise DataError(path, part, "expected the metrics of a fit, got something else") from error
-        if set(known) != set(views.names):
+        if set(old_rows) != set(views.names):
             raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
-        fresh[part] = new = evaluate(render, views, lpips) if known else None
+        new = evaluate(render, views, lpips) if old_rows else None
         if new is not None and lpips is None:
-            for row, before in [(new, old), *((row, known[row["name"]]) for row in new["views"])]:
-                row |= {key: before.get(key) for key in MEASURES if key.startswith("lpips")}
+            _copy_lpips(old, new)
+            for row in new["views"]:
+                _copy_lpips(old_rows[row["name"]], row)
+        fresh[part] = new
     return metrics | fresh
 
 
+def _copy_lpips(source: dict[str, Any], target: dict[str, Any]) -> None:
+    """Copy the values of LPIPS, None where there are none."""
+    for key in MEASURES:
+        if key.startswith("lpips"):
+            target[key] = source.get(key)
+
+
 def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
+    """The `MEASURES` of one image."""
     level = psnr(image, target, 1.0).item()
     # Kornia's "valid" map of zero-padded images is the whole map with zero padding.
     border = [_WINDOW // 2] * 4
@@ -107,12 +120,15 @@ def as_text(metrics: dict[str, Any]) -> str:
     names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
     for part in ("test", "train"):
         values = metrics[part] or {}
-        shown = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
-        lines += [f"{part:>5}: " + ", ".join(shown)] if shown else []
-    seen = metrics.get("seen") or {}
-    if seen.get("psnr") is not None and seen.get("psnr_rest") is not None:
-        share, level, rest = (seen[name] for name in ("share", "psnr", "psnr_rest"))
-        lines.append(f" test: {100 * share:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
+        measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
+        if measured:
+            lines.append(f"{part:>5}: " + ", ".join(measured))
+    coverage = metrics.get("seen") or {}
+    level = coverage.get("psnr")
+    rest = coverage.get("psnr_rest")
+    if level is not None and rest is not None:
+        percent = 100 * coverage["share"]
+        lines.append(f" test: {percent:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
     if not metrics["test"]:
         lines.append("no photo was held out: the quality of other views was not measured (see --hold-out)")
     return "\n".join(lines)

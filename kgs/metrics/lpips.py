@@ -30,8 +30,8 @@ NORM_EPS = 1e-10
 
 # VGG16 in torchvision's order: blocks of convolutions of size 3, each with a ReLU, and between blocks a pooling by 2.
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-MIN_SIZE = 16  # pixels, of the smallest image that four poolings leave something of
-MAX_HEADER = 10_000  # bytes of an array's
+MIN_SIZE = 16  # pixels, the smallest side that is at least 1 after four poolings
+MAX_HEADER = 10_000  # bytes of the header of an array
 
 
 class Lpips(nn.Module):
@@ -68,11 +68,11 @@ class Lpips(nn.Module):
         """
         with torch.device("meta"):
             module = cls()
-        network, lines = weight_files(folder)
+        features_path, heads_path = weight_files(folder)
         shapes = {name: tuple(value.shape) for name, value in module.state_dict().items()}
         heads = {name: shape for name, shape in shapes.items() if name.startswith("lin")}
         features = {name: shape for name, shape in shapes.items() if name not in heads}
-        module.load_state_dict(_read(lines, heads) | _read(network, features), assign=True)
+        module.load_state_dict(_read(heads_path, heads) | _read(features_path, features), assign=True)
         return module.requires_grad_(False).eval()
 
     def forward(self, image: Tensor, target: Tensor, rescale: bool = True) -> Tensor:
@@ -108,6 +108,7 @@ def _network_input(image: Tensor, rescale: bool) -> Tensor:
 
 
 def _unit(features: Tensor) -> Tensor:
+    """The features, scaled to unit length along the channels."""
     norm: Tensor = torch.linalg.vector_norm(features, dim=1, keepdim=True)
     return features / (norm + NORM_EPS)
 

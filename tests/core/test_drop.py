@@ -250,7 +250,7 @@ def test_nothing_is_warned_about_when_nothing_is_amiss(layer):
 
 def test_the_warning_points_at_the_calling_line():
     with pytest.warns(UserWarning, match="never set") as caught:
-        DropGaussian().forward(draw())
+        DropGaussian()(draw())
     assert caught[0].filename == __file__
 
 

@@ -9,7 +9,18 @@ import trimesh
 from factories import random_cloud as cloud
 from scipy.spatial.transform import Rotation
 
-from kgs.geometry import camera_centers, camera_extent, common_up, degrees_between, log_spacing, meeting_point
+from kgs.camera import pinhole_cameras
+from kgs.geometry import (
+    ViewGeometry,
+    camera_centers,
+    camera_extent,
+    common_up,
+    degrees_between,
+    log_spacing,
+    meeting_point,
+    project_points,
+    unproject,
+)
 from kgs.model import GaussianModel
 
 
@@ -39,6 +50,25 @@ def test_centres_are_found_again():
     extrinsics = rig(CENTRES, turned(3))
     assert torch.allclose(camera_centers(extrinsics), CENTRES, atol=1e-12)
     assert camera_centers(extrinsics.float()).dtype == torch.float64
+
+
+def test_points_project_to_kornias_pixels_and_back():
+    k = torch.tensor([[50.0, 0.5, 31.0], [0.0, 60.0, 22.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    cameras = pinhole_cameras(rig(CENTRES, turned(3)), k, width=64, height=48)
+    geometry = ViewGeometry.of(cameras)
+    points = 5 * torch.randn(40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    pixels, depths = geometry.project(points)
+    expected = cameras.project(points[None].expand(3, -1, -1)).transpose(0, 1)
+    front = depths > 0
+    torch.testing.assert_close(pixels[front], expected[front])
+    for view in range(3):
+        back = geometry.unproject(pixels[:, view], depths[:, view], torch.full((40,), view))
+        torch.testing.assert_close(back, points)
+        for ours, all_views in zip(geometry.one(view).project(points), (pixels, depths), strict=True):
+            torch.testing.assert_close(ours[:, 0], all_views[:, view])
+    assert torch.equal(project_points(points, cameras)[0], pixels)
+    first = (pixels[:, 0], depths[:, 0], torch.zeros(40, dtype=torch.int64))
+    assert torch.equal(unproject(*first, cameras), geometry.unproject(*first))
 
 
 def test_extent_of_known_cameras():

@@ -25,12 +25,12 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.app.console import each
 from kgs.datasets.scene import Views
-from kgs.geometry import typical_depths
+from kgs.geometry import ViewGeometry, typical_depths
 from kgs.init_points import InitialPoints, initial_points
 
 
 @pytest.fixture(scope="module")
-def found(planes: Views) -> InitialPoints:
+def sift_points(planes: Views) -> InitialPoints:
     return initial_points(planes, "sift")
 
 
@@ -41,41 +41,41 @@ def depth_errors(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.minimum(to_back, to_front), to_front < to_back
 
 
-def test_sift_points_lie_on_the_planes(found: InitialPoints) -> None:
-    errors, front = depth_errors(found.points)
-    assert found.kind == "sift"
-    assert found.points.dtype == torch.float32
-    assert found.points.shape == found.colors.shape
+def test_sift_points_lie_on_the_planes(sift_points: InitialPoints) -> None:
+    errors, front = depth_errors(sift_points.points)
+    assert sift_points.kind == "sift"
+    assert sift_points.points.dtype == torch.float32
+    assert sift_points.points.shape == sift_points.colors.shape
     assert min(int(front.sum()), int((~front).sum())) > 50
     assert float(errors.median()) < 0.005
     assert float((errors < 0.03).double().mean()) > 0.97
 
 
-def test_sift_points_have_no_bias_in_depth(found: InitialPoints) -> None:
-    x, _, z = found.points.double().unbind(1)
+def test_sift_points_have_no_bias_in_depth(sift_points: InitialPoints) -> None:
+    x, _, z = sift_points.points.double().unbind(1)
     for depth, slope in (BACK, FRONT):
         ratio = z / (depth + slope * x)
         assert abs(float(ratio[(ratio - 1).abs() < 0.03].median()) - 1) < 0.002
 
 
-def test_sift_colors_are_those_of_the_planes(found: InitialPoints) -> None:
-    _, front = depth_errors(found.points)
+def test_sift_colors_are_those_of_the_planes(sift_points: InitialPoints) -> None:
+    _, front = depth_errors(sift_points.points)
     for chosen, tint in ((front, FRONT_TINT), (~front, BACK_TINT)):
-        shades = found.colors[chosen] / found.colors[chosen].sum(1, keepdim=True)
+        shades = sift_points.colors[chosen] / sift_points.colors[chosen].sum(1, keepdim=True)
         expected = torch.tensor(tint) / sum(tint)
         assert float((shades - expected).abs().median()) < 0.005
-    assert float(found.colors.std(0).min()) > 0.05
+    assert float(sift_points.colors.std(0).min()) > 0.05
 
 
-def test_the_same_bits_again_for_any_number_of_threads(planes: Views, found: InitialPoints) -> None:
+def test_the_same_bits_again_for_any_number_of_threads(planes: Views, sift_points: InitialPoints) -> None:
     threads = torch.get_num_threads(), cv2.getNumThreads()
     try:
         for count in (1, 3):
             torch.set_num_threads(count)
             cv2.setNumThreads(count)
             again = initial_points(planes, "sift", seed=count)
-            assert torch.equal(again.points, found.points)
-            assert torch.equal(again.colors, found.colors)
+            assert torch.equal(again.points, sift_points.points)
+            assert torch.equal(again.colors, sift_points.colors)
     finally:
         torch.set_num_threads(threads[0])
         cv2.setNumThreads(threads[1])
@@ -97,13 +97,14 @@ def seeing_views(posed: PinholeCamera, points: torch.Tensor) -> torch.Tensor:
     return ((pixels > -0.5 - 1e-3) & (pixels < limits + 1e-3)).all(-1).logical_and(depths > 0).sum(0)
 
 
-def test_random_points_are_seen_by_two_views_and_span_the_sift_depths(planes: Views, found: InitialPoints) -> None:
+def test_random_points_lie_in_two_views_at_the_depths_of_sift_points(planes: Views, sift_points: InitialPoints) -> None:
     result = initial_points(planes, "random", count=2000)
     assert result.kind == "random"
     assert result.points.shape == result.colors.shape == (2000, 3)
     assert int(seeing_views(planes.cameras, result.points).min()) >= 2
     assert 0 <= float(result.colors.min()) <= float(result.colors.max()) <= 1
-    depths, sift = result.points[:, 2], found.points[:, 2]
+    depths = result.points[:, 2]
+    sift = sift_points.points[:, 2]
     assert 0.7 * float(sift.min()) < float(depths.min()) < float(depths.max()) < 1.6 * float(sift.max())
 
 
@@ -188,14 +189,27 @@ def test_typical_depths_without_points_before_a_camera(points: torch.Tensor) -> 
     assert typical_depths(points, flat().cameras) == (1.0, 1.0)
 
 
+def test_cameras_are_converted_once(planes: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+    converted: list[PinholeCamera] = []
+    convert = ViewGeometry.of
+
+    def counted(posed: PinholeCamera) -> ViewGeometry:
+        converted.append(posed)
+        return convert(posed)
+
+    monkeypatch.setattr(ViewGeometry, "of", counted)
+    initial_points(planes, "sift")
+    assert len(converted) == 1
+
+
 def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = torch.rand(80, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 5.0])
     alone = torch.tensor([[0.2, 0.1, 3.2]])
     monkeypatch.setattr("kgs.init_points.find_tracks", lambda *_: exact_tracks(torch.cat([wall, alone])))
     posed = cameras()
-    found = initial_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
-    assert found.kind == "sift"
-    torch.testing.assert_close(found.points, wall, rtol=1e-4, atol=1e-4)
+    result = initial_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
+    assert result.kind == "sift"
+    torch.testing.assert_close(result.points, wall, rtol=1e-4, atol=1e-4)
 
 
 REAL = [

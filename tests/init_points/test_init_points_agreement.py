@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from init_point_scenes import as_views, cameras
+from init_point_scenes import cameras
 
+from kgs.geometry import ViewGeometry
 from kgs.init_points.agreement import agreed_points, average_depths
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 30, 4.0
 BESIDE = cameras(np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]]), turn=0.0, size=(WIDTH, HEIGHT))
-VIEWS = as_views(BESIDE, torch.full((2, 3, HEIGHT, WIDTH), 0.5))
+GEOMETRY = ViewGeometry.of(BESIDE)
 EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 SHARED = (slice(None), slice(5, None))  # of the first view: the second camera sees it 3.5 pixels further left
 
@@ -23,7 +24,7 @@ def wall(depth: float) -> DepthMap:
 
 def agreed(maps: list[DepthMap], certain: list[torch.Tensor]) -> torch.Tensor:
     """Which pixels of the first view are kept."""
-    _, pixels = agreed_points(VIEWS, maps, certain, 0)
+    _, pixels = agreed_points(GEOMETRY, maps, certain, 0)
     kept = torch.zeros_like(EVERYWHERE)
     kept[pixels[:, 1], pixels[:, 0]] = True
     return kept
@@ -31,7 +32,7 @@ def agreed(maps: list[DepthMap], certain: list[torch.Tensor]) -> torch.Tensor:
 
 def test_similar_depths_are_averaged_and_agree_then() -> None:
     maps, certain = [wall(DEPTH), wall(1.025 * DEPTH)], [EVERYWHERE, EVERYWHERE]
-    averaged = average_depths(VIEWS, maps, certain)
+    averaged = average_depths(GEOMETRY, maps, certain)
     expected = torch.tensor(2 / (1 / DEPTH + 1 / (1.025 * DEPTH)))
     torch.testing.assert_close(averaged[0].depths[SHARED], expected.expand(HEIGHT, WIDTH - 5))
     torch.testing.assert_close(averaged[1].depths[:, : WIDTH - 5], expected.expand(HEIGHT, WIDTH - 5))
@@ -43,7 +44,7 @@ def test_similar_depths_are_averaged_and_agree_then() -> None:
 def test_other_depths_stay(unlike: str) -> None:
     maps = [wall(DEPTH), wall((1.05 if unlike == "depth" else 1.02) * DEPTH)]
     masks = [EVERYWHERE & (unlike != "own mask"), EVERYWHERE & (unlike != "other mask")]
-    assert torch.equal(average_depths(VIEWS, maps, masks)[0].depths, maps[0].depths)
+    assert torch.equal(average_depths(GEOMETRY, maps, masks)[0].depths, maps[0].depths)
 
 
 def test_pixels_need_agreeing_neighbours() -> None:

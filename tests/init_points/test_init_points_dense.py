@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
-from kgs.geometry import camera_centers, nearest_pixels, project_points
+from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
 from kgs.init_points import _sweep_range, initial_points
 from kgs.init_points.agreement import AGREEMENT
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, _with_less_sky, dense_points
@@ -46,9 +46,9 @@ def generator(seed: int = 0) -> torch.Generator:
 
 @pytest.mark.slow
 def test_depths_of_the_synthetic_scene(views: Views, truth: torch.Tensor, span: tuple[float, float]) -> None:
-    for view, found in enumerate(sweep_depths(views, *span)):
-        accepted = found.is_inner & (found.scores > 0.6)
-        errors = (found.depths / truth[view] - 1).abs()
+    for view, depth_map in enumerate(sweep_depths(views, *span)):
+        accepted = depth_map.is_inner & (depth_map.scores > 0.6)
+        errors = (depth_map.depths / truth[view] - 1).abs()
         assert float(accepted.double().mean()) > 0.6
         assert float(errors[accepted].median()) < 0.01
         assert float((errors[accepted] < 0.02).double().mean()) > 0.7
@@ -124,12 +124,12 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
     extrinsics[:, 0, 3] = -places
     first = views.camera(0)
     camera = PinholeCamera(first.intrinsics.repeat(n, 1, 1), extrinsics, first.height.repeat(n), first.width.repeat(n))
-    line = Views(camera, views.images[:1].repeat(n, 1, 1, 1), tuple(f"{k}.png" for k in range(n)))
+    line = ViewGeometry.of(camera)
     assert sorted(_neighbours(line, 0, 3.0)) == [3, 4, 5, 6]
     assert _neighbours(line, 7, 3.0)[0] == 6
 
 
-def test_awarp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
+def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
     image = torch.rand(20, 30, generator=generator())
     homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], [0.002, -0.003, 1.0]], dtype=torch.float64)
     rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
@@ -144,24 +144,24 @@ def test_awarp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
 
 
 def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:
-    near_camera = (
-        torch.linalg.inv(views.camera(0).extrinsics.double())[0] @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
-    )
+    geometry = ViewGeometry.of(views.cameras)
+    near_camera = torch.linalg.inv(geometry.extrinsics[0]) @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
     scene = torch.tensor([[0.0, 0.0, 4.0], [0.2, 0.1, 6.0]], dtype=torch.float64)
-    assert _sweep_range(torch.cat([scene, near_camera[None, :3]]), views) == _sweep_range(scene, views)
+    more = torch.cat([scene, near_camera[None, :3]])
+    assert _sweep_range(*geometry.project(more), geometry) == _sweep_range(*geometry.project(scene), geometry)
 
 
 def test_views_from_one_place_have_no_depth(views: Views) -> None:
     camera = views.camera(0)
     both = [torch.cat([x, x]) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)]
     twice = Views(PinholeCamera(*both), views.images[[0, 0]], ("a.png", "b.png"))
-    assert all(not found.is_inner.any() for found in sweep_depths(twice, 1.0, 10.0))
+    assert all(not depth_map.is_inner.any() for depth_map in sweep_depths(twice, 1.0, 10.0))
 
 
 def test_dense_is_a_kind_of_first_points(views: Views) -> None:
-    found = initial_points(views, "dense")
-    assert found.kind == "dense"
-    assert 1000 <= len(found.points) <= 10_000
+    result = initial_points(views, "dense")
+    assert result.kind == "dense"
+    assert 1000 <= len(result.points) <= 10_000
 
 
 def test_smoothing_keeps_edges_and_repairs_holes() -> None:
@@ -173,8 +173,8 @@ def test_smoothing_keeps_edges_and_repairs_holes() -> None:
     cost = (torch.arange(planes)[:, None, None] - truth).abs().clamp(max=5).float() / 5
     silent = torch.rand(height, width, generator=generator()) < 0.33
     cost = torch.where(silent, 0.5, cost)
-    found = _semi_global(cost, grey).argmin(0)
-    assert float((found == truth).double().mean()) > 0.99
+    result = _semi_global(cost, grey).argmin(0)
+    assert float((result == truth).double().mean()) > 0.99
     assert float((torch.where(silent, 0.5, cost).argmin(0) == truth).double().mean()) < 0.75
 
 
@@ -218,9 +218,9 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
 
 @pytest.mark.parametrize("draw", [pytest.param("uniform", marks=pytest.mark.slow), "spread"])
 def test_few_points_are_enough_where_many_agree(draw: str) -> None:
-    found = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
-    assert found.kind == "dense"
-    assert 450 <= len(found.points) <= 500
+    result = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
+    assert result.kind == "dense"
+    assert 450 <= len(result.points) <= 500
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])

@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from factories import random_model, with_camera
+from factories import with_camera
 from init_point_scenes import flat
 
 import kgs
+from kgs.app.fit_folder import fit_folder
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Scene
 from kgs.errors import DataError
-from kgs.fit import FitConfig, fit_scene
+from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
 from kgs.init_points import initial_points
 
@@ -102,9 +104,9 @@ def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     points, colors = torch.randn(40, 3, generator=generator), torch.rand(40, 3, generator=generator)
     kgs.save_ply(tmp_path / "splat.ply", kgs.GaussianModel.from_points(points, colors, sh_degree=2))
-    found = initial_points(flat(), "file", file=tmp_path / "splat.ply")
-    assert torch.equal(found.points, points)
-    assert torch.allclose(found.colors, colors, atol=1e-6)
+    result = initial_points(flat(), "file", file=tmp_path / "splat.ply")
+    assert torch.equal(result.points, points)
+    assert torch.allclose(result.colors, colors, atol=1e-6)
 
 
 def write_cloud(path: Path, shift: tuple[float, float, float]) -> FitConfig:
@@ -119,15 +121,11 @@ def test_points_in_another_frame_end_a_fit_before_it_begins(
     scene: Scene, tmp_path: Path, shift: tuple[float, float, float], in_front: int
 ) -> None:
     config = write_cloud(tmp_path / "cloud.ply", shift)
-    former = tmp_path / "out" / "splat.ply"
-    former.parent.mkdir()
-    kgs.save_ply(former, random_model())
-    content = former.read_bytes()
+    out = tmp_path / "out"
     message = f"cloud.ply: initial points: .* got none of 40, of which {in_front} lie before a camera"
     with pytest.raises(DataError, match=message):
-        fit_scene(scene, config, tmp_path / "out")
-    assert former.read_bytes() == content
-    assert [path.name for path in former.parent.iterdir() if path.suffix] == ["splat.ply"]
+        fit_folder(scene, config, out, SceneRequest("somewhere"))
+    assert not any(path.suffix for path in out.iterdir())
 
 
 def test_views_that_show_no_initial_point_are_named(scene: Scene, tmp_path: Path, recwarn: Any) -> None:
@@ -147,8 +145,8 @@ def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
     origin = np.array([432_100.25, 5_400_000.5, 120.0])
     rows = "\n".join(" ".join(f"{x:.4f}" for x in row) for row in local + origin)
     (tmp_path / "cloud.xyz").write_text(rows)
-    found = initial_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
-    np.testing.assert_allclose(found.points.numpy(), local, atol=1e-5)
+    result = initial_points(flat(), "file", file=tmp_path / "cloud.xyz", origin=torch.from_numpy(origin))
+    np.testing.assert_allclose(result.points.numpy(), local, atol=1e-5)
 
 
 def test_a_file_whose_vertices_have_another_name_has_no_points(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from init_point_scenes import (
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
+from kgs.geometry import ViewGeometry
 from kgs.init_points.tracks import Tracks, find_tracks
 from kgs.init_points.triangulate import triangulate, triangulate_certain
 
@@ -26,8 +27,8 @@ def test_masks_leave_out_keypoints(planes: Views) -> None:
     masks = torch.ones(3, 1, HEIGHT, WIDTH)
     masks[..., : WIDTH // 2] = 0
     tracks = find_tracks(as_views(planes.cameras, planes.images, masks))
-    assert len(tracks.seen) > 30
-    assert float(tracks.pixels[tracks.seen][:, 0].min()) > WIDTH // 2 - 1
+    assert len(tracks.visible) > 30
+    assert float(tracks.pixels[tracks.visible][:, 0].min()) > WIDTH // 2 - 1
 
 
 def blobs(places: np.ndarray, scales: np.ndarray, size: tuple[int, int]) -> Views:
@@ -58,7 +59,7 @@ def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched() -> None:
     for image in (pattern, np.tile(pattern[:, :64], (1, 5, 1))):
         pair = np.stack([image, np.roll(image, -8, axis=1)])
         tracks = find_tracks(as_views(posed, torch.from_numpy(pair).float().permute(0, 3, 1, 2)))
-        counts.append(len(tracks.seen))
+        counts.append(len(tracks.visible))
     assert counts[0] > 100
     assert counts[1] < 0.05 * counts[0]
 
@@ -67,22 +68,22 @@ def test_triangulation_agrees_with_opencv_for_two_views() -> None:
     posed, rng = cameras(), np.random.default_rng(0)
     pixels = rng.uniform(50, 200, (40, 3, 2))
     pixels[:, 2] = pixels[:, 0] + rng.uniform(-30, -10, (40, 1)) * [1, 0]
-    seen = torch.tensor([True, False, True]).expand(40, 3)
+    visible = torch.tensor([True, False, True]).expand(40, 3)
     # OpenCV's equations in the same normalised coordinates: two rays that do not meet have no other common answer.
     inverse = np.linalg.inv(posed.intrinsics[0, :3, :3].double().numpy())
     rays = np.concatenate([pixels, np.ones((40, 3, 1))], -1) @ inverse.T
     projections = posed.extrinsics[:, :3].double().numpy()
     expected = cv2.triangulatePoints(projections[0], projections[2], rays[:, 0, :2].T, rays[:, 2, :2].T)
     expected = (expected[:3] / expected[3]).T
-    points = triangulate(Tracks(torch.from_numpy(pixels), seen), posed).numpy()
+    points = triangulate(Tracks(torch.from_numpy(pixels), visible), ViewGeometry.of(posed)).numpy()
     np.testing.assert_allclose(points, expected, rtol=0.02, atol=0.02)
 
 
 def test_exact_tracks_give_exact_points() -> None:
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 3.0])
-    recovered, kept = triangulate_certain(exact_tracks(points), cameras())
-    assert bool(kept.seen.all())
-    torch.testing.assert_close(recovered.float(), points, rtol=1e-4, atol=1e-4)
+    certain = triangulate_certain(exact_tracks(points), ViewGeometry.of(cameras()))
+    assert bool(certain.tracks.visible.all())
+    torch.testing.assert_close(certain.points.float(), points, rtol=1e-4, atol=1e-4)
 
 
 def test_a_moved_and_scaled_world_moves_and_scales_the_points() -> None:
@@ -92,10 +93,10 @@ def test_a_moved_and_scaled_world_moves_and_scales_the_points() -> None:
     extrinsics[:, :3, 3] = 100 * (extrinsics[:, :3, 3] - extrinsics[:, :3, :3] @ shift.double())
     moved = PinholeCamera(posed.intrinsics.double(), extrinsics, posed.height, posed.width)
     tracks = exact_tracks(points)
-    expected, _ = triangulate_certain(tracks, posed)
-    found, kept = triangulate_certain(tracks, moved)
-    assert bool(kept.seen.all())
-    torch.testing.assert_close(found / 100 - shift, expected, rtol=1e-9, atol=1e-9)
+    expected = triangulate_certain(tracks, ViewGeometry.of(posed))
+    certain = triangulate_certain(tracks, ViewGeometry.of(moved))
+    assert bool(certain.tracks.visible.all())
+    torch.testing.assert_close(certain.points / 100 - shift, expected.points, rtol=1e-9, atol=1e-9)
 
 
 def test_uncertain_points_go() -> None:
@@ -104,6 +105,6 @@ def test_uncertain_points_go() -> None:
     tracks = exact_tracks(points)
     tracks.pixels[2, 1, 1] += 3.0
     tracks.pixels[3, 1, 1] += 40.0
-    recovered, kept = triangulate_certain(tracks, cameras())
-    torch.testing.assert_close(recovered.float(), points[[0, 2]], rtol=1e-4, atol=1e-4)
-    assert kept.seen.tolist() == [[True, True, True], [True, False, True]]
+    certain = triangulate_certain(tracks, ViewGeometry.of(cameras()))
+    torch.testing.assert_close(certain.points.float(), points[[0, 2]], rtol=1e-4, atol=1e-4)
+    assert certain.tracks.visible.tolist() == [[True, True, True], [True, False, True]]

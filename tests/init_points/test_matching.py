@@ -46,20 +46,20 @@ def test_matches_are_torchs(n, m):
 def test_the_first_of_equal_pairs_has_the_other_as_its_rival(monkeypatch):
     monkeypatch.setattr(matching, "MAX_RATIO", 1.5)
     arguments = (*(x.repeat(2, 1) for x in keypoints(300, 300)[:2]), *(x.repeat(2, 1) for x in keypoints(300, 300)[2:]))
-    found, expected = (matches(arguments, backend) for backend in ("numba", "torch"))
-    assert len(found[0]) > 50
-    assert all(torch.equal(a, b) for a, b in zip(found[1:], expected[1:], strict=True))
+    results, expected = (matches(arguments, backend) for backend in ("numba", "torch"))
+    assert len(results[0]) > 50
+    assert all(torch.equal(a, b) for a, b in zip(results[1:], expected[1:], strict=True))
 
 
 def test_bits_do_not_depend_on_threads():
-    before, found = torch.get_num_threads(), []
+    before, results = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            found.append(matches(keypoints(333, 444), "numba"))
+            results.append(matches(keypoints(333, 444), "numba"))
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for some in found for a, b in zip(some, found[0], strict=True))
+    assert all(torch.equal(a, b) for some in results for a, b in zip(some, results[0], strict=True))
 
 
 @pytest.mark.slow

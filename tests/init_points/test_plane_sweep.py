@@ -39,30 +39,30 @@ def costs(arguments, backend):
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_costs_and_scores_are_torchs(count, height, width, planes):
     arguments = pictures(count, height, width, planes)
-    for found, expected in zip(costs(arguments, "numba"), costs(arguments, "torch"), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-6, atol=2e-6, check_stride=False)
+    for results, expected in zip(costs(arguments, "numba"), costs(arguments, "torch"), strict=True):
+        torch.testing.assert_close(results, expected, rtol=1e-6, atol=2e-6, check_stride=False)
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_depth_maps_are_torchs(count):
     views = synthetic_scene(train_views=count, test_views=1, size=(48, 64), seed=0).train
     maps = [plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend) for backend in ("numba", "torch")]
-    for found, expected in zip(*maps, strict=True):
-        same = (found.depths / expected.depths - 1).abs() < 1e-4
+    for results, expected in zip(*maps, strict=True):
+        same = (results.depths / expected.depths - 1).abs() < 1e-4
         assert float(same.double().mean()) > 0.999
-        assert float((found.scores - expected.scores)[same].abs().max()) < 1e-5
+        assert float((results.scores - expected.scores)[same].abs().max()) < 1e-5
 
 
 def test_bits_depend_neither_on_threads_nor_on_repetition():
     arguments = pictures(2, 70, 61, 24)
-    before, found = torch.get_num_threads(), []
+    before, results = torch.get_num_threads(), []
     try:
         for threads, _ in product((1, 2, 3, 4), range(2)):
             torch.set_num_threads(threads)
-            found.append(costs(arguments, "numba"))
+            results.append(costs(arguments, "numba"))
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for some in found for a, b in zip(some, found[0], strict=True))
+    assert all(torch.equal(a, b) for some in results for a, b in zip(some, results[0], strict=True))
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
     """See `ProjectionStage`; what the kernels cannot do is done in torch."""
-    if not _is_plain(cameras) or gaussians.quats.ndim == 3 or options.near_plane < 1e-8:  # Kornia divides by no less
+    if not _covers(cameras) or gaussians.quats.ndim == 3 or options.near_plane < 1e-8:  # Kornia divides by no less
         return project_in_torch(gaussians, cameras, size, options, colors)
     opacities = gaussians.opacities.detach()
     wide = bool((opacities > 2.0).any())  # only these change the cutoff
@@ -123,15 +123,17 @@ class _Projection(torch.autograd.Function):
         return *(x if want else None for x, want in zip(input_grads, wanted, strict=True)), None, None, None
 
 
-def _is_plain(cameras: Cameras) -> TypeGuard[PinholeCamera]:
-    """Whether these are pinhole cameras with affine intrinsics and poses, the poses invertible."""
+def _covers(cameras: Cameras) -> TypeGuard[PinholeCamera]:
+    """Whether these are pinhole cameras with finite numbers, focal lengths other than 0, and affine, invertible poses.
+
+    The last rows of the intrinsics have been checked.
+    """
     if not isinstance(cameras, PinholeCamera):
         return False
     k, pose = arrays(cameras.intrinsics, cameras.extrinsics)
-    unit = np.eye(4)
-    affine = (k[:, 2:] == unit[2:]).all() and not k[:, :2, 3].any() and (pose[:, 3] == unit[3]).all()
     finite = np.isfinite(k).all() and np.isfinite(pose).all()
-    return bool(affine and finite and k[:, 0, 0].all() and k[:, 1, 1].all() and np.linalg.det(pose[:, :3, :3]).all())
+    affine = (pose[:, 3] == [0.0, 0.0, 0.0, 1.0]).all()
+    return bool(finite and affine and k[:, [0, 1], [0, 1]].all() and np.linalg.det(pose[:, :3, :3]).all())
 
 
 def _views(cameras: PinholeCamera, frame: Frame) -> list[tuple[Array, ...]]:

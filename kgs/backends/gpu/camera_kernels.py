@@ -10,10 +10,10 @@ import triton.language as tl
 from .footprint_kernels import is_finite
 
 WIDTH = 36
-PLAIN = 25  # where in a row it says that intrinsics and pose are affine, and the pose invertible
+COVERED = 25  # column: 1 for finite numbers, focal lengths other than 0, and an affine, invertible pose; else 0
 
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
-_PLAIN: tl.constexpr = tl.constexpr(PLAIN)
+_COVERED: tl.constexpr = tl.constexpr(COVERED)
 
 
 @triton.jit
@@ -35,15 +35,15 @@ def _store_limits(out, focal, centre, low, high, margin):
 
 @triton.jit
 def describe_cameras(intrinsics, extrinsics, left, top, right, bottom, margin_x, margin_y, rows):
-    """Fill the row of a camera from its matrices `(4, 4)`."""
+    """Fill the row of a camera from its matrices `(4, 4)`; the last rows of the intrinsics have been checked."""
     c = tl.program_id(0)
     matrix, pose, out = intrinsics + c * 16, extrinsics + c * 16, rows + c * _WIDTH
     i = tl.arange(0, 16)
     k, e = tl.load(matrix + i), tl.load(pose + i)
     unit = tl.where(i % 5 == 0, 1.0, 0.0)
-    plain = is_finite(k) & is_finite(e) & ((k == unit) | ((i < 8) & (i % 4 < 3))) & ((e == unit) | (i < 12))
-    plain &= (k != 0.0) | ((i != 0) & (i != 5))
-    plain = tl.min(plain.to(tl.int32), 0)
+    covered = is_finite(k) & is_finite(e) & ((e == unit) | (i < 12))
+    covered &= (k != 0.0) | ((i != 0) & (i != 5))
+    covered = tl.min(covered.to(tl.int32), 0)
     for j in tl.static_range(12):
         tl.store(out + j, tl.load(pose + j))
     for j in tl.static_range(3):
@@ -53,7 +53,7 @@ def describe_cameras(intrinsics, extrinsics, left, top, right, bottom, margin_x,
     _store_limits(out + 20, tl.load(matrix + 5), tl.load(matrix + 6), top, bottom, margin_y)
     det = tl.load(pose) * _cofactor(pose, 0, 0) + tl.load(pose + 1) * _cofactor(pose, 0, 1)
     det += tl.load(pose + 2) * _cofactor(pose, 0, 2)
-    plain = tl.where((det != 0.0) & is_finite(det), plain, 0)  # torch says that it has no inverse
+    covered = tl.where((det != 0.0) & is_finite(det), covered, 0)  # torch says that it has no inverse
     for j in tl.static_range(3):
         moved = tl.load(pose + 3) * 0.0
         for m in tl.static_range(3):
@@ -61,4 +61,4 @@ def describe_cameras(intrinsics, extrinsics, left, top, right, bottom, margin_x,
             tl.store(out + 26 + 3 * j + m, inverse)
             moved -= inverse * tl.load(pose + 4 * m + 3)
         tl.store(out + 22 + j, moved)
-    tl.store(out + _PLAIN, plain.to(tl.float32))
+    tl.store(out + _COVERED, covered.to(tl.float32))

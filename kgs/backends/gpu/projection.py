@@ -13,7 +13,7 @@ from kgs.camera import MARGIN, Cameras, whole_frame
 from kgs.projection import visibility_cutoff
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
-from .camera_kernels import PLAIN, WIDTH, describe_cameras
+from .camera_kernels import COVERED, WIDTH, describe_cameras
 from .launch import blocks, launch, wide_sum
 from .projection_kernels import check_gaussians, find_visible, footprint_gradients, list_visible
 
@@ -82,8 +82,8 @@ def _find_visible(
     frustum = (cutoff, options.near_plane, options.eps2d, *size)
     launch(find_visible, (blocks(n, _BLOCK), len(rows)), *values, finite, rows, *frustum, n, flags, BLOCK=_BLOCK)
     places = torch.cumsum(flags.view(-1), 0)
-    *ends, plain = torch.cat([places[n - 1 :: n], rows[:, PLAIN].amin().long()[None]]).tolist()
-    if not plain:
+    *ends, covered = torch.cat([places[n - 1 :: n], rows[:, COVERED].amin().long()[None]]).tolist()
+    if not covered:
         return None
     counts = [end - begin for begin, end in pairwise([0, *ends])]
     return _Visible(rows, places, counts, n - finite.sum())
