@@ -16,12 +16,11 @@ VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a
 def say(line: str, file: TextIO | None = None) -> None:
     """Print one or more lines, on stdout unless told otherwise, and flush them.
 
-    Control characters, and letters that the terminal does not have, become escapes. Writing to a closed pipe does
-    nothing.
+    Control characters, and letters that the stream cannot encode, become escapes. A closed pipe is no error.
     """
     stream = sys.stdout if file is None else file
     line = "\n".join(map(printable, line.split("\n")))
-    with suppress(OSError, ValueError, AttributeError):  # a stream that its reader or the program closed, or None
+    with suppress(OSError, ValueError, AttributeError):  # closed by its reader or by the program, or None
         encoding = stream.encoding or "utf-8"
         print(line.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
@@ -47,9 +46,17 @@ def _quoted(word: str) -> str:
 def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
     """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a line for every tenth.
 
-    Both tell the time that is left; the first line comes after two seconds at most. Yields `advance(note="")`, to be
-    called after each unit; the note is shown behind the figures. `done` units are already done. With a total of 0
-    nothing is shown.
+    Both have the time that is left. The first line comes with the first unit that ends after two seconds, at a tenth of
+    the total at the latest.
+
+    Args:
+        total: number of units; with 0 nothing is shown.
+        title: name of the stage.
+        done: number of units that are already done.
+        unit: name of a unit; its plural has an s.
+
+    Yields:
+        `advance(note="")`, to be called after each unit. The note is shown behind the figures.
     """
     bar: Any = None
     with suppress(OSError, ValueError, AttributeError, ImportError):  # no tqdm, or a stderr that is closed

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_orig
 
 
 class _Range(NamedTuple):
-    """The interval of valid numbers. `ends` are its brackets: "[" and "]" include a limit, "(" and ")" exclude it."""
+    """The interval of valid numbers. Of its `ends`, "[" and "]" include a limit, "(" and ")" exclude it."""
 
     least: float
     most: float = 1e300
@@ -108,35 +108,36 @@ class FitConfig:
     last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0.
 
     Args:
-        steps: training steps, to which the recipe's counts are scaled; None: 1000 for up to three views, 1500 for more.
+        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 1000 for up to three
+            views, 1500 for more.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
-        drop_schedule: linear grows with the steps, as in the paper; constant is dropout at that rate.
-        undropped_steps: in the last so many steps, a tenth of all at most, no Gaussian is dropped.
-        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3; unless given, short
-            fits (probes) find out what the training views need.
-        refine_poses: optimise the poses of the training cameras too. It helps where they are half a degree or more off,
-            and accurate poses get slightly worse. Their mean and spread stay, and so do test cameras.
+        drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
+        undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
+        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: short fits (probes)
+            find out what the training views need.
+        refine_poses: optimise the poses of the training cameras too. It helps if they are half a degree or more off;
+            accurate poses get slightly worse. The mean and the spread of the poses stay, and so do test cameras.
         coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1].
         seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
-        init: initial points. dense: points of depth maps, made from the training images by a plane sweep in some
-            seconds per view. sift: points of matched keypoints. random: random points in the space that at least two
-            images see. scene: the random points that Blender's layout prescribes. model-points: points of a COLMAP
-            model, which was refined with the test views too. file: points of a file.
+        init: kind of initial points. dense: points of depth maps, made from the training images by a plane sweep in
+            some seconds per view. sift: points of matched keypoints. random: random points in the space that at least
+            two images see. scene: the random points that Blender's layout prescribes. model-points: the points of a
+            COLMAP model, which was refined with the test views too. file: the points of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
-        init_points: the number of points of the init random, and the largest number of dense; at least 4. Unless given:
-            of dense one for every 3 pixels whose depth two views agree on, 30 000 to 60 000; of random 30 000.
+        init_points: number of points of the init random, and largest number of dense; at least 4. Unless given: of
+            dense one for every 3 pixels whose depth two views agree on, 30 000 to 60 000; of random 30 000.
         draw: how dense points are chosen. spread: one from each of as many equal cells of the images. uniform: each
             with the same probability.
         training_background: random: another colour in each step, so that a hole in the splat cannot pass for a surface
             of the background's colour. scene: the background of the scene, as in test views.
-        max_gaussians: densification stops at this number; unless given, 10 per step and at least 1.5 times the
-            number of initial points.
+        max_gaussians: largest number of Gaussians, at which densification stops. Unless given: 10 per step, and at
+            least 1.5 times the number of initial points.
         keep_all: keep Gaussians that no training view shows, and harmonics that change no image.
-        max_bytes: bound on the working memory of a render in bytes; it changes results only by rounding.
+        max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding.
         evaluations: how often the PSNR curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
-        backend: numba: compiled, several times faster, only on a CPU. triton: compiled, only on a GPU. auto: the one
-            of these that is installed, else torch.
+        backend: numba: compiled, several times faster than torch, only on a CPU. triton: compiled, only on a GPU. auto:
+            the one of these that is installed, else torch.
         recipe: all other numbers, a `kgs.fit.config.Recipe`.
 
     Raises:
@@ -203,10 +204,12 @@ def _convert(value: Any, hint: Any) -> tuple[Any, str]:
     if get_origin(hint) is not Annotated:
         return value if isinstance(value, hint) else None, "a name" if hint is str else f"a {hint.__name__}"
     kind, limits = get_args(hint)
-    real = float in (kind, *get_args(kind))
-    word, python = ("finite", float) if real else ("whole", int)
-    is_number = isinstance(value, Real if real else Integral) and not isinstance(value, bool)
-    return python(value) if is_number and limits.holds(value) else None, f"a {word} number {limits}"
+    is_real = float in (kind, *get_args(kind))
+    expected = f"a {'finite' if is_real else 'whole'} number {limits}"
+    is_number = isinstance(value, Real if is_real else Integral) and not isinstance(value, bool)
+    if not (is_number and limits.holds(value)):
+        return None, expected
+    return (float(value) if is_real else int(value)), expected
 
 
 # `paper`: the paper's rule and recipe, with its counts scaled. `plain`: the same without dropping.
@@ -240,8 +243,8 @@ class Detail(NamedTuple):
     entries: dict[str, Any]
 
 
-# Fewer steps, a third of them on a quarter of the pixels, and fewer points; the default; and four times the pixels, for
-# half of the steps on a quarter of them. docs/recipe.md has what each gains and costs.
+# low: fewer steps, a third of them on a quarter of the pixels, and fewer points. high: four times the pixels, of which
+# half of the steps use a quarter. docs/recipe.md says what each gains and costs.
 DETAILS = {
     "low": Detail(378, {"steps": 1000, "coarse": 0.3, "init_points": 12_000}),
     "normal": Detail(504, {}),

@@ -172,7 +172,7 @@ def test_what_folders_and_options_show_is_told_before_torch_is_loaded(tmp_path):
         (tmp_path / name).touch()
     before = sorted(tmp_path.rglob("*"))
     imports = "import json\nimport kgs.app.cli\nfrom kgs.datasets import folders\n"
-    code = WITHOUT_TORCH.replace("import kgs.app.cli\nkgs.cli.main()", imports + RUN_ALL)
+    code = WITHOUT_TORCH.replace("import kgs.app.cli\nkgs.app.cli.main()", imports + RUN_ALL)
     words = json.dumps({name: words for name, (words, _) in MISTAKES.items()})
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, input=words, capture_output=True, text=True, timeout=60

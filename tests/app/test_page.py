@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from factories import batch, random_camera, random_gaussians, replace
+from factories import batch, random_camera, random_gaussians
 
 import kgs
-from kgs.app.page import Picture, write_page
+from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
 from kgs.app.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
+from kgs.app.page.write import MOST_BYTES
 
 SIZE = (24, 32)
 GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)
@@ -26,9 +28,18 @@ def views(*values: float) -> dict[str, Any]:
     return {"psnr": sum(values) / len(values), "ssim": 0.5, "lpips_vgg": None, "views": rows}
 
 
-def write(path: Path, **options: Any) -> str:
-    options = {"near_plane": 0.01, "background": torch.zeros(3)} | options
-    write_page(path, "a title", GAUSSIANS, CAMERAS, NAMES, ["training", "training", "test"], **options)
+def content(pictures: list[Picture] | None = None, film: bytes = b"", **words: Any) -> PageContent:
+    """A page of three photos, of which the last one was held out; `words` are entries of its text."""
+    return PageContent(
+        PageSplat(GAUSSIANS, background=torch.zeros(3)),
+        PagePhotos(CAMERAS, NAMES, ["training", "training", "test"], pictures or []),
+        PageText(**{"title": "a title", **words}),
+        film,
+    )
+
+
+def write(path: Path, most_bytes: int = MOST_BYTES, **parts: Any) -> str:
+    write_page(path, content(**parts), most_bytes)
     return path.read_text(encoding="utf-8")
 
 
@@ -62,8 +73,9 @@ def test_a_page_loads_nothing_and_names_no_place_on_a_disk(tmp_path: Path) -> No
 
 
 def test_names_that_are_no_utf8_are_shown_with_escapes(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3)}
-    write_page(tmp_path / "a.html", "\udce9t\udce9", GAUSSIANS, CAMERAS, ["\udcff.jpg", "b", "c"], ["a"] * 3, **options)
+    page = content(title="\udce9t\udce9")
+    page = replace(page, photos=replace(page.photos, names=["\udcff.jpg", "b", "c"]))
+    write_page(tmp_path / "a.html", page)
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>\\udce9t\\udce9</title>" in text
     assert "\\udcff.jpg" in text
@@ -87,21 +99,27 @@ def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
         write(path, most_bytes=10_000)
 
 
+def test_exif_is_spoken_of_where_there_are_photos(tmp_path: Path) -> None:
+    words = "its photos contain no Exif data"
+    assert words not in write(tmp_path / "index.html")
+    assert words in write(tmp_path / "index.html", pictures=[Picture(NAMES[0], torch.rand(3, *SIZE))])
+
+
 def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
     cited = re.findall(r"@software\{kgs,(.*?)\n\}", write(tmp_path / "index.html"), re.DOTALL)
     assert len(cited) == 1
     assert "a title" not in cited[0]
     assert re.findall(r"(\w+) +=", cited[0]) == ["title", "author", "version"]
-    assert cited[0].rstrip().endswith(f"version = {{{kgs.__version__}}}")
+    assert "\n\n" not in cited[0]
+    assert cited[0].endswith(f"version = {{{kgs.__version__}}}")
 
 
 def test_a_stray_gaussian_costs_no_film_and_is_named(tmp_path: Path) -> None:
     means = GAUSSIANS.means.clone()
     means[3, 0] = 1e12
     path = tmp_path / "index.html"
-    film = bytes(20_000)
-    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3), "film": film}
-    words = write_page(path, "a", replace(GAUSSIANS, means=means), CAMERAS, NAMES, ["training"] * 3, **options)
+    page = content(film=bytes(20_000))
+    words = write_page(path, replace(page, splat=replace(page.splat, gaussians=replace(GAUSSIANS, means=means))))
     assert words == "all but 1 stray Gaussian"
     text = path.read_text(encoding="utf-8")
     assert "This page shows all but 1 stray Gaussian" in text
@@ -113,9 +131,8 @@ def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
     names = list("abcdef")
     rows = [{"name": name, "psnr": 20.0 + (name == "b"), "ssim": None, "lpips_vgg": None} for name in names]
     runs = {"": {"train": {"psnr": 20.2, "ssim": None, "lpips_vgg": None, "views": rows}, "test": None}}
-    options: dict[str, Any] = {"near_plane": 0.01, "background": torch.zeros(3), "runs": runs}
     path = tmp_path / "index.html"
-    write_page(path, "a", GAUSSIANS, cameras, names, ["training"] * 6, **options)
+    write_page(path, replace(content(runs=runs), photos=PagePhotos(cameras, names, ["training"] * 6)))
     assert '"first":1,' in path.read_text(encoding="utf-8")
 
 

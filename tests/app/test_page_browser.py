@@ -19,7 +19,7 @@ from factories import batch, random_camera, random_gaussians, with_camera
 import kgs
 from kgs import Gaussians
 from kgs.app.files import film as films
-from kgs.app.page import Picture, write_page
+from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
 from kgs.app.page.fit_page import write_fit_page
 from kgs.app.sfm import pose_photos
 from kgs.datasets import load_scene
@@ -28,6 +28,7 @@ from kgs.fit.config import DEMO
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
+from kgs.types import RasterOptions
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
@@ -80,14 +81,26 @@ def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
     views = [{"name": names[3], "psnr": 20.0, "ssim": 0.5, "ssim_zero_padded": 0.5, "lpips_vgg": 0.25}]
     curve = [{"step": i, "seconds": 1.0 * i, "test_psnr": 20 + i / 9, "train_psnr": 25.0 + i} for i in range(4)]
     metrics = {"test": {**views[0], "views": views}, "train": None, "curve": curve, "seconds": 3.0, "steps": 3}
-    rules: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "pictures": pictures}
     film = path.with_name("film.webm")
     views_of_film = Views(cameras, renders, tuple(names))
     assert films.write_film(film, lambda _: renders[:1], views_of_film, 4.0) == ""
     settings = {"init_file": "/photos/someone/points.ply", "a_setting_with_a_long_name": "x" * 60}
-    shown: dict[str, Any] = {"runs": {"": metrics}, "settings": settings, "film": film.read_bytes()}
-    write_page(path, "A test", gaussians, cameras, names, PARTS, **shown, **rules)
+    write_page(
+        path,
+        PageContent(
+            PageSplat(gaussians, BACKGROUND),
+            PagePhotos(cameras, names, PARTS, pictures),
+            PageText("A test", {"": metrics}, settings=settings),
+            film.read_bytes(),
+        ),
+    )
     return path
+
+
+def bare_page(gaussians: Gaussians, cameras: Any, **options: Any) -> PageContent:
+    """A page of four photos without pictures; `options` are those of the renderer."""
+    splat = PageSplat(gaussians, BACKGROUND, RasterOptions(**options))
+    return PageContent(splat, PagePhotos(cameras, list("abcd"), PARTS), PageText("a"))
 
 
 def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, page: Path) -> None:
@@ -185,8 +198,7 @@ def test_an_antialiased_splat_is_drawn_as_such(browser: Browser, scene: Any, tmp
             kgs.GaussianRenderer(antialiased=antialiased, backend="torch").eval()(small, cameras, BACKGROUND).image
             for antialiased in (False, True)
         )
-    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND, "antialiased": True}
-    write_page(tmp_path / "index.html", "a", small, cameras, list("abcd"), PARTS, **options)
+    write_page(tmp_path / "index.html", bare_page(small, cameras, antialiased=True))
     browser.size(1000, 800)
     browser.open(tmp_path / "index.html", READY)
     for index in range(4):
@@ -203,8 +215,7 @@ def test_strays_change_nothing_of_what_is_shown(browser: Browser, scene: Any, re
     strays.means[:] = torch.tensor([[0.0, 0.0, -1.0]]) * torch.tensor([[1e12], [2e5], [30.0]])
     strays.colors[2, 9, 1] = 1e8
     more = Gaussians(*map(torch.cat, zip(vars(gaussians).values(), vars(strays).values(), strict=True)))
-    options: dict[str, Any] = {"near_plane": 0.01, "background": BACKGROUND}
-    words = write_page(tmp_path / "index.html", "a", more, cameras, list("abcd"), PARTS, **options)
+    words = write_page(tmp_path / "index.html", bare_page(more, cameras))
     assert words == "all but 1 stray Gaussian"
     browser.size(1000, 800)
     browser.open(tmp_path / "index.html", READY)

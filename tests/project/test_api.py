@@ -3,6 +3,7 @@
 import configparser
 import dataclasses
 import importlib
+import importlib.util
 import inspect
 import math
 import subprocess
@@ -60,6 +61,13 @@ PUBLIC = [(module, name) for module, names in INVENTORY.items() for name in name
 @pytest.mark.parametrize("module", INVENTORY)
 def test_inventory(module):
     assert sorted(importlib.import_module(module).__all__) == sorted(INVENTORY[module])
+
+
+@pytest.mark.parametrize("package", ["kgs", "kgs.losses", "kgs.datasets", "kgs.fit"])
+def test_no_public_name_is_that_of_a_module(package):
+    """Whoever imported the module would put it in the place of the name."""
+    names = importlib.import_module(package).__all__
+    assert not [name for name in names if importlib.util.find_spec(f"{package}.{name}")]
 
 
 LAZY = """

@@ -134,6 +134,22 @@ def test_each_folder_of_results_says_what_made_it():
         assert (ROOT / script).is_file()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("folder", "packages"),
+    [("starts", ()), ("training", ("pandas", "distributed")), ("cameras", ("pandas", "distributed", "pycolmap"))],
+)
+def test_the_script_of_a_table_of_results_runs(folder, packages, tmp_path):
+    for package in packages:
+        pytest.importorskip(package)
+    script = ROOT / "docs" / "results" / folder / "measure.py"
+    done = subprocess.run(
+        [sys.executable, script, "--out", tmp_path, "--quick"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / f"{folder}.md").is_file()
+
+
 # -- links -----------------------------------------------------------------------------------------------------------
 
 
@@ -179,6 +195,13 @@ def test_its_links_lead_somewhere(path):
         if not inside or (anchor and anchor not in anchors(target)):
             missing.append(link)
     assert not missing
+
+
+@pytest.mark.parametrize("path", LINKING, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_its_lists_begin_below_an_empty_line(path):
+    """Else the site runs their items together in one paragraph."""
+    text = re.sub(r"^```.*?^```", "", text_of(path), flags=re.M | re.S)
+    assert not re.findall(r"^(?![-*] |\d+\. |[ #|]).+\n(?:[-*]|\d+\.) .*$", text, re.M)
 
 
 def test_links_are_found():

@@ -47,15 +47,16 @@ CLAIMS = {
     ),
     "03_three_views": (
         """
-        assert without.step == with_drop.step == STEPS
-        assert with_drop.state.drop.rate == 0.2 and without.state.drop is None
-        assert without.state.curve[-1]["train_psnr"] > without.state.curve[0]["train_psnr"]
+        assert without.history["steps"] == with_drop.history["steps"] == STEPS
+        assert with_drop.settings.drop == 0.2 and without.settings.drop == 0.0
+        first, *_, last = without.history["curve"]
+        assert last["train_psnr"] > first["train_psnr"]
         """,
         """
-        last = [trainer.state.curve[-1] for trainer in (without, with_drop)]
-        gaps = [point["train_psnr"] - point["test_psnr"] for point in last]
+        ends = [fit.history["curve"][-1] for fit in (without, with_drop)]
+        gaps = [end["train_psnr"] - end["test_psnr"] for end in ends]
         assert gaps[0] > gaps[1] + 0.5 > 2.5
-        assert without.state.curve[-1]["test_psnr"] > 18
+        assert ends[0]["test_psnr"] > 18
         """,
     ),
     "04_error_against_run_time": (
@@ -108,10 +109,10 @@ CLAIMS["07_your_own_photos"] = (
     """
     assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
     assert len(scene.test) == 0 and len(scene.train) == COUNT
-    assert trainer.step == judge.step == STEPS and half.test.names == ("1.png",)
+    assert fit.history["steps"] == judge.history["steps"] == STEPS and half.test.names == ("1.png",)
     """,
     """
-    assert max(errors) < 0.2 and trainer.psnr(scene.train) > 28
+    assert max(errors) < 0.2 and fit.psnr(scene.train) > 28
     assert 15 < judge.psnr(half.test) < judge.psnr(half.train)
     """,
 )

@@ -72,8 +72,9 @@ def fit_cell(cell: Cell) -> dict[str, Any]:
         scene = synthetic_scene(train_views=3, size=SIZE, seed=cell["seed"])
     else:
         scene = load_scene(Path(os.environ["KGS_DATA"]) / "llff" / cell["scene"], train_views=3, downscale=2)
-    _, metrics, result = fit_and_measure(scene, config, choose_points(scene, config))
-    return result | {key: metrics["test"][key] for key in ("psnr", "ssim")} | {"train_psnr": metrics["train"]["psnr"]}
+    _, fit, stored = fit_and_measure(scene, config, choose_points(scene, config))
+    test = fit.metrics["test"]
+    return stored | {"psnr": test["psnr"], "ssim": test["ssim"], "train_psnr": fit.metrics["train"]["psnr"]}
 
 
 def write_knobs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:

@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _open_streams() -> None:
-    """Open the standard streams that are closed: the next file that is opened would be taken for one of them."""
+    """Open the standard streams that are closed: the next file to be opened would become one of them."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
@@ -42,7 +42,7 @@ def _open_streams() -> None:
 
 
 def _flush_streams() -> None:
-    """Write what is left, and where nobody reads it keep Python from complaining at exit."""
+    """Write what is left. If nobody reads a stream, point it at the null device, or Python complains at exit."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

@@ -6,7 +6,7 @@ from .options import Out
 
 
 def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
-    """Measure time and memory of renders and training steps, of torch and numba.
+    """Measure time and memory of renders and training steps with torch and numba.
 
     For example:
       kgs bench speed -o speed
@@ -15,7 +15,7 @@ def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
     Writes speed.csv, speed.json, speed.md and scaling.png in minutes, with --quick in tens of seconds.
 
     Args:
-        out: folder for the results, made if it is not there.
+        out: folder for the results, created if it does not exist.
         quick: fewer Gaussians and repetitions.
         device: where to render: cpu, cuda, cuda:1, ...
     """
@@ -34,7 +34,7 @@ def precision(*, out: Out, quick: bool = False) -> None:
     Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
 
     Args:
-        out: folder for the results, made if it is not there.
+        out: folder for the results, created if it does not exist.
         quick: small images with few Gaussians.
     """
     from kgs.bench.precision import precision
@@ -43,16 +43,16 @@ def precision(*, out: Out, quick: bool = False) -> None:
 
 
 def extremes(*, out: Out) -> int:
-    """Measure errors of stiff and extreme cases, and compare them with their bounds.
+    """Measure errors of stiff and extreme cases, and compare them with bounds.
 
     For example:
       kgs bench extremes -o extremes
       OMP_NUM_THREADS=1 kgs bench extremes -o extremes-1
 
-    Writes extremes.csv, extremes.json and extremes.md in seconds; the exit code is 1 where a bound is missed.
+    Writes extremes.csv, extremes.json and extremes.md in seconds. The exit code is 1 if a bound is exceeded.
 
     Args:
-        out: folder for the results, made if it is not there.
+        out: folder for the results, created if it does not exist.
     """
     from kgs.bench.extremes import extremes
 

@@ -2,17 +2,17 @@
 
 
 def check(*, device: str | None = None) -> int:
-    """Show versions, devices and backends, whether each is right, how fast it is, and which one is taken.
+    """Check this installation: versions, devices, and whether each backend is right and how fast it is.
 
     For example:
       kgs check
       kgs check --device cuda:1
 
-    Run it first, and put what it prints into a report of a fault. It takes 20 seconds, the first time a minute:
-    kernels are compiled, and kept. The exit code is 1 where something is wrong.
+    Run it first, and put what it prints into a bug report. It takes 20 seconds; the first time, when the kernels are
+    compiled, a minute. The exit code is 1 if something is wrong.
 
     Args:
-        device: what to check: cpu, cuda, cuda:1, xpu, ... ; not given: the CPU and all GPUs.
+        device: what to check: cpu, cuda, cuda:1, xpu, ... Unless given: the CPU and all GPUs.
     """
     from kgs.bench.check import check
 

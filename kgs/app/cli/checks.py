@@ -1,7 +1,7 @@
-"""Mistakes in a command's options that can be reported without torch, which takes seconds to load.
+"""Checks of options that need no torch, which takes seconds to load.
 
 The check of a command is beside it: `check_fit` in `fit.py`. `kgs.app.cli.run` calls it with all arguments of the
-command before anything heavy is loaded; the command itself checks what needs more.
+command before anything heavy is loaded; the command itself checks the rest.
 """
 
 import ctypes
@@ -20,13 +20,13 @@ _DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve
 
 
 def check_roll(roll: float) -> None:
-    """A ValueError unless this is an angle by which pictures can be turned."""
+    """Raise a ValueError unless this is an angle by which pictures can be turned."""
     if not -360 <= roll <= 360:
         raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
 def check_installed(device: str, backend: str, *packages: str) -> None:
-    """A ModuleNotFoundError where a package is not installed, a ValueError where a device cannot be used."""
+    """Raise a ModuleNotFoundError if a package is not installed, a ValueError if the device cannot be used."""
     for package in (*_ALWAYS, *packages, *(["numba"] if backend == "numba" else [])):
         if find_spec(package) is None:
             raise ModuleNotFoundError(f"{package} is not installed", name=package)
@@ -35,7 +35,7 @@ def check_installed(device: str, backend: str, *packages: str) -> None:
 
 
 def _why_no_device(kind: str) -> str:
-    """Why torch cannot use a device of this kind, as far as that is sure before it is loaded; "" where it may."""
+    """Why torch cannot use a device of this kind; "" if it may, or if only torch itself can tell."""
     if kind not in _DEVICES and not entry_points(group="torch.backends"):
         return "torch knows cpu, cuda, mps, xpu and others"
     if kind != "cuda":
@@ -68,7 +68,7 @@ def check_scene(scene: Path) -> None:
 
 
 def check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
-    """Check a folder of unposed photos and what is asked of it; reads their headers only where `downscale` is given."""
+    """Check a folder of unposed photos, and the options about them; only `downscale` needs the photos' headers."""
     from kgs.app.sfm.find import find_photos
     from kgs.app.sfm.place import check_place
 

@@ -1,4 +1,4 @@
-"""`kgs demo`: the built-in scene, fitted with DropGaussian, and to compare without it from an equal start."""
+"""`kgs demo`: fits the built-in scene with DropGaussian, and to compare without it from the same initial points."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ def demo(
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
-    """Fit three photos of a built-in room, and measure views that were not used.
+    """Fit three photos of a built-in room, and measure the fit on three held-out views.
 
     For example:
       kgs demo -o demo
@@ -37,10 +37,11 @@ def demo(
             turntable.webm (.mp4 where there is an encoder).
         steps: training steps; all of the demo takes a minute on 2 cores with the default.
         size: height and width of the pictures.
-        compare: a second fit without DropGaussian, from the same initial points. For most seeds the two differ little.
-        seed: the scene, the initial points and both fits derive from it.
+        compare: fit a second time without DropGaussian, from the same initial points. For most seeds the two differ
+            little.
+        seed: of everything random: the scene, the initial points and the fits.
         device: cpu, cuda, ...
-        backend: as of kgs fit.
+        backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.outputs import check_folder
     from kgs.datasets import synthetic_scene
@@ -68,7 +69,7 @@ def demo(
 
 
 def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, float]) -> dict[str, dict[str, Any]]:
-    """Fit a scene once or twice, write its pictures, page, files and the exports; returns what metrics.json holds.
+    """Fit a scene once or twice, and write pictures, page and all other files; returns the content of metrics.json.
 
     `drops` are the rates of dropping by the name of the run; pictures show the last one beside the others.
     """

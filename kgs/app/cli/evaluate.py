@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.app.console import as_line, say, say_next
-from kgs.errors import printable
+from kgs.errors import DataError, printable
 from kgs.fit.config import Backend
 
 from .options import Existing
@@ -14,17 +14,19 @@ from .options import Existing
 def evaluate(
     out: Existing, /, *, lpips_weights: Existing | None = None, device: str = "cpu", backend: Backend = "auto"
 ) -> None:
-    """Measure a fit again and bring its metrics.json and page up to date; what is not measured stays as it is.
+    """Measure a fit again, and update its metrics.json and its page.
+
+    Measures that are not taken again stay as they are.
 
     For example:
       kgs eval fern-3
       kgs eval fern-3 --lpips-weights weights
 
     Args:
-        out: the output folder of `kgs fit`.
-        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is not measured.
+        out: the folder of the results of kgs fit.
+        lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
         device: cpu, cuda, ...
-        backend: auto: that of the fit.
+        backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
     from kgs.app.files.ownership import is_own, record
     from kgs.app.page.fit_page import PAGE, write_own_page
@@ -64,4 +66,6 @@ def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: 
     if lpips_weights is not None:
         weight_files(lpips_weights)
     if not Staging(out).finished.exists():
+        if not (out / "config.json").exists():
+            raise DataError(out / "config.json", "", "cannot be read: expected the folder of the results of kgs fit")
         read_json(out / "config.json")

@@ -16,7 +16,7 @@ from .options import Existing, Out
 
 
 def defaults(words: list[str]) -> dict[str, Any]:
-    """The numbers of a fit that no option gives: those of --preset and --detail."""
+    """The default of `config`, which follows from --preset and --detail."""
     preset = PRESETS.get(_value(words, "--preset"), PRESETS["auto"])
     detail = DETAILS.get(_value(words, "--detail"), DETAILS["normal"])
     return {"config": replace(preset, **detail.entries)}
@@ -47,33 +47,34 @@ def fit(
     lpips_weights: Existing | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
-    """Turn a folder of photos into a splat, with test metrics.
+    """Turn a folder of photos into a splat, a page to look at it, and a film.
 
     For example:
       kgs fit PHOTOS -o OUT
       kgs fit fern -o fern-3 --views 3 --size 504
 
     Args:
-        scene: a folder of 3 or more photos, whose cameras are found first (extra sfm) and written to the output folder
-            (images, sparse/0, photos.json); or one with camera poses: LLFF, COLMAP, Blender or nerfstudio.
-        out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 a film.
-        views: training views, spread over the views that are not held out; all of them unless given.
-        hold_out: every Nth photo is for testing; 0 uses all for training. Unless given: what the scene's files say, or
-            every eighth; of unposed photos none.
-        size: reduce the photos to this many pixels on their longer side; 504 for unposed photos on a CPU.
+        scene: a folder of 3 or more photos, or a scene with camera poses (LLFF, COLMAP, Blender or nerfstudio). The
+            cameras of photos are found first (extra sfm).
+        out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 the film.
+        views: number of training views, spread over those that are not held out. Unless given: all of them.
+        hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the scene's files say, or every
+            eighth photo; of photos without poses none.
+        size: reduce the photos to this many pixels on their longer side. Unless given: 504 for photos without poses on
+            a CPU, else their own size.
         downscale: reduce the photos by this factor instead.
-        background: behind photos with transparency.
-        preset: auto: what the training views need, and no more. paper: DropGaussian's rule and recipe, as published.
-            plain: the same without dropping. See --preset paper --help-all.
-        detail: moves size, steps and initial points together; high: 1000 pixels. Options given by name win. See
-            --detail high --help-all.
-        resume: continue from the checkpoint in the output folder.
-        photos: photos on the page; without them it can be shown where they must not.
+        background: the colour behind photos with transparency.
+        preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
+            without dropping. See --preset paper --help-all.
+        detail: sets size, steps and number of initial points together. low: 378 pixels. high: 1000 pixels. Options that
+            are given by name win. See --detail high --help-all.
+        resume: continue from the checkpoint in the folder of the results.
+        photos: show photos on the page. --no-photos leaves them out: the page can go where the photos must not.
         roll: turn page and film clockwise by this angle in degrees, where photos lie on their side.
-        lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out.
+        lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
         config: every number of the fit.
     """
-    del preset  # `defaults` has read it
+    del preset  # `defaults` reads it
     from kgs.app.files.ownership import is_own
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
@@ -116,8 +117,10 @@ def fit(
     loaded = request.load(base, say)
     height, width = loaded.train.images.shape[-2:]
     if max(height, width) < SMALLEST:
-        shrunk_by = "size" if downscale is None else "downscale"
-        raise ValueError(f"{shrunk_by}: expected at least {SMALLEST} pixels, got photos of {width}x{height}")
+        reason = f"expected at least {SMALLEST} pixels, got photos of {width}x{height}"
+        if downscale is None:  # a size that is too small is refused before
+            raise DataError(scene, "images", reason)
+        raise ValueError(f"downscale: {reason}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, stages=stages)
@@ -130,8 +133,8 @@ def fit(
     renders = out / "renders"
     shrunk = ("--downscale", f"{request.downscale:g}") if request.downscale else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
-    if what := left_out(metrics["needs"]):
-        say(f"left out: {what}")
+    if needless := left_out(metrics["needs"]):
+        say(f"left out: {needless}")
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")
         return 128 + published.signal

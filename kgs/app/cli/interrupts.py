@@ -7,7 +7,7 @@ from types import FrameType
 
 
 def leave_at_once() -> None:
-    """Let Ctrl-C end the process: nothing is begun yet, and an exception could be lost in an import."""
+    """Let Ctrl-C end the process at once: no work is lost yet, and an import could swallow the exception."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         with suppress(ValueError):  # only the main thread may set it
             signal.signal(signal.SIGINT, _leave)

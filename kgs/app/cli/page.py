@@ -33,14 +33,15 @@ def page(
 
     Args:
         ply: a 3DGS PLY file.
-        cameras: the scene (LLFF, COLMAP, Blender or nerfstudio folder) whose cameras and photos to use.
+        cameras: the scene (folder of LLFF, COLMAP, Blender or nerfstudio) whose cameras and photos to use.
         out: the HTML file to write.
-        downscale: shrink the photos by this factor.
-        background: behind the splat, and behind photos with transparency.
-        photos: photos beside their renders; without them the page is small, and can be shown where they must not.
+        downscale: reduce the photos by this factor.
+        background: the colour behind the splat, and behind photos with transparency.
+        photos: show photos beside their renders. --no-photos leaves them out: the page is smaller, and can go where the
+            photos must not.
         roll: turn all pictures clockwise by this angle in degrees, where photos lie on their side.
         device: cpu, cuda, ...
-        backend: as of kgs fit.
+        backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.ownership import claim, record
     from kgs.app.page.fit_page import MOST_PICTURES, spread, write_fit_page
@@ -56,15 +57,15 @@ def page(
         raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, place, backend)
     few = spread(len(scene.train), MOST_PICTURES)
-    seen = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train  # of another offset
-    shown = replace(seen, cameras=scene.train.camera(few))
-    fit = replace(fit, metrics={"views": evaluate(fit.render, shown), "versions": versions()})
+    pictured = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train
+    pictured = replace(pictured, cameras=scene.train.camera(few))  # in the frame of `scene`, whose offset differs
+    fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
     claim(out.parent, "page", [out.name])
     cost = write_fit_page(
         out,
         f"{ply.stem}, {Path(cameras).resolve().name}",
         {"": fit},
-        shown=shown,
+        beside=pictured,
         words=("photo", "test"),
         notes=["Whether the splat was fitted to these photos is not known here."],
         photos=photos,

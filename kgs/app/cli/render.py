@@ -32,12 +32,12 @@ def render(
 
     Args:
         ply: a 3DGS PLY file.
-        cameras: the scene (LLFF, COLMAP, Blender or nerfstudio folder) whose cameras to use.
-        out: folder for the PNGs, named like the scene's photos; not where these are.
-        downscale: shrink the pictures by this factor.
-        background: behind the splat; transparent: PNGs with an alpha channel.
+        cameras: the scene (folder of LLFF, COLMAP, Blender or nerfstudio) whose cameras to use.
+        out: folder for the PNGs, which are named like the scene's photos; not the folder of the photos.
+        downscale: reduce the pictures by this factor.
+        background: the colour behind the splat; transparent: PNGs with an alpha channel.
         device: cpu, cuda, ...
-        backend: as of kgs fit.
+        backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     import torch
 

@@ -8,7 +8,7 @@ import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import fields
-from functools import partial, wraps
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
@@ -57,11 +57,11 @@ def exit_code(words: list[str]) -> int:
     """Run one command; errors and warnings are a line each, on stderr."""
     warnings.showwarning = lambda text, *_: say(f"kgs: {text}", sys.stderr)
     flags: dict[str, str] = {}
-    message, code = "", 2
+    code = 2
     try:
         name, words = _find(words)
         command, defaults = _load(name)
-        flags |= _flags_of(command)
+        flags = _flags_of(command)
         call = _parse(command, f"kgs {name}", words, defaults(words))
         _check(name, call)
         for module in _HEAVY:
@@ -69,7 +69,9 @@ def exit_code(words: list[str]) -> int:
         interrupt_as_usual()
         return int(call() or 0)
     except SystemExit as stop:
-        message, code = (stop.code, 2) if isinstance(stop.code, str) else ("", stop.code or 0)
+        if not isinstance(stop.code, str):
+            return stop.code or 0
+        message = stop.code
     except ModuleNotFoundError as error:
         message = _of_a_missing_package(error)
     except ImportError as error:
@@ -80,26 +82,35 @@ def exit_code(words: list[str]) -> int:
         argument, colon, reason = str(error).partition(":")
         message = printable(flags.get(argument, argument) + colon + reason)
     except TrainingDiverged as error:
-        message, code = printable(f"training diverged: {error}"), 1
+        message = printable(f"training diverged: {error}")
+        code = 1
     except BrokenPipeError:
-        code = 0  # the reader has what it wanted
+        return 0  # the reader has what it wanted
     except OSError as error:
         place = f"{printable(error.filename)}: " if error.filename else ""
-        message, code = f"{place}{error.strerror}", 2 if error.errno in USER_ERRORS else 1
+        message = f"{place}{error.strerror}"
+        code = 2 if error.errno in USER_ERRORS else 1
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not any(cause in str(error) for cause in ("allocate", "of memory")):
+        if not _is_out_of_memory(error):
             raise
-        message, code = f"not enough memory: {error}".partition("\n")[0], 1
+        message = f"not enough memory: {error}".partition("\n")[0]
+        code = 1
     except KeyboardInterrupt as stop:
-        message, code = f"stopped{str(stop) and ': '}{stop}", 130
+        message = f"stopped: {stop}" if str(stop) else "stopped"
+        code = 130
     finally:
         interrupt_as_usual()
-    if message:
-        say(f"kgs: {message}", sys.stderr)
+    say(f"kgs: {message}", sys.stderr)
     return code
 
 
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether memory was too short; torch and CUDA say so in a RuntimeError."""
+    return isinstance(error, MemoryError) or any(cause in str(error) for cause in ("allocate", "of memory"))
+
+
 def _of_a_missing_package(error: ModuleNotFoundError) -> str:
+    """Message for a package that is not installed; it names the extra that brings it."""
     package = (error.name or "").partition(".")[0]
     if package == "kgs":
         raise error
@@ -113,7 +124,7 @@ def _of_a_missing_package(error: ModuleNotFoundError) -> str:
 
 
 def _import(module: str) -> None:
-    """Import a large package. A missing one is reported by the command that needs it; a broken one here, but numba."""
+    """Import a large package. A missing one, or a broken numba, is left to the command that needs it."""
     try:
         import_module(module)
     except ModuleNotFoundError:
@@ -141,7 +152,7 @@ def _of_a_broken_package(error: ImportError) -> str:
 
 
 def _find(words: list[str]) -> tuple[str, list[str]]:
-    """The name of the command that the first words are, and the words after it."""
+    """Split the words of a command line into the name of the command and the rest."""
     if words[:1] == ["--version"]:
         _say_versions()
         raise SystemExit(0)
@@ -164,9 +175,8 @@ def _find(words: list[str]) -> tuple[str, list[str]]:
 def _say_versions() -> None:
     from kgs.machine import versions
 
-    found = versions()
-    found.setdefault("numba", "is not installed: the extra fast brings it")
-    say("\n".join(f"{name} {version}" for name, version in found.items()))
+    lines = {"numba": "is not installed: the extra fast brings it", **versions()}
+    say("\n".join(f"{name} {version}" for name, version in lines.items()))
 
 
 def _say_commands(prefix: str) -> None:
@@ -179,7 +189,7 @@ def _say_commands(prefix: str) -> None:
 
 
 def _load(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], dict[str, Any]]]:
-    """The function of a command, and that of the defaults which follow from its words."""
+    """The function of a command, and the function that derives defaults from its words."""
     module, function = _COMMANDS[name]
     home = import_module(module)
     return getattr(home, function), getattr(home, "defaults", lambda _: {})
@@ -196,20 +206,22 @@ def _check(name: str, call: partial[Any]) -> None:
 
 
 def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
-    """What the command line calls the arguments that errors of the library name."""
-    paths: dict[str, str] = {}
+    """The options of a command by the names of arguments, which errors of the library begin with."""
     parameters = inspect.signature(command).parameters
-    if "config" in parameters:
-        paths |= {entry.name: f"recipe.{entry.name}" for entry in fields(Recipe)}
-        paths |= {f"recipe.{entry.name}": f"recipe.{entry.name}" for entry in fields(Recipe)}
-        paths |= {entry.name: entry.name for entry in fields(FitConfig)}
-    paths |= {name: name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY}
-    paths |= _OTHER_NAMES
+    recipe = [entry.name for entry in fields(Recipe)] if "config" in parameters else []
+    config = [entry.name for entry in fields(FitConfig)] if "config" in parameters else []
+    own = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
+    paths = {
+        **{name: f"recipe.{name}" for name in recipe},
+        **{f"recipe.{name}": f"recipe.{name}" for name in recipe},
+        **{name: name for name in (*config, *own)},  # `steps` is that of the fit
+        **_OTHER_NAMES,
+    }
     return {name: "--" + path.replace("_", "-") for name, path in paths.items()}
 
 
 def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None:
-    """Suggest a folder for the results where the command needs one and got everything but that."""
+    """Refuse a command line that lacks nothing but the folder for the results, and suggest one."""
     out = inspect.signature(command).parameters.get("out")
     is_given = any(word in ("-o", "--out", "-h", "--help", "--help-all") or word.startswith("--out=") for word in words)
     is_needed = out is not None and out.kind is out.KEYWORD_ONLY and out.default is out.empty
@@ -224,30 +236,34 @@ def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: d
     """Read the options; returns the call that they ask for, once its input paths are there."""
     import tyro
 
-    from .options import EXISTS, has_short_help, short
+    from .options import EXISTS, describe, has_short_help, short
 
     _check_out(command, prog, words)
     if "--help-all" in words:
         words = ["--help" if word == "--help-all" else word for word in words]
     elif has_short_help(command) and {"-h", "--help"} & {*words}:
         try:
-            markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
-            tyro.cli(short(command, defaults["config"]), prog=prog, args=["--help"], config=markers)
+            plain = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+            tyro.cli(short(command, defaults["config"]), prog=prog, args=["--help"], config=plain)
         finally:
             say(f"{prog} --help-all shows all options")
 
-    @wraps(command)
+    markers = [tyro.conf.FlagCreatePairsOff]
+    if not has_short_help(command):
+        markers.append(tyro.conf.DisallowNone)  # an option that is not given is None
+
     def bind(*arguments: Any, **options: Any) -> partial[Any]:
         bound = inspect.signature(command).bind(*arguments, **options)
         for name, value in bound.arguments.items():
             hint = command.__annotations__[name]
-            is_input = any(EXISTS in get_args(part) for part in (hint, *get_args(hint)))  # optional ones too
+            path = value if any(EXISTS in get_args(part) for part in (hint, *get_args(hint))) else None  # or optional
             if isinstance(value, FitConfig):
-                is_input, value = True, value.init_file
-            if is_input and value is not None and not value.exists():
-                raise DataError(value, "", f"expected {EXISTS}, found none")
+                path = value.init_file
+            if path is not None and not path.exists():
+                raise DataError(path, "", f"expected {EXISTS}, found none")
         return partial(command, *arguments, **options)
 
+    describe(bind, command)
     function = partial(bind, **defaults) if defaults else bind
-    call: partial[Any] = tyro.cli(function, prog=prog, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    call: partial[Any] = tyro.cli(function, prog=prog, args=words, config=markers)
     return call

@@ -1,4 +1,4 @@
-"""`kgs fit` of unposed photos: their cameras first, and then a scene like any other, in the folder of the results."""
+"""`kgs fit` of unposed photos: finds their cameras, and makes a scene of them in the folder of the results."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def is_unposed(scene: Path) -> bool:
-    """Whether this can only be photos without cameras, or a video of them: no scene, and none right below or above."""
+    """Whether this is a video, or a folder that is no scene and has none right below or above it."""
     if scene.is_file():
         return scene.suffix.lower() in VIDEO_SUFFIXES
     return scene.is_dir() and nearest_scene(scene) is None
@@ -24,16 +24,16 @@ def is_unposed(scene: Path) -> bool:
 def find_scene(
     photos: Path, out: Path, request: "SceneRequest", seed: int, size: int | None = None
 ) -> "tuple[SceneRequest, Path]":
-    """Find the cameras of unposed photos; returns how the scene is to be loaded, and from where.
+    """Find the cameras of unposed photos; returns how to load the scene, and the folder it is in.
 
-    That folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
+    The folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
 
     Args:
         photos: the folder of the photos.
         out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
-        request: what the user asked for; None stands for what was left open. No photo is held out unless it says so.
-            Its `downscale` divides the photos as they came; that of the result the smaller copies that kgs keeps.
-        seed: of what the solvers draw.
+        request: what the user asked for. No photo is held out unless it says so. Its `downscale` divides the photos as
+            they came, that of the result the smaller copies in `images`.
+        seed: of the solvers.
         size: longer side of the photos in the fit, in pixels.
 
     Raises:
@@ -46,33 +46,33 @@ def find_scene(
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
-    kept = max(report["size"])
-    wanted = kept if size is None else size
+    largest = max(report["size"])
+    wanted = largest if size is None else size
     if request.downscale is not None:
         wanted = max(report["photo_size"]) / request.downscale
-    if wanted > kept and max(report["photo_size"]) > kept:
-        say(f"the photos are fitted at {kept} pixels, the size at which kgs keeps them")
+    if wanted > largest and max(report["photo_size"]) > largest:
+        say(f"the photos are fitted at {largest} pixels, the size of kgs's copies of them")
     loaded_as = replace(
         request,
         scene=".",
         hold_out=request.hold_out or 0,
-        downscale=max(1.0, kept / wanted),
+        downscale=max(1.0, largest / wanted),
         title=photos.resolve().name,
     )
     return loaded_as, Path(report["folder"])
 
 
 @contextmanager
-def on_ctrl_c(kept: str) -> Iterator[None]:
-    """Have Ctrl-C say what is left of the work."""
+def on_ctrl_c(remains: str) -> Iterator[None]:
+    """Let Ctrl-C in this block say what remains of the work."""
     try:
         yield
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(kept) from stop
+        raise KeyboardInterrupt(remains) from stop
 
 
 def settle(out: Path) -> None:
-    """Put cameras that waited for a fit in their place, beside its results."""
+    """Move cameras that waited for a fit to their place beside its results."""
     from kgs.app.sfm.place import photo_staging
 
     with locked(out):

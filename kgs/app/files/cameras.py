@@ -13,7 +13,7 @@ from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import common_up
 
 _OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
-_DISTANT = 10.0  # times the median distance from the middle: a sky, which the bounds leave out before
+_DISTANT = 10.0  # times the median distance from the middle: Gaussians beyond are a sky, outside the bounds
 
 
 def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[dict[str, Any]]:
@@ -36,13 +36,7 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
         rotation, bounds (two opposite corners of a box, in world units; beyond each of its sides lies a hundredth of
         the centres that are not in a sky; not without Gaussians), and generator, the version of kgs that wrote it.
     """
-    box = dict[str, Any]()
-    if len(means):
-        places = means.detach().double().cpu().numpy()
-        distances = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-        near = places[distances <= _DISTANT * np.median(distances)]
-        corners = np.quantile(near, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
-        box["bounds"] = (corners + offset.double().cpu().numpy()).tolist()
+    box = {"bounds": _bounds(means, offset)} if len(means) else {}
     entries = list[dict[str, Any]]()
     for part in views:
         height, width = part.images.shape[-2:]
@@ -65,6 +59,16 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
     return entries
 
 
+def _bounds(means: Tensor, offset: Tensor) -> list[list[float]]:
+    """Two opposite corners of a box around the centres `(N, 3)`, N >= 1, without a sky and without strays."""
+    places = means.detach().double().cpu().numpy()
+    distances = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    near = places[distances <= _DISTANT * np.median(distances)]
+    corners = np.quantile(near, [_OUTSIDE, 1 - _OUTSIDE], axis=0) + offset.double().cpu().numpy()
+    bounds: list[list[float]] = corners.tolist()
+    return bounds
+
+
 def rolled(views: Views, degrees: float) -> Views:
     """The views with their pictures turned clockwise, such that photos which lie on their side stand upright.
 
@@ -77,15 +81,20 @@ def rolled(views: Views, degrees: float) -> Views:
     """
     if not degrees or not len(views):
         return views
-    angle, quarters = math.radians(degrees), round(degrees / 90)
+    angle = math.radians(degrees)
+    quarters = round(degrees / 90)
     turn = torch.eye(4, dtype=torch.float64)
     turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     cameras = views.cameras
-    lenses, poses = cameras.intrinsics.clone(), (turn.to(cameras.extrinsics) @ cameras.extrinsics)
+    poses = turn.to(cameras.extrinsics) @ cameras.extrinsics
+    lenses = cameras.intrinsics.clone()
     height, width = views.images.shape[-2:]
     for _ in range(quarters % 4):  # x' = H - 1 - y, y' = x
-        fx, fy, cx, cy = (lenses[:, i, j].clone() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        lenses[:, 0, 0], lenses[:, 1, 1], lenses[:, 0, 2], lenses[:, 1, 2] = fy, fx, height - 1 - cy, cx
+        before = lenses.clone()
+        lenses[:, 0, 0] = before[:, 1, 1]
+        lenses[:, 1, 1] = before[:, 0, 0]
+        lenses[:, 0, 2] = height - 1 - before[:, 1, 2]
+        lenses[:, 1, 2] = before[:, 0, 2]
         height, width = width, height
 
     def turned(image: Tensor) -> Tensor:

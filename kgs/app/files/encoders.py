@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 RATE = 24  # frames per second
 BITS = 0.2  # of H.264 for each pixel: six seconds of 640x426 have 1.0 MB, and go into the page as they are
-MP4, WEBM = ".mp4", ".webm"
+MP4 = ".mp4"
+WEBM = ".webm"
 ASKED = "KGS_H264"  # environment variable: the encoder of FFmpeg to use
 _ENCODERS = ("libopenh264", "h264_videotoolbox", "h264_mf")  # BSD; of macOS; of Windows
 _H264 = 27  # FFmpeg's number of the codec
@@ -26,7 +27,7 @@ Frame = NDArray[Any]  # of uint8
 
 
 def film_suffix() -> tuple[str, str]:
-    """`MP4` or `WEBM`, what films can be here, and a sentence where the user asked for MP4 and it cannot be."""
+    """The format of films here, `MP4` or `WEBM`, and a sentence if the user asked for an MP4 that cannot be written."""
     asked = os.environ.get(ASKED, "")
     try:
         import av
@@ -47,8 +48,11 @@ def h264_encoder() -> str:
         with contextlib.suppress(av.FFmpegError, ValueError, OSError):
             context: Any = av.CodecContext.create(name, "w")
             if context.codec.id == _H264:
-                context.width, context.height, context.pix_fmt = 64, 64, "yuv420p"
-                context.time_base, context.framerate = Fraction(1, RATE), Fraction(RATE)
+                context.width = 64
+                context.height = 64
+                context.pix_fmt = "yuv420p"
+                context.time_base = Fraction(1, RATE)
+                context.framerate = Fraction(RATE)
                 context.open()
                 return name
     return ""
@@ -77,7 +81,7 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate: flo
 
 
 def _write_webm(path: Path, frames: Iterable[Frame], size: tuple[int, int], _: float) -> tuple[int, str]:
-    """Write frames as VP8; how many there were, and why it failed."""
+    """Write frames as VP8; returns their number, and why it failed or ""."""
     count = 0
     with _stderr_discarded():
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP80"), RATE, size)
@@ -91,8 +95,9 @@ def _write_webm(path: Path, frames: Iterable[Frame], size: tuple[int, int], _: f
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate: float) -> tuple[int, str]:
-    """Write frames as H.264; how many there were, and why it failed."""
-    name, count = h264_encoder(), 0
+    """Write frames as H.264; returns their number, and why it failed or ""."""
+    count = 0
+    name = h264_encoder()
     if not name:
         return 0, "there is no encoder of H.264 here"
     import av
@@ -101,7 +106,8 @@ def _write_mp4(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate:
         with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as file:
             stream: Any = file.add_stream(name, rate=RATE, options=dict(_OPTIONS))
             stream.width, stream.height = size
-            stream.pix_fmt, stream.bit_rate = "yuv420p", round(rate or BITS * RATE * size[0] * size[1])
+            stream.pix_fmt = "yuv420p"
+            stream.bit_rate = round(rate or BITS * RATE * size[0] * size[1])
             for frame in frames:
                 picture = av.VideoFrame.from_ndarray(frame, format="bgr24")
                 file.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
@@ -115,11 +121,12 @@ def _write_mp4(path: Path, frames: Iterable[Frame], size: tuple[int, int], rate:
 @contextlib.contextmanager
 def _stderr_discarded() -> Iterator[None]:
     """Discards what native code writes to stderr: OpenCV prints a remark for each WebM file."""
-    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    stderr = os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(null, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)
         os.close(null)

@@ -12,7 +12,8 @@ from kgs.json_files import write_whole
 
 # One colour for each method in all figures and pages: those of Okabe and Ito, which colour-blind people tell apart. The
 # study has more of them (kgs/study/plots.py); pages show black as the colour of their text.
-DEFAULT, WITHOUT = "#CC79A7", "#000000"
+DEFAULT = "#CC79A7"
+WITHOUT = "#000000"
 
 
 def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indices: list[int]) -> None:
@@ -30,7 +31,7 @@ def write_sheet(path: Path, views: Views, columns: dict[str, list[Tensor]], indi
 
 
 def write_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
-    """Plot test and training PSNR against seconds of training; the run "without" has the colour of no dropping."""
+    """Plot test and training PSNR against seconds of training; runs "without ..." have a colour of their own."""
     figure = _figure(6, 4)
     axes = figure.subplots()
     for name, curve in runs.items():

@@ -89,19 +89,24 @@ def path_near_plane(means: Tensor, cameras: PinholeCamera, near_plane: float) ->
 
 
 def film_within(path: Path, most_bytes: int) -> bytes:
-    """The content of a film that was written by `write_film`, encoded again where it has more bytes than these.
+    """The content of a film that `write_film` wrote, encoded again if it has more than `most_bytes`.
 
     H.264 gets fewer bits for a pixel first; then, and VP8 at once, as OpenCV knows no other rate for it, fewer pixels.
     b"" where the film cannot be made so small.
     """
     content = path.read_bytes()
     video = cv2.VideoCapture(str(path))
-    width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    width = video.get(cv2.CAP_PROP_FRAME_WIDTH)
+    height = video.get(cv2.CAP_PROP_FRAME_HEIGHT)
     frames = []
-    while len(content) > most_bytes and (found := video.read())[0]:
-        frames.append(found[1])
+    if len(content) > most_bytes:
+        is_read, frame = video.read()
+        while is_read:
+            frames.append(frame)
+            is_read, frame = video.read()
     suffix = film_suffix()[0] if path.suffix == MP4 else path.suffix
-    share, spare = 1.0, _SPARE if suffix == MP4 else 1
+    share = 1.0
+    spare = _SPARE if suffix == MP4 else 1
     bits = 8 * len(content) * RATE / max(1, len(frames))  # per second
     with tempfile.TemporaryDirectory() as folder:
         smaller = Path(folder) / f"film{suffix}"
@@ -163,7 +168,7 @@ def paced(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
 
 
 def _speeds(places: Array) -> Array:
-    """Speeds in (0, 1] at places `(M, D)` that are as far from each other along a path; 0 at both ends."""
+    """Speeds in [0, 1] at places `(M, D)` at equal distances along a path; 0 at both ends."""
     part = 1 / (len(places) - 1)
     steps = np.diff(places, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True).clip(1e-12)
@@ -204,7 +209,8 @@ def tour(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     order = _round_trip(distances)
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
     times = np.array([distances[a, b] for a, b in zip(order, order[1:] + order[:1], strict=True)]).clip(1e-6)
-    places, rotations = poses[order, :3, 3], poses[order, :3, :3]
+    places = poses[order, :3, 3]
+    rotations = poses[order, :3, :3]
     focus = meeting_point(extrinsics[order])
     if focus is None:
         places, rotations = _interpolated(places, rotations, times, shares)
@@ -222,7 +228,8 @@ def tour(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
 
 def _distances(poses: Tensor) -> Array:
     """Distances between camera-to-world poses, `(V, V)`: those of positions plus those of directions, each up to 1."""
-    centers, forward = poses[:, :3, 3].numpy(), poses[:, :3, 2].numpy()
+    centers = poses[:, :3, 3].numpy()
+    forward = poses[:, :3, 2].numpy()
     moved = np.linalg.norm(centers[:, None] - centers, axis=2)
     turned = np.arccos((forward @ forward.T).clip(-1, 1))
     distances: Array = moved / (moved.max() or 1.0) + turned / np.pi
@@ -247,14 +254,16 @@ def _looking_at(target: Tensor, places: Tensor, down: Tensor) -> Tensor:
 def _extrinsics(places: Tensor, rotations: Tensor) -> Tensor:
     """World-to-camera matrices `(F, 4, 4)` from positions and camera-to-world rotations."""
     poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, places
-    found: Tensor = torch.linalg.inv(poses)
-    return found
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = places
+    extrinsics: Tensor = torch.linalg.inv(poses)
+    return extrinsics
 
 
 def _round_trip(distances: Array) -> list[int]:
     """A short round trip through all points: always to the nearest one next, then improved by reversing sections."""
-    order, left = [0], set(range(1, len(distances)))
+    order = [0]
+    left = set(range(1, len(distances)))
     while left:
         order.append(min(left, key=lambda i: (distances[order[-1], i], i)))
         left.remove(order[-1])
@@ -263,7 +272,8 @@ def _round_trip(distances: Array) -> list[int]:
         improved = False
         for i in range(1, len(order) - 1):
             for j in range(i + 1, len(order)):
-                a, b, c, d = order[i - 1], order[i], order[j], order[(j + 1) % len(order)]
+                a, b = order[i - 1], order[i]
+                c, d = order[j], order[(j + 1) % len(order)]
                 if distances[a, c] + distances[b, d] < distances[a, b] + distances[c, d] - 1e-9:
                     order[i : j + 1] = order[i : j + 1][::-1]
                     improved = True
@@ -306,7 +316,8 @@ def _closed_spline(stops: Array, times: Array, shares: Array) -> Array:
 def _tangents(before: Array, after: Array, step_before: Array, step_after: Array) -> Array:
     """Tangents by Fritsch and Butland: a weighted harmonic mean of both slopes, or 0 where their signs differ."""
     extremum = before * after <= 0
-    before, after = np.where(extremum, 1.0, before), np.where(extremum, 1.0, after)
+    before = np.where(extremum, 1.0, before)
+    after = np.where(extremum, 1.0, after)
     weights = (2 * step_after + step_before) / before + (step_after + 2 * step_before) / after
     tangents: Array = np.where(extremum, 0.0, 3 * (step_before + step_after) / weights)
     return tangents

@@ -69,24 +69,25 @@ def save_glb(
     translation = torch.zeros(3, dtype=torch.float64, device="cpu")
     if offset is not None:
         translation = matrix @ torch.from_numpy(as_vector("offset", offset))
-    node: dict[str, Any] = {
+    content = b""
+    mesh = dict[str, Any]()
+    if len(model):  # glTF has no empty accessors, so a file without Gaussians has no mesh
+        content = b"".join(values.tobytes() for values in attributes.values())
+        mesh = {**_mesh(attributes), "buffers": [{"byteLength": len(content)}]}
+    node = {
         "name": "splat",
         "rotation": quaternion.tolist(),
         "translation": translation.tolist(),
+        **({"mesh": 0} if mesh else {}),
     }
-    document: dict[str, Any] = {
+    document = {
         "asset": {"version": "2.0", "generator": f"kgs {__version__}"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
+        **mesh,
     }
-    content = b""
-    if len(model):  # glTF has no empty accessors, so a file without Gaussians has no mesh
-        node["mesh"] = 0
-        content = b"".join(values.tobytes() for values in attributes.values())
-        document |= _mesh(attributes)
-        document["buffers"] = [{"byteLength": len(content)}]
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)  # the length of a chunk is a multiple of four bytes
     chunks = _chunk(b"JSON", text)
@@ -121,7 +122,8 @@ def _mesh(attributes: dict[str, NDArray[np.float32]]) -> dict[str, Any]:
         )
         start += values.nbytes
     positions = attributes["POSITION"]
-    accessors[indices["POSITION"]] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    box = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    accessors[indices["POSITION"]].update(box)
     return {"meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": buffer_views}
 
 

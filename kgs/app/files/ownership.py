@@ -48,7 +48,7 @@ def read_list(folder: Path) -> dict[str, Entries]:
 
 
 def claim(folder: Path, kind: str, names: Iterable[str]) -> None:
-    """Enter files that are about to be written, so that those which a kill leaves are known as well."""
+    """Enter files that are about to be written, so that what a killed process leaves counts as own."""
     _merge(folder, kind, dict.fromkeys(names))
 
 

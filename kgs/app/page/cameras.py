@@ -53,10 +53,10 @@ def viewer_scene(
     """
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()
-    found = list[dict[str, Any]]()
+    entries = list[dict[str, Any]]()
     for name, part, position, (k, pose, size) in zip(names, parts, positions, lenses(cameras), strict=True):
         depths = visible_points(points, k, pose, size)[:, 2]
-        found.append(
+        entries.append(
             {
                 "name": name,
                 "part": part,
@@ -68,46 +68,46 @@ def viewer_scene(
                 "distance": float(np.median(depths)) if len(depths) else 1.0,
             }
         )
-    depth = float(np.median([camera["distance"] for camera in found]))
-    rotations = np.array([camera["rotation"] for camera in found])
+    depth = float(np.median([camera["distance"] for camera in entries]))
+    rotations = np.array([camera["rotation"] for camera in entries])
     training = are_training(parts)
     middle = _nearest_mean_pose(rotations, positions / depth, training)
     known = psnr or {}
     first = max(middle[: math.ceil(len(middle) / 3)], key=lambda i: known.get(names[i], -math.inf))
+    distance = entries[first]["distance"]
     up = common_up(cameras.extrinsics)
     path = tour(cameras.extrinsics[training], np.arange(_SWAY_POSES) / _SWAY_POSES, depth)
     return {
-        "cameras": found,
+        "cameras": entries,
         "first": first,
         "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
-        "arc": _arc(rotations, positions, first, found[first]["distance"], up.numpy()),
-        "turned": [
-            _turned(cameras.extrinsics, quarters, positions, first, found[first]["distance"]) for quarters in (1, 2, 3)
-        ],
+        "arc": _arc(rotations, positions, first, distance, up.numpy()),
+        "turned": [_turned(cameras.extrinsics, quarters, positions, first, distance) for quarters in (1, 2, 3)],
         "sway": _sway(path.numpy(), positions[first]),
     }
 
 
 def are_training(parts: Sequence[str]) -> list[bool]:
-    """Which photos count as training photos, by what they were used for: all but "test"; all if there are no others."""
+    """Which photos count as training photos, by what they were used for: all but "test", or all if all are "test"."""
     training = [part != "test" for part in parts]
     return training if any(training) else [True] * len(parts)
 
 
 def lenses(cameras: PinholeCamera) -> list[tuple[Array, Array, NDArray[np.intp]]]:
     """Intrinsics, extrinsics (both `(4, 4)`), and width and height of each camera."""
-    k, poses = (x.detach().cpu().double().numpy() for x in (cameras.intrinsics, cameras.extrinsics))
+    k = cameras.intrinsics.detach().cpu().double().numpy()
+    poses = cameras.extrinsics.detach().cpu().double().numpy()
     sizes = np.array([cameras.width.tolist(), cameras.height.tolist()], np.intp).T
     return list(zip(k, poses, sizes, strict=True))
 
 
 def visible_points(points: Array, k: Array, pose: Array, size: NDArray[np.intp], near_plane: float = 0.0) -> Array:
     """Those of the points `(N, 3)` that lie inside the image and beyond the near plane, in the camera's axes."""
-    seen = points @ pose[:3, :3].T + pose[:3, 3]
-    seen = seen[seen[:, 2] > near_plane]
-    pixels = seen[:, :2] / seen[:, 2:] * k.diagonal()[:2] + k[:2, 2]
-    inside: Array = seen[((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)]
+    in_camera = points @ pose[:3, :3].T + pose[:3, 3]
+    in_front = in_camera[in_camera[:, 2] > near_plane]
+    pixels = in_front[:, :2] / in_front[:, 2:] * k.diagonal()[:2] + k[:2, 2]
+    inside: Array = in_front[((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)]
     return inside
 
 

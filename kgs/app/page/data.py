@@ -31,7 +31,8 @@ from kgs.types import SH_SIZES, Gaussians, RasterOptions
 from .cameras import Array, lenses, visible_points
 
 PIXEL_ERROR = 0.01  # largest shift of a Gaussian's centre by rounding, in pixels of the given cameras
-FINE, COARSE = 16, 8  # bits per number
+FINE = 16  # bits per number
+COARSE = 8  # bits per number, where the limit of size asks for it
 _POSITION_BITS = 8, 48  # fewest and most bits of a coordinate
 _STRAY = 1e5  # times the median distance from the middle: no sky is so far away
 _MOST_COEFFICIENT = 1e4  # larger ones are lowered to this one, with which a colour is white or black, too
@@ -114,20 +115,21 @@ def pack(
     values = {name: value[rows] for name, value in values.items()}
     values["colors"] = values["colors"].clip(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)
     degree = SH_SIZES.index(values["colors"].shape[1])
-    packed, reductions = Packed({}, b""), list[str]()
+    packed = Packed({}, b"")
+    reductions = list[str]()
     for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
         if len(packed.content) <= most_bytes:
             return packed._replace(left_out=", ".join(words + reductions), is_reduced=bool(reductions))
     contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
     order = np.argsort(-contributions, kind="stable")
-    kept = len(rows)
+    count = len(rows)
     while len(packed.content) > most_bytes:
-        kept = min(kept - 1, math.floor(_TARGET_SHARE * kept * most_bytes / len(packed.content)))
-        if kept < 1:
+        count = min(count - 1, math.floor(_TARGET_SHARE * count * most_bytes / len(packed.content)))
+        if count < 1:
             raise ValueError(f"most_bytes: expected room for a Gaussian, got {most_bytes} bytes")
-        chosen = {name: value[order[:kept]] for name, value in values.items()}
+        chosen = {name: value[order[:count]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
-    words += [*reductions, f"{kept} of {len(rows)} Gaussians"]
+    words += [*reductions, f"{count} of {len(rows)} Gaussians"]
     return packed._replace(left_out=", ".join(words), is_reduced=True)
 
 
@@ -139,8 +141,8 @@ def _strays(means: Array, cameras: PinholeCamera) -> NDArray[np.bool_]:
     distances = np.linalg.norm(means - middle, axis=1)
     to_cameras = np.linalg.norm(camera_centers(cameras.extrinsics).numpy() - middle, axis=1)
     usual = max(np.median(distances), np.median(to_cameras))
-    found: NDArray[np.bool_] = (distances > _STRAY * usual) & (usual > 0)
-    return found
+    strays: NDArray[np.bool_] = (distances > _STRAY * usual) & (usual > 0)
+    return strays
 
 
 def _with_all_gaussians(
@@ -164,11 +166,11 @@ def _compressed_columns(
     order = _by_place(values["means"])
     ordered = {name: value[order] for name, value in values.items()}
     pixels_per_unit = _pixels_per_unit(ordered["means"], cameras, near_plane)
-    found = list[tuple[Column, bytes]]()
+    compressed = list[tuple[Column, bytes]]()
     for column in _columns(ordered, pixels_per_unit, bits, degree):
         deflate = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
-        found.append((column, deflate.compress(column.planes()) + deflate.flush(zlib.Z_FULL_FLUSH)))
-    return found
+        compressed.append((column, deflate.compress(column.planes()) + deflate.flush(zlib.Z_FULL_FLUSH)))
+    return compressed
 
 
 def _gzip(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
@@ -178,7 +180,8 @@ def _gzip(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
         "degree": degree,
         "columns": [[column.name, column.width, column.low, column.step] for column, _ in columns],
     }
-    checksum, size = 0, 0
+    checksum = 0
+    size = 0
     for column, _ in columns:
         planes = column.planes()
         checksum = zlib.crc32(planes, checksum)
@@ -231,7 +234,8 @@ def _fixed_point(name: str, values: Array, bits: int) -> Column:
 
 def _spread_out(name: str, values: Array, bits: int) -> Column:
     """A column whose integers of `bits` bits cover the range of the values."""
-    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    low = float(values.min()) if len(values) else 0.0
+    high = float(values.max()) if len(values) else 0.0
     step = (high - low) / (2**bits - 1) or 1.0
     integers = np.rint((values - low) / step).astype(np.uint64)
     return Column(name, math.ceil(bits / 8), low, step, integers)

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -13,9 +13,9 @@ MEASURES = {
     "ssim_zero_padded": ("SSIM (zero padded)", 3),
     "lpips_vgg": ("LPIPS", 3),
 }
-# What sets of views are called, by their keys in metrics.json; the first one that was measured is told.
+# Names of the sets of views by their keys in metrics.json; `verdict` speaks of the first one that was measured.
 PARTS = {"test": "held out", "train": "training", "views": "photos"}
-# What a PSNR of at least so many dB looks like.
+# What renders look like whose PSNR is at least this many dB.
 _LEVELS = (
     (32.0, "hard to tell from the photos at a glance"),
     (26.0, "close to the photos, without their finest detail"),
@@ -26,8 +26,12 @@ _LEVELS = (
 # The folders of an absolute path inside a text.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[\\/](?:[^\\/\s]+[\\/])+(?=[^\\/\s])")
 # The plot, in the units of its SVG: its size, and the borders of the area with the lines.
-_WIDTH, _HEIGHT = 640, 260
-_LEFT, _RIGHT, _TOP, _BOTTOM = 48, 620, 12, 230
+_WIDTH = 640
+_HEIGHT = 260
+_LEFT = 48
+_RIGHT = 620
+_TOP = 12
+_BOTTOM = 230
 
 Runs = Mapping[str, Mapping[str, Any]]  # the content of metrics.json by the name of the run; "" if there is only one
 Curve = tuple[str, str, str, list[tuple[float, float]]]  # run, key of the part, label, (seconds, PSNR)
@@ -44,16 +48,16 @@ def without_folders(value: Any) -> str:
 
 def facts(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Numbers, strings and lists of these as text, by their names; nested dicts are flattened, other values ignored."""
-    found = dict[str, str]()
+    rows = dict[str, str]()
     for name, value in values.items():
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):
-            found |= facts(value, f"{title}: ")
+            rows.update(facts(value, f"{title}: "))
         elif isinstance(value, list | tuple) and all(isinstance(each, str | int | float) for each in value):
-            found[title] = ", ".join(map(_as_text, value)) or "none"
+            rows[title] = ", ".join(map(_as_text, value)) or "none"
         elif value is None or isinstance(value, str | int | float):
-            found[title] = _as_text(value)
-    return found
+            rows[title] = _as_text(value)
+    return rows
 
 
 def verdict(runs: Runs) -> str:
@@ -84,7 +88,7 @@ def verdict(runs: Runs) -> str:
 
 
 def _in_words(psnr: float) -> str:
-    """What the numbers of `_LEVELS` stand for."""
+    """What a PSNR looks like, see `_LEVELS`."""
     return next(words for least, words in _LEVELS if psnr >= least)
 
 
@@ -111,8 +115,8 @@ def psnr_plot(runs: Runs) -> dict[str, Any] | None:
                 curves.append((run, part, _with_run(PARTS[part], run), points))
     if not curves:
         return None
-    seconds = _ticks(point[0] for *_, points in curves for point in points)
-    levels = _ticks(point[1] for *_, points in curves for point in points)
+    seconds = _ticks([point[0] for *_, points in curves for point in points])
+    levels = _ticks([point[1] for *_, points in curves for point in points])
 
     def x(value: float) -> float:
         return round(_LEFT + (_RIGHT - _LEFT) * (value - seconds[0]) / (seconds[-1] - seconds[0]), 1)
@@ -153,13 +157,14 @@ def _mean_and_range(values: Mapping[str, Any], key: str, digits: int) -> str:
     return text
 
 
-def _ticks(values: Iterable[float]) -> list[float]:
+def _ticks(values: Sequence[float]) -> list[float]:
     """A few round numbers that enclose all values; a span of less than 0.01 is extended to 0.01."""
-    found: Sequence[float] = list(values)
-    low, span = min(found), max(max(found) - min(found), 0.01)
+    low = min(values)
+    span = max(max(values) - low, 0.01)
     magnitude = 10 ** math.floor(math.log10(span / 4))
     step = next((s * magnitude for s in (5, 2) if s * magnitude <= span / 4), magnitude)
-    first, last = math.floor(low / step), math.ceil((low + span) / step)
+    first = math.floor(low / step)
+    last = math.ceil((low + span) / step)
     return [round(i * step, 10) for i in range(first, last + 1)]
 
 

@@ -23,9 +23,10 @@ from kgs.fit.fit import Fit
 from kgs.fit.prune import contributions, left_out
 from kgs.json_files import read_json
 
-from . import Picture, write_page
+from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
-from .write import MOST_FILM_BYTES
+from .pictures import Picture
+from .write import MOST_FILM_BYTES, write_page
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
@@ -37,7 +38,7 @@ def write_fit_page(
     title: str,
     fits: Mapping[str, Fit],
     *,
-    shown: Views | None = None,
+    beside: Views | None = None,
     words: tuple[str, str] = ("training", "test"),
     notes: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
@@ -52,7 +53,7 @@ def write_fit_page(
         path: the file to write.
         title: of the page.
         fits: of one scene, with metrics, by the name of the run; "" for a single one.
-        shown: the views to show beside their renders; only these need pixels. None: up to `MOST_PICTURES` test views,
+        beside: the views to show beside their renders; only these need pixels. None: up to `MOST_PICTURES` test views,
             or training views if there are no test views.
         words: what training and test views are called.
         notes: sentences to show below the one that says how good the fit is.
@@ -67,36 +68,45 @@ def write_fit_page(
     """
     fit = list(fits.values())[-1]
     scene = fit.scene
-    views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
-    photographed = shown or views.select(spread(len(views), MOST_PICTURES))
-    shown = rolled(photographed, roll)
-    if not photos:
-        shown = shown.select([])
+    training_word, test_word = words
+    if len(scene.test):
+        views = scene.test
+        word = test_word
+    else:
+        views = scene.train
+        word = training_word
+    photographed = beside or views.select(spread(len(views), MOST_PICTURES))
+    pictured = rolled(photographed if photos else photographed.select([]), roll)
     with torch.no_grad():
         gaussians = fit.model()
     runs = {run: one.metrics for run, one in fits.items()}
-    first = next(iter(runs.values()))
-    return write_page(
-        path,
-        title,
-        gaussians,
-        _all_cameras(rolled(scene.train, roll), rolled(scene.test, roll)),
-        [*scene.train.names, *scene.test.names],
-        [words[0]] * len(scene.train) + [words[1]] * len(scene.test),
-        near_plane=fit.options.near_plane,
-        background=_ground(photographed, scene.background),
-        antialiased=fit.options.antialiased,
-        pictures=_pictures(shown, fits),
-        pictures_note=_pictures_note(len(shown), len(views), word),
+    first_run = next(iter(runs.values()))
+    content = PageContent(
+        splat=PageSplat(
+            gaussians,
+            background=_ground(photographed, scene.background),
+            options=fit.options,
+            weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
+        ),
+        photos=PagePhotos(
+            cameras=_all_cameras(rolled(scene.train, roll), rolled(scene.test, roll)),
+            names=[*scene.train.names, *scene.test.names],
+            parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
+            pictures=_pictures(pictured, fits),
+            pictures_note=_pictures_note(len(pictured), len(views), word),
+        ),
+        text=PageText(
+            title,
+            runs=runs,
+            notes=notes,
+            remarks=_remarks(runs),
+            settings=_settings(settings or {}),
+            report=_report_facts(_read_report(report)),
+            left_out=left_out(first_run.get("needs") or {}),
+        ),
         film=b"" if film is None else film_within(film, MOST_FILM_BYTES),
-        runs=runs,
-        left_out=left_out(first.get("needs") or {}),
-        notes=notes,
-        remarks=_remarks(runs),
-        settings=_settings(settings or {}),
-        report=_report_facts(_read_report(report)),
-        weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
     )
+    return write_page(path, content)
 
 
 def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> None:
@@ -145,7 +155,7 @@ def _remarks(runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def _ground(views: Views, background: Tensor) -> Tensor:
     """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border instead of black.
 
-    Photos with transparency show a thing before `background`; it is returned then, and where it was chosen: not black.
+    `background` itself if the photos have transparency, and so show a thing before it, or if it is not black.
     """
     if views.masks is not None or not len(views) or bool(background.any()):
         return background
@@ -165,10 +175,11 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
     return {**config.get("request", {}), **config.get("fit", {}), **rest}
 
 
-def _report_facts(found: Mapping[str, Any]) -> dict[str, Any]:
+def _report_facts(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content of photos.json, without hashes and settings; long lists become a range. Missing parts are skipped."""
-    report = {name: value for name, value in found.items() if name not in ("seed", "settings", "sha256", "versions")}
-    photos, matches = report.pop("photos", None), report.pop("matches", None)
+    report = {name: value for name, value in content.items() if name not in ("seed", "settings", "sha256", "versions")}
+    photos = report.pop("photos", None)
+    matches = report.pop("matches", None)
     with suppress(AttributeError, KeyError, TypeError, ValueError):
         points = [photo["points"] for photo in photos.values()]
         report["points in a photo"] = f"{min(points)} to {max(points)}"
@@ -181,20 +192,20 @@ def _report_facts(found: Mapping[str, Any]) -> dict[str, Any]:
     return report
 
 
-def _pictures_note(shown: int, count: int, word: str) -> str:
+def _pictures_note(pictured: int, count: int, word: str) -> str:
     """Which photos are shown, as "6 of 8 test photos." or "The test photos."."""
     photos = "photos" if word == "photo" else f"{word} photos"
-    return f"{shown} of {count} {photos}." if shown < count else f"The {photos}."
+    return f"{pictured} of {count} {photos}." if pictured < count else f"The {photos}."
 
 
 def _coverage_note(metrics: Mapping[str, Any], run: str) -> list[str]:
     """The PSNR of held-out views where training views cover the scene and elsewhere, as a sentence; [] if unknown."""
-    seen = metrics.get("seen") or {}
-    if seen.get("psnr") is None or seen.get("psnr_rest") is None:
+    covered = metrics.get("seen") or {}
+    if covered.get("psnr") is None or covered.get("psnr_rest") is None:
         return []
     sentence = (
-        f"{100 * seen['share']:.0f} % of the area of the held-out photos is covered by two or more training views: "
-        f"PSNR {seen['psnr']:.2f} dB there, {seen['psnr_rest']:.2f} dB elsewhere."
+        f"{100 * covered['share']:.0f} % of the area of the held-out photos is covered by two or more training views: "
+        f"PSNR {covered['psnr']:.2f} dB there, {covered['psnr_rest']:.2f} dB elsewhere."
     )
     return [f"{run}: {sentence}" if run else sentence]
 

@@ -2,25 +2,25 @@
 
 import base64
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
-from torch import Tensor
 
 from kgs.app.files.film import path_near_plane
 from kgs.camera import MARGIN
 from kgs.json_files import write_whole
-from kgs.types import Gaussians, RasterOptions
+from kgs.types import RasterOptions
 from kgs.version import __version__
 
 from .cameras import are_training, viewer_scene
+from .content import PageContent, PagePhotos, PageSplat, PageText
 from .data import Packed, pack
 from .figures import facts, measure_table, psnr_of_views, psnr_plot, verdict, without_folders
-from .pictures import GAIN, Picture, encoded
+from .pictures import GAIN, encoded
 
 MOST_BYTES = 8_000_000  # of a page
 MOST_FILM_BYTES = 1_100_000  # 1.5 MB of the page, in base64
@@ -39,60 +39,17 @@ _FILES = [
 ]
 
 
-def write_page(
-    path: Path,
-    title: str,
-    gaussians: Gaussians,
-    cameras: PinholeCamera,
-    names: Sequence[str],
-    parts: Sequence[str],
-    *,
-    near_plane: float,
-    background: Tensor,
-    antialiased: bool = False,
-    pictures: Sequence[Picture] = (),
-    pictures_note: str = "",
-    film: bytes = b"",
-    runs: Mapping[str, Mapping[str, Any]] | None = None,
-    left_out: str = "",
-    notes: Sequence[str] = (),
-    remarks: Sequence[str] = (),
-    settings: Mapping[str, Any] | None = None,
-    report: Mapping[str, Any] | None = None,
-    weights: Callable[[], Tensor] | None = None,
-    most_bytes: int = MOST_BYTES,
-) -> str:
+def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -> str:
     """Write a page with a viewer of a splat, photos beside renders, measures and facts. The write is atomic.
 
     The viewer opens at one of the training cameras nearest the mean pose, see `viewer_scene`. File names are shown as
-    they are given; in all other texts absolute paths are shortened to their last part. The splat is packed into the
-    bytes that the rest of the page leaves, see :func:`kgs.app.page.data.pack`.
-
-    Convention:
-        World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
+    they are given. The splat is packed into the bytes that the rest of the page leaves, see
+    :func:`kgs.app.page.data.pack`. The film is left out where it has more than `MOST_FILM_BYTES`, or where anything of
+    the splat would have to be left out for it.
 
     Args:
         path: the file to write.
-        title: of the page.
-        gaussians: with harmonics, or RGB.
-        cameras: the cameras of the photos, C >= 1 of one image size.
-        names: file names of the C photos.
-        parts: what each photo was used for: "training", "test", or another word.
-        near_plane: of the renderer, in world units. Beside the photos' cameras the viewer's is farther away, see
-            :func:`kgs.app.files.film.path_near_plane`.
-        background: colour behind the splat, `(3,)` in [0, 1].
-        antialiased: draw the splat as with `RasterOptions.antialiased`.
-        pictures: photos with renders, `kgs.app.page.Picture`.
-        pictures_note: a sentence that says which photos these are.
-        film: the content of an MP4 or WebM file; b"" for none. It is left out where it has more than `MOST_FILM_BYTES`,
-            or where anything of the splat would have to be left out for it.
-        runs: the content of metrics.json by the name of the run; "" if there is only one run.
-        left_out: what the fit left out, and why.
-        notes: sentences to show below the one that says how good the fit is.
-        remarks: sentences to show below the table of measures.
-        settings: the settings of the fit.
-        report: facts about how the cameras were found.
-        weights: returns the contribution of each Gaussian, `(N,)`. It is called if Gaussians must be left out.
+        content: what the page shows.
         most_bytes: limit for the page.
 
     Returns:
@@ -102,79 +59,136 @@ def write_page(
         ValueError: the page does not fit.
         OSError: the file cannot be written.
     """
-    import jinja2
-    from markupsafe import Markup
-
-    runs = runs or {}
-    scene = viewer_scene(cameras, names, parts, gaussians.means, psnr_of_views(list(runs.values())[-1]) if runs else {})
-    width, height = scene["cameras"][0]["size"]
-    first_run = next(iter(runs.values()), {})
-    measures_head, measures = measure_table(runs)
-    folder = resources.files("kgs.app.page")
-    context: dict[str, Any] = {
-        "title": without_folders(title),
-        "summary": f"{len(gaussians)} Gaussians; {_counts(parts)} photos of {width} × {height} pixels.",
-        "version": __version__,
-        "aspect": f"{width} / {height}",
-        "scene": scene,
-        "verdict": verdict(runs),
-        "notes": [without_folders(note) for note in notes],
-        "remarks": [without_folders(remark) for remark in remarks],
-        "measures_head": measures_head,
-        "measures": measures,
-        "plot": psnr_plot(runs),
-        "pictures": encoded(pictures, _PICTURE_BYTES),
-        "pictures_note": pictures_note,
-        "difference_gain": GAIN,
-        "cameras": _camera_facts(scene["cameras"], parts) | facts(report or {}),
-        "costs": _costs(runs),
-        "left_out": without_folders(left_out),
-        "settings": facts(settings or {}),
-        "versions": facts(first_run.get("versions") or {"kgs": __version__}),
-        "files": {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES},
-    }
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("kgs.app.page", "."), autoescape=True, trim_blocks=True
-    )
-    template = environment.get_template("page.html.jinja")
-    viewer_settings = {
-        "nearPlane": near_plane,
-        "farNearPlane": path_near_plane(gaussians.means, _training_cameras(cameras, parts), near_plane),
-        "lowPass": RasterOptions.eps2d,
-        "antialiased": antialiased,
-        "margin": MARGIN,
-        "background": background.tolist(),
-    }
-
-    def page(splat: Mapping[str, Any], words: Mapping[str, str]) -> bytes:
-        data = json.dumps({"scene": scene, "settings": viewer_settings, **splat}, separators=(",", ":"))
-        html: str = template.render(**context, **words, data=Markup(data.replace("<", "\\u003c")))
-        return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
-
-    def packed_beside(film: str) -> Packed:
-        context["film"] = film
-        room = max(0, most_bytes - len(page({}, {})) - _LAYOUT_BYTES)
-        return pack(gaussians, cameras, room * 3 // 4, weights, near_plane)  # base64 turns 3 bytes into 4
-
-    has_film = 0 < len(film) <= MOST_FILM_BYTES
-    kind = "mp4" if film[4:8] == b"ftyp" else "webm"
-    packed = packed_beside(f"data:video/{kind};base64," + base64.b64encode(film).decode() if has_film else "")
-    if has_film and packed.is_reduced:
-        packed = packed_beside("")
-    content = base64.b64encode(packed.content).decode()
-    splat = {"layout": packed.layout, "content": content}
-    words = {
-        "reduced": packed.left_out,
-        "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
-        "page_size": _megabytes(0),  # as many characters as the true size
-    }
-    words["page_size"] = _megabytes(len(page(splat, words)))
-    write_whole(path, page(splat, words))
+    page = _Page(content)
+    film = _film_uri(content.film)
+    packed = _packed(content, page, film, most_bytes)
+    if film and packed.is_reduced:
+        film = ""
+        packed = _packed(content, page, film, most_bytes)
+    size = len(page.html(film, packed))
+    write_whole(path, page.html(film, packed, size))
     return packed.left_out
 
 
-def _training_cameras(cameras: PinholeCamera, parts: Sequence[str]) -> PinholeCamera:
-    rows = torch.tensor(are_training(parts))
+class _Page:
+    """Makes the HTML of a page, with a film and a splat that vary until the page is small enough."""
+
+    def __init__(self, content: PageContent) -> None:
+        import jinja2
+
+        runs = list(content.text.runs.values())
+        self._scene = viewer_scene(
+            content.photos.cameras,
+            content.photos.names,
+            content.photos.parts,
+            content.splat.gaussians.means,
+            psnr_of_views(runs[-1]) if runs else {},
+        )
+        self._settings = _viewer_settings(content.splat, content.photos)
+        self._context = _context(content, self._scene)
+        loader = jinja2.PackageLoader("kgs.app.page", ".")
+        environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
+        self._template = environment.get_template("page.html.jinja")
+
+    def html(self, film: str, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
+        """The whole file.
+
+        Args:
+            film: data URI of the film; "" for none.
+            packed: the splat; None leaves it out.
+            page_bytes: the size that the page says it has. The text is equally long for all sizes below 10 MB.
+        """
+        from markupsafe import Markup
+
+        splat = {}
+        words = {}
+        if packed is not None:
+            content = base64.b64encode(packed.content).decode()
+            splat = {"layout": packed.layout, "content": content}
+            words = {
+                "reduced": packed.left_out,
+                "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
+                "page_size": _megabytes(page_bytes),
+            }
+        data = {"scene": self._scene, "settings": self._settings, **splat}
+        text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+        html: str = self._template.render(**self._context, **words, film=film, data=Markup(text))
+        return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
+
+
+def _packed(content: PageContent, page: _Page, film: str, most_bytes: int) -> Packed:
+    """The splat, packed into what the film and the rest of the page leave."""
+    room = max(0, most_bytes - len(page.html(film)) - _LAYOUT_BYTES)
+    splat = content.splat
+    return pack(
+        splat.gaussians,
+        content.photos.cameras,
+        room * 3 // 4,  # base64 turns 3 bytes into 4
+        splat.weights,
+        splat.options.near_plane,
+    )
+
+
+def _film_uri(film: bytes) -> str:
+    """The film as a data URI; "" if there is none, or it has more than `MOST_FILM_BYTES`."""
+    if not 0 < len(film) <= MOST_FILM_BYTES:
+        return ""
+    kind = "mp4" if film[4:8] == b"ftyp" else "webm"
+    return f"data:video/{kind};base64,{base64.b64encode(film).decode()}"
+
+
+def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
+    """What the template shows besides film and splat; `scene` is that of :func:`viewer_scene`."""
+    from markupsafe import Markup
+
+    photos = content.photos
+    text = content.text
+    width, height = scene["cameras"][0]["size"]
+    first_run = next(iter(text.runs.values()), {})
+    measures_head, measures = measure_table(text.runs)
+    folder = resources.files("kgs.app.page")
+    return {
+        "title": without_folders(text.title),
+        "summary": (
+            f"{len(content.splat.gaussians)} Gaussians; {_counts(photos.parts)} photos of {width} × {height} pixels."
+        ),
+        "version": __version__,
+        "aspect": f"{width} / {height}",
+        "scene": scene,
+        "verdict": verdict(text.runs),
+        "notes": [without_folders(note) for note in text.notes],
+        "remarks": [without_folders(remark) for remark in text.remarks],
+        "measures_head": measures_head,
+        "measures": measures,
+        "plot": psnr_plot(text.runs),
+        "pictures": encoded(photos.pictures, _PICTURE_BYTES),
+        "pictures_note": photos.pictures_note,
+        "difference_gain": GAIN,
+        "cameras": {**_camera_facts(scene["cameras"], photos.parts), **facts(text.report)},
+        "costs": _costs(text),
+        "left_out": without_folders(text.left_out),
+        "settings": facts(text.settings),
+        "versions": facts(first_run.get("versions") or {"kgs": __version__}),
+        "files": {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES},
+    }
+
+
+def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:
+    """The settings of renderer.js."""
+    near_plane = splat.options.near_plane
+    return {
+        "nearPlane": near_plane,
+        "farNearPlane": path_near_plane(splat.gaussians.means, _training_cameras(photos), near_plane),
+        "lowPass": RasterOptions.eps2d,
+        "antialiased": splat.options.antialiased,
+        "margin": MARGIN,
+        "background": splat.background.tolist(),
+    }
+
+
+def _training_cameras(photos: PagePhotos) -> PinholeCamera:
+    rows = torch.tensor(are_training(photos.parts))
+    cameras = photos.cameras
     values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
     return PinholeCamera(*(value.cpu()[rows] for value in values))
 
@@ -200,20 +214,18 @@ def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) ->
     }
 
 
-def _costs(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Seconds, memory and backend of each run, as text."""
-    found = dict[str, str]()
-    for run, metrics in runs.items():
+def _costs(text: PageText) -> dict[str, str]:
+    """Seconds of training, memory and backend of each run, as text."""
+    costs = dict[str, str]()
+    for run, metrics in text.runs.items():
         prefix = f"{run}: " if run else ""
         if metrics.get("seconds") is not None:
-            found[f"{prefix}training"] = f"{metrics['seconds']:.1f} s for {metrics.get('steps', '?')} steps"
-        for stage, seconds in (metrics.get("stages") or {}).items():
-            found[f"{prefix}{stage}"] = f"{seconds:.1f} s" if isinstance(seconds, int | float) else str(seconds)
+            costs[f"{prefix}training"] = f"{metrics['seconds']:.1f} s for {metrics.get('steps', '?')} steps"
         if metrics.get("peak_rss_mb"):
-            found[f"{prefix}peak memory"] = f"{metrics['peak_rss_mb']} MiB"
+            costs[f"{prefix}peak memory"] = f"{metrics['peak_rss_mb']} MiB"
         if metrics.get("backend"):
-            found[f"{prefix}backend"] = str(metrics["backend"])
-    return found
+            costs[f"{prefix}backend"] = str(metrics["backend"])
+    return costs
 
 
 def _megabytes(count: int) -> str:

@@ -23,10 +23,12 @@ _PROBE = 4 * 2**20  # bytes that are written to see whether a disk is full
 
 
 class Aside:
-    """Runs steps, from any thread, until the block ends; those that are at work then are ended."""
+    """Runs steps, from any thread. The end of the block ends the steps that are still at work."""
 
     def __init__(self) -> None:
-        self._lock, self._at_work, self._is_open = threading.Lock(), set[subprocess.Popen[str]](), True
+        self._lock = threading.Lock()
+        self._at_work = set[subprocess.Popen[str]]()
+        self._is_open = True
 
     def __enter__(self) -> Self:
         return self
@@ -71,7 +73,7 @@ class Aside:
 
 
 def check_space(folder: Path) -> None:
-    """Raise an OSError about a folder that nothing can be written to any more: some MiB are, and removed."""
+    """Raise an OSError if 4 MiB cannot be written to the folder; the file is removed again."""
     probe = folder / "probe"
     try:
         with open(probe, "wb") as file:
@@ -102,7 +104,7 @@ def _failure(code: int, said: str, database: Path) -> Exception:
 def _write_colmap_matches(
     pycolmap: Any, database: str, images: str, names: list[str], lens: str | None, seed: int
 ) -> None:
-    """COLMAP's own keypoints and matches of photos, verified; the rest of their lens stands in their files.
+    """Write COLMAP's own keypoints and verified matches of photos; without `lens`, COLMAP guesses it from their files.
 
     Args:
         pycolmap: the module.
@@ -112,30 +114,37 @@ def _write_colmap_matches(
         lens: the parameters of their SIMPLE_RADIAL lens, where they are known.
         seed: of the verification.
     """
-    reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     if lens is not None:
         reader.camera_params = lens
-    extraction.num_threads, extraction.use_gpu, extraction.max_image_size = 1, False, _LONGEST
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads = 1
+    extraction.use_gpu = False
+    extraction.max_image_size = _LONGEST
     extraction.sift.peak_threshold *= _PEAK_FACTOR
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads, matching.use_gpu = 1, False
-    cpu, one = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
+    matching.num_threads = 1
+    matching.use_gpu = False
     pycolmap.extract_features(
         database,
         images,
         image_names=names,
-        camera_mode=one,
+        camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=reader,
         extraction_options=extraction,
-        device=cpu,
+        device=pycolmap.Device.cpu,
     )
-    rules = {"matching_options": matching, "verification_options": _two_view_options(pycolmap, seed)}
-    pycolmap.match_exhaustive(database, **rules, device=cpu)
+    pycolmap.match_exhaustive(
+        database,
+        matching_options=matching,
+        verification_options=_two_view_options(pycolmap, seed),
+        device=pycolmap.Device.cpu,
+    )
 
 
 def _verify(pycolmap: Any, database: str, seed: int) -> None:
-    """Those matches of each pair that one motion of the camera explains."""
+    """Keep the matches of each pair that one motion of the camera explains."""
     verifier = pycolmap.GeometricVerifierOptions()
     verifier.num_threads = 1
     pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_view_options(pycolmap, seed))
@@ -143,7 +152,8 @@ def _verify(pycolmap: Any, database: str, seed: int) -> None:
 
 def _two_view_options(pycolmap: Any, seed: int) -> Any:
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed, options.detect_watermark = seed, False
+    options.ransac.random_seed = seed
+    options.detect_watermark = False
     return options
 
 

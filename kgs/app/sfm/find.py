@@ -60,7 +60,7 @@ def list_photos(folder: Path) -> list[Path]:
 
 
 def notes_on(folder: Path) -> list[str]:
-    """What is in a folder of photos and not used, one sentence each."""
+    """What a folder of photos holds that is not used, a sentence each."""
     notes = list(folders.unused_files(folder))
     if converted := sorted(_converted(folder)):
         notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed(converted)}")
@@ -68,7 +68,7 @@ def notes_on(folder: Path) -> list[str]:
 
 
 def _converted(folder: Path) -> set[Path]:
-    """The raw and HEIC files beside which the same photo lies in a format that is always read, as cameras save it."""
+    """Raw and HEIC files of photos that are also there, by the same stem, in a format that kgs always reads."""
     stems = {path.stem.lower() for path in list_images(folder)}
     return {path for path in list_images(folder, UNREADABLE_SUFFIXES) if path.stem.lower() in stems}
 

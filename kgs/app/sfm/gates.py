@@ -42,15 +42,16 @@ def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> l
     """
     if cameras is None:
         return ["no pair of photos gave a first guess of the cameras"]
-    found, ratio = [], cameras.focal / longest
+    reasons = []
+    ratio = cameras.focal / longest
     if missing := [name for name in names if name not in cameras.points]:
-        found.append(f"{len(missing)} of {len(names)} photos could not be placed: {', '.join(missing)}")
+        reasons.append(f"{len(missing)} of {len(names)} photos could not be placed: {', '.join(missing)}")
     if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]:
         limits = f"{FOCAL_RANGE[0]:g} to {FOCAL_RANGE[1]:g}"
-        found.append(f"the focal length came out at {ratio:.3g} times the longer side, where lenses have {limits}")
+        reasons.append(f"the focal length came out at {ratio:.3g} times the longer side, where lenses have {limits}")
     if few := [f"{name} ({count})" for name, count in cameras.points.items() if count < FEWEST_POINTS]:
-        found.append(f"fewer than {FEWEST_POINTS} points are seen in {', '.join(few)}")
-    return found
+        reasons.append(f"fewer than {FEWEST_POINTS} points are seen in {', '.join(few)}")
+    return reasons
 
 
 def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str]]:
@@ -66,39 +67,53 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
     return worst
 
 
-def focal_doubt(found: Sequence[Cameras]) -> str:
+def focal_doubt(solutions: Sequence[Cameras]) -> str:
     """Why neither solution determines the focal length; "" if one does."""
-    rise = max(0.0, *(cameras.focal_rise for cameras in found))
+    rise = max(0.0, *(cameras.focal_rise for cameras in solutions))
     if rise >= LEAST_RISE:
         return ""
     return f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {LEAST_RISE:.0%}"
 
 
-def focal_difference(found: Sequence[Cameras]) -> str:
+def focal_difference(solutions: Sequence[Cameras]) -> str:
     """How far the solvers' focal lengths are apart, if that is too far; "" if it is not."""
-    ratio = max(cameras.focal for cameras in found) / min(cameras.focal for cameras in found)
+    focals = [cameras.focal for cameras in solutions]
+    ratio = max(focals) / min(focals)
     if ratio <= MOST_RATIO:
         return ""
     return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}"
 
 
 def judge(
-    folder: Path, found: list[Cameras | None], names: list[str], longest: int, pairs: Pairs, *, forward: bool = False
+    folder: Path,
+    solutions: list[Cameras | None],
+    names: list[str],
+    longest: int,
+    pairs: Pairs,
+    *,
+    forward: bool = False,
 ) -> tuple[Cameras, float]:
     """The cameras that pass the gates, and the solvers' largest difference in degrees; a DataError if none pass.
 
-    If both pass, those whose worst photo sees more points are taken. `forward`: whether the camera moved along its
-    view, which is what a refusal then speaks of.
+    If both pass, those whose worst photo sees more points are taken.
+
+    Args:
+        folder: of the photos, which errors name.
+        solutions: what each solver found, None where it found nothing.
+        names: the names of all photos.
+        longest: the longer side of the photos in pixels.
+        pairs: verified matches of each pair.
+        forward: whether the camera moved along its view, which is what a refusal then speaks of.
     """
-    reasons = [objections(cameras, names, longest) for cameras in found]
-    good = [cameras for cameras, against in zip(found, reasons, strict=True) if cameras and not against]
+    reasons = [objections(cameras, names, longest) for cameras in solutions]
+    good = [cameras for cameras, against in zip(solutions, reasons, strict=True) if cameras and not against]
     if not good:
         raise DataError(folder, "", refusal(reasons[0], names, pairs, forward))
-    for cameras in found:  # nothing confirms a photo that only one solver placed
+    for cameras in solutions:  # nothing confirms a photo that only one solver placed
         if missing := [name for name in names if cameras is None or name not in cameras.points]:
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
             raise DataError(folder, "", refusal([reason], names, pairs, forward))
-    both = [cameras for cameras in found if cameras]
+    both = [cameras for cameras in solutions if cameras]
     if doubt := focal_doubt(both):
         raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
     degrees, pair = disagreement(*both)
@@ -125,12 +140,13 @@ def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
 
 def weakest_link(names: Sequence[str], pairs: Pairs) -> tuple[str, str]:
     """The pair with the fewest matches among those that hold the photos together (a maximum spanning tree)."""
-    group, weakest = {name: {name} for name in names}, (names[0], names[1])
+    group = {name: {name} for name in names}
+    weakest = (names[0], names[1])
     for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
         if group[pair[0]] is not group[pair[1]]:
             weakest = pair
             joined = group[pair[0]] | group[pair[1]]
-            group |= dict.fromkeys(joined, joined)
+            group.update(dict.fromkeys(joined, joined))
     return weakest
 
 
@@ -167,8 +183,8 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         reason = f"no two of the {len(names)} photos show enough of the same things"
         advice = "Take them again with a smaller step between neighbours: two thirds of a photo should be in the next"
     else:
-        shown = "; ".join(f"{i}: {', '.join(group)}" for i, group in enumerate(groups, 1))
-        reason = f"the photos fall into {len(groups)} groups that do not overlap ({shown})"
+        listed = "; ".join(f"{i}: {', '.join(group)}" for i, group in enumerate(groups, 1))
+        reason = f"the photos fall into {len(groups)} groups that do not overlap ({listed})"
         between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
         advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
     return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .aside import check_space
 
 FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
-_MAX_ERROR = 1.5  # pixels between a point and where a photo shows it
+_MAX_ERROR = 1.5  # largest reprojection error, in pixels
 _FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
 _FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one places no pair
 _ROUNDS = 5  # at most, each of placing photos with the lens held and then adjusting it
@@ -60,7 +60,8 @@ def quiet_pycolmap() -> Iterator[Any]:
 
     if main and before is not None:
         signal.signal(signal.SIGTERM, before)
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.FATAL)
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
         yield pycolmap
     finally:
@@ -77,7 +78,7 @@ def verified(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], 
 
 def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], PairGeometry]:
     """What the verified matches of each overlapping pair say about depth, by the names of the pair in `names`."""
-    found = {}
+    geometries = {}
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         images = {image.image_id: names[image.name] for image in file.read_all_images()}
         places = {i: file.read_keypoints(i)[:, :2] for i in images}
@@ -85,12 +86,13 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
         for i, j in combinations(sorted(images), 2):
             rows = _inliers(file, i, j)
             if len(rows) >= FEWEST_MATCHES:
-                first, second = places[i][rows[:, 0]], places[j][rows[:, 1]]
+                first = places[i][rows[:, 0]]
+                second = places[j][rows[:, 1]]
                 _, planar = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
                 shift = float(np.median(np.linalg.norm(first - second, axis=1)))
                 share = 0.0 if planar is None else float(np.mean(planar))
-                found[images[i], images[j]] = PairGeometry(shift, share, _is_forward(first, second, lens))
-    return found
+                geometries[images[i], images[j]] = PairGeometry(shift, share, _is_forward(first, second, lens))
+    return geometries
 
 
 def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: Any) -> bool:
@@ -98,10 +100,10 @@ def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: A
 
     These places are the epipoles, of a matrix that few or wrong matches leave open: hence the second condition.
     """
-    found, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, _MAX_ERROR, 0.999)
-    if found is None or found.shape != (3, 3):
+    fundamental, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, _MAX_ERROR, 0.999)
+    if fundamental is None or fundamental.shape != (3, 3):
         return False
-    epipoles = np.array([np.linalg.svd(matrix)[2][-1] for matrix in (found, found.T)])
+    epipoles = np.array([np.linalg.svd(matrix)[2][-1] for matrix in (fundamental, fundamental.T)])
     with np.errstate(divide="ignore", invalid="ignore"):
         places = epipoles[:, :2] / epipoles[:, 2:]
     if not bool(((places > 0) & (places < (lens.width, lens.height))).all()):
@@ -126,20 +128,24 @@ def solve(
         names: the photos' names by those of the images in the database.
         focal: the focal length in pixels if it is known; None: it is adjusted.
     """
-    best, error = None, 0.0
+    best = None
+    error = 0.0
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         lens = file.read_all_cameras()[0]
         lens.focal_length = focal or lens.focal_length
         for _ in range(_ROUNDS):
             file.update_camera(lens)
-            found = _map(pycolmap, database, images, work, seed, focal is None)
-            if found is None or (best is not None and _is_worse(found, best)):
+            scene = _map(pycolmap, database, images, work, seed, focal is None)
+            if scene is None or (best is not None and _is_worse(scene, best)):
                 break
-            best, error = _adjust(found, focal)
-            before, lens.params = np.array(lens.params), lens_of_scene(best).params
+            best, error = _adjust(scene, focal)
+            before = np.array(lens.params)
+            lens.params = lens_of_scene(best).params
             if abs(lens.params[0] / before[0] - 1) < _CONVERGED and abs(lens.params[3] - before[3]) < _CONVERGED:
                 break
-    return None if best is None else cameras_of(best, names, _focal_rise(best, error) if focal is None else math.inf)
+    if best is None:
+        return None
+    return cameras_of(best, names, _focal_rise(best, error) if focal is None else math.inf)
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
@@ -165,7 +171,9 @@ def _map(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, fre
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.multiple_models, options.min_model_size, options.extract_colors = False, 2, False
+    options.multiple_models = False
+    options.min_model_size = 2
+    options.extract_colors = False
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     options.min_num_matches = 10
@@ -173,30 +181,31 @@ def _map(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, fre
     options.mapper.abs_pose_min_num_inliers = 12
     options.mapper.filter_max_reproj_error = _MAX_ERROR
     options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = _MAX_ERROR
-    options.mapper.init_max_error, options.mapper.abs_pose_max_error = 2.0, 4.0
+    options.mapper.init_max_error = 2.0
+    options.mapper.abs_pose_max_error = 4.0
     options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
     options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES
-    found = _run_mapper(pycolmap, database, images, work, options)
-    if found is None:
+    scene = _run_mapper(pycolmap, database, images, work, options)
+    if scene is None:
         options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES_AGAIN
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = free
-        found = _run_mapper(pycolmap, database, images, work, options)
-    return found
+        scene = _run_mapper(pycolmap, database, images, work, options)
+    return scene
 
 
 def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any) -> Any:
     """The reconstruction that places most photos; None if the mapper finds none."""
     try:
-        found = pycolmap.incremental_mapping(database, images, work, options)
+        scenes = pycolmap.incremental_mapping(database, images, work, options)
     except (RuntimeError, ValueError):  # the mapper gives up
         check_space(database.parent)
         return None
-    return max(found.values(), key=lambda scene: scene.num_reg_images()) if found else None
+    return max(scenes.values(), key=lambda scene: scene.num_reg_images(), default=None)
 
 
-def _is_worse(found: Any, best: Any) -> bool:
+def _is_worse(scene: Any, best: Any) -> bool:
     """Whether a reconstruction has fewer photos than the best one so far, or less than half of its points."""
-    return bool(found.num_reg_images() < best.num_reg_images() or 2 * found.num_points3D() < best.num_points3D())
+    return bool(scene.num_reg_images() < best.num_reg_images() or 2 * scene.num_points3D() < best.num_points3D())
 
 
 def _adjust(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
@@ -223,9 +232,12 @@ def _bundle_adjust(reconstruction: Any, distortion: float | None, focal: float |
     """
     scene = copy.deepcopy(reconstruction)
     with quiet_pycolmap() as pycolmap:
-        options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
-        options.print_summary, options.ceres.solver_options.num_threads = False, 1
-        options.refine_focal_length, options.refine_extra_params = focal is None, distortion is None
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        options.ceres.solver_options.num_threads = 1
+        options.refine_focal_length = focal is None
+        options.refine_extra_params = distortion is None
+        config = pycolmap.BundleAdjustmentConfig()
         lens = lens_of_scene(scene)
         known = lens.params.copy()
         lens.params = [focal or known[0], *known[1:3], known[3] if distortion is None else distortion]

@@ -18,7 +18,8 @@ from kgs.progress import Stage
 from .read import Photo
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size
-FEWEST_KEYPOINTS, MOST_KEYPOINTS = 4096, 8192  # of one photo
+FEWEST_KEYPOINTS = 4096  # of one photo
+MOST_KEYPOINTS = 8192  # of one photo
 ALL_KEYPOINTS = 24_576  # of all photos together, if that leaves each one `FEWEST_KEYPOINTS`
 _CONTRAST = 0.01
 _CHUNK = 512  # keypoints compared at once: bounds the memory
@@ -37,10 +38,12 @@ class PhotoKeypoints(NamedTuple):
 def find_keypoints(photo: Photo, most: int) -> PhotoKeypoints:
     """The strongest SIFT keypoints of a photo, up to `most`; nothing is random."""
     factor = 2 if max(photo.size) < SMALL else 1
-    found = root_sift(photo.grey(), most, factor, contrastThreshold=_CONTRAST)
-    places, sizes, angles = (found.places + 0.5).float(), found.sizes.float(), found.angles.float()
+    keypoints = root_sift(photo.grey(), most, factor, contrastThreshold=_CONTRAST)
+    places = (keypoints.places + 0.5).float()
+    sizes = keypoints.sizes.float()
+    angles = keypoints.angles.float()
     frames = laf_from_center_scale_ori(places[None], sizes[None, :, None, None], angles[None, :, None])
-    return PhotoKeypoints(places, found.descriptors, frames)
+    return PhotoKeypoints(places, keypoints.descriptors, frames)
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], stage: Stage) -> None:
@@ -54,14 +57,14 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], stage: 
     """
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     most = min(MOST_KEYPOINTS, max(FEWEST_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
-    found = [find_keypoints(photo, most) for photo in stage(photos, "keypoints", "photo")]
+    keypoints = [find_keypoints(photo, most) for photo in stage(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
     with _open(database) as file:
         ids = _write_photos(file, photos, names)
-        for image_id, keypoints in zip(ids, found, strict=True):
-            file.write_keypoints(image_id, keypoints.places.numpy())
+        for image_id, of_photo in zip(ids, keypoints, strict=True):
+            file.write_keypoints(image_id, of_photo.places.numpy())
         for i, j in stage(list(combinations(range(len(photos)), 2)), "matches", "pair"):
-            pairs = _match(found[i], found[j], area)
+            pairs = _match(keypoints[i], keypoints[j], area)
             if len(pairs) >= _FEWEST_MATCHES:
                 file.write_matches(ids[i], ids[j], pairs.numpy().astype("uint32"))
 
@@ -70,7 +73,9 @@ def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...])
     """Indices of matching keypoints, `(M, 2)`: mutual nearest neighbours among descriptors that pass AdaLAM."""
     if min(len(first.places), len(second.places)) < _FEWEST_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
-    nearest1, best2, nearest2 = [], torch.full((len(second.places),), -1.0), torch.zeros(len(second.places)).long()
+    nearest1 = []
+    best2 = torch.full((len(second.places),), -1.0)
+    nearest2 = torch.zeros(len(second.places), dtype=torch.int64)
     for start in range(0, len(first.places), _CHUNK):
         products = first.descriptors[start : start + _CHUNK] @ second.descriptors.T
         nearest1.append(products.argmax(1))
@@ -82,9 +87,14 @@ def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...])
     columns = columns[rows]
     if len(rows) < _FEWEST_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
-    (_, descriptors1, frames1), (_, descriptors2, frames2) = first, second
-    arguments = (descriptors1[rows], descriptors2[columns], frames1[:, rows], frames2[:, columns])
-    _, pairs = match_adalam(*arguments, hw1=area, hw2=area)
+    _, pairs = match_adalam(
+        first.descriptors[rows],
+        second.descriptors[columns],
+        first.frames[:, rows],
+        second.frames[:, columns],
+        hw1=area,
+        hw2=area,
+    )
     return torch.stack([rows[pairs[:, 0]], columns[pairs[:, 1]]], dim=1)
 
 
@@ -120,7 +130,8 @@ def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]
     camera.camera_id = file.write_camera(camera)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
-    rig_id, ids = file.write_rig(rig), []
+    rig_id = file.write_rig(rig)
+    ids = []
     for name in names:
         image = pycolmap.Image(name=name, camera_id=camera.camera_id)
         image.image_id = file.write_image(image)

@@ -14,7 +14,9 @@ from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.errors import DataError
 from kgs.json_files import read_json
 
-REPORT, IMAGES, MODEL = CAMERAS_REPORT, "images", "sparse/0"
+REPORT = CAMERAS_REPORT
+IMAGES = "images"
+MODEL = "sparse/0"
 
 
 def photo_staging(out: Path) -> Staging:
@@ -23,8 +25,9 @@ def photo_staging(out: Path) -> Staging:
 
 
 def check_place(out: Path, folder: Path) -> None:
-    """A DataError where the results would lie among the user's photos or in place of files of another program."""
-    advice, photos = "choose another folder", folder.resolve()
+    """Raise a DataError if results would lie among the user's photos, or replace files that kgs did not write."""
+    advice = "choose another folder"
+    photos = folder.resolve()
     staging = photo_staging(out)
     results = [out / IMAGES, out / "sparse"]
     temporary = [staging.unfinished, staging.finished]

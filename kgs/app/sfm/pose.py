@@ -85,7 +85,8 @@ def pose_photos(
         ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
-    folder, out = Path(folder), Path(out)
+    folder = Path(folder)
+    out = Path(out)
     with quiet_pycolmap():  # a missing package is an error before any work
         pass
     paths = find_photos(folder)
@@ -114,8 +115,8 @@ def pose_photos(
                 shutil.rmtree(new, ignore_errors=True)
         if not (wait and (out / "splat.ply").exists()):
             staging.complete()
-        found = waiting if staging.is_waiting else out
-        return read_json(found / REPORT) | {"reused": place is not None, "folder": str(found)}
+        posed = waiting if staging.is_waiting else out
+        return {**read_json(posed / REPORT), "reused": place is not None, "folder": str(posed)}
 
 
 def find_cameras(
@@ -126,18 +127,22 @@ def find_cameras(
     Raises:
         DataError: the photos do not fit together, or their cameras cannot be trusted.
     """
-    seconds, lap = dict[str, float](), _clock()
-    folder, names = opened[0].path.parent, [photo.path.name for photo in opened]
-    work, images = new / "work", new / IMAGES
+    seconds = dict[str, float]()
+    lap = _clock()
+    folder = opened[0].path.parent
+    names = [photo.path.name for photo in opened]
+    work = new / "work"
+    images = new / IMAGES
     for path in (images, work):
         path.mkdir(parents=True)
-    with _one_thread(), _full_disk_told(new):
+    with _one_thread(), report_full_disk(new):
         photos = read_photos(opened, stage)
         unsharp = [photo.path.name for photo in blurred(photos)]
         if unsharp:
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
         png = png_names(names)
-        image_names, photo_names = list(png.values()), {image: name for name, image in png.items()}
+        image_names = list(png.values())
+        photo_names = {image: name for name, image in png.items()}
         write_images(images, photos, image_names)
         bare = images
         if not all(photo.is_opaque for photo in photos):  # COLMAP would find keypoints in what alpha hides
@@ -145,12 +150,19 @@ def find_cameras(
             bare.mkdir()
             write_images(bare, photos, image_names, opaque=True)
         seconds["photos"] = lap()
-        first, second = work / "first.db", work / "second.db"
+        first = work / "first.db"
+        second = work / "second.db"
         with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
-            of_second: dict[str, Any] = {"images": str(bare), "names": image_names, "seed": seed}
             lens = lens_of(photos)
-            of_second["lens"] = lens.params_to_string() if lens.has_prior_focal_length else None
-            second_matches = executor.submit(aside.run, "write_colmap_matches", second, **of_second)
+            second_matches = executor.submit(
+                aside.run,
+                "write_colmap_matches",
+                second,
+                images=str(bare),
+                names=image_names,
+                lens=lens.params_to_string() if lens.has_prior_focal_length else None,
+                seed=seed,
+            )
             write_matches(first, photos, image_names, stage)
             aside.run("verify", first, seed=seed)
             pairs = verified(first, photo_names)
@@ -164,18 +176,18 @@ def find_cameras(
                 return solve(second, images, work / "second", seed, photo_names)
 
             second_cameras = executor.submit(solve_second)
-            found = [solve(first, images, work / "first", seed, photo_names)]
+            solutions = [solve(first, images, work / "first", seed, photo_names)]
             seconds["cameras"] = lap()
-            found.append(second_cameras.result())
-        placed = [cameras for cameras in found if cameras]
+            solutions.append(second_cameras.result())
+        placed = [cameras for cameras in solutions if cameras]
         held = None
         if placed and (focal_doubt(placed) or focal_difference(placed)):
             held = exif_focal(photos)
         if held:
             say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
-            found = [solve(matches, images, work / "held", seed, photo_names, held) for matches in (first, second)]
+            solutions = [solve(matches, images, work / "held", seed, photo_names, held) for matches in (first, second)]
         seconds["second solver"] = lap()
-        chosen, degrees = judge(folder, found, names, max(photos[0].size), pairs, forward=is_forward(geometries))
+        chosen, degrees = judge(folder, solutions, names, max(photos[0].size), pairs, forward=is_forward(geometries))
         level_and_scale(chosen)
         write_model(new / MODEL, chosen, images)
         shutil.rmtree(work)
@@ -198,7 +210,7 @@ def find_cameras(
         "matches": [[*pair, count] for pair, count in pairs.items()],
         "points": chosen.reconstruction.num_points3D(),
         "reprojection_error_px": error,
-        "solver": SOLVERS[found.index(chosen)],
+        "solver": SOLVERS[solutions.index(chosen)],
         "agreement_degrees": degrees,
         "gates": {
             "focal_over_longer_side": list(FOCAL_RANGE),
@@ -209,7 +221,7 @@ def find_cameras(
             "passed": True,
         },
         "seconds": seconds,
-        "versions": versions() | {"pycolmap": version("pycolmap")},
+        "versions": {**versions(), "pycolmap": version("pycolmap")},
     }
 
 
@@ -232,15 +244,17 @@ def _clock() -> Callable[[], float]:
 
     def lap() -> float:
         nonlocal last
-        before, last = last, time.perf_counter()
-        return round(last - before, 2)
+        now = time.perf_counter()
+        seconds = round(now - last, 2)
+        last = now
+        return seconds
 
     return lap
 
 
 @contextmanager
-def _full_disk_told(folder: Path) -> Iterator[None]:
-    """Raise an OSError where pycolmap failed because a disk is full: it does not say so."""
+def report_full_disk(folder: Path) -> Iterator[None]:
+    """Turn a RuntimeError of pycolmap into an OSError if the disk is full, which pycolmap does not say."""
     try:
         yield
     except RuntimeError:
@@ -250,12 +264,13 @@ def _full_disk_told(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """One thread for torch and OpenCV: with several, sums are rounded in another order."""
-    threads, cores = torch.get_num_threads(), cv2.getNumThreads()
+    """Run torch and OpenCV on one thread: their rounding depends on the number of threads."""
+    threads_of_torch = torch.get_num_threads()
+    threads_of_opencv = cv2.getNumThreads()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(cores)
+        torch.set_num_threads(threads_of_torch)
+        cv2.setNumThreads(threads_of_opencv)

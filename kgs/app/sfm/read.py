@@ -124,7 +124,7 @@ class Photo:
 
 
 def open_photos(paths: list[Path]) -> list[OpenPhoto]:
-    """Open photos without decoding them. Their files are not opened again: `read_photos` decodes what is kept here.
+    """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
 
     Raises:
         DataError: a file cannot be read or is not a photo, or two files are the same photo.

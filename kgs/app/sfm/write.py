@@ -31,8 +31,10 @@ def level_and_scale(cameras: Cameras) -> None:
         OpenCV's axes: afterwards y points down and, for the first photo, z forward as far as that is level. The origin
         is the mean of the cameras' centres.
     """
-    scene, names = cameras.reconstruction, list(cameras.rotations)
-    first, up = cameras.rotations[names[0]], -sum(rotation[1] for rotation in cameras.rotations.values())
+    scene = cameras.reconstruction
+    names = list(cameras.rotations)
+    first = cameras.rotations[names[0]]
+    up = -sum(rotation[1] for rotation in cameras.rotations.values())
     turned = _onto(first @ up, np.array([0.0, -1.0, 0.0])) @ first
     depths = np.concatenate([_depths(scene, image) for image in scene.images.values()])
     scale = 1.0 / float(np.median(depths))
@@ -42,11 +44,15 @@ def level_and_scale(cameras: Cameras) -> None:
 
 
 def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
-    """Write cameras, images and points with tracks and colours, as COLMAP's binary files; an OSError unless whole."""
+    """Write cameras, images and points with tracks and colours as COLMAP's binary files.
+
+    Raises:
+        OSError: a file was not written whole; COLMAP itself does not say so.
+    """
     folder.mkdir(parents=True)
     cameras.reconstruction.extract_colors_for_all_images(images)
     cameras.reconstruction.write_binary(folder)
-    try:  # COLMAP does not look whether all was written
+    try:
         read_cameras(folder / "cameras.bin")
         read_points(folder / "points3D.bin", set(read_images(folder / "images.bin")))
     except DataError as error:
