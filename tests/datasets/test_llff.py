@@ -1,4 +1,4 @@
-"""The LLFF loader, on arrays made here from the format's description and on the real scenes."""
+"""The LLFF loader, on arrays made here from the format's description."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from kgs.datasets import Scene, load_scene
+from kgs.datasets import load_scene
 from kgs.errors import DataError
 
 WIDTH, HEIGHT, COUNT, FOCAL = 48, 32, 10, 80.0  # of the file; the images are half that size
@@ -28,13 +28,6 @@ def rows(seed: int = 0) -> np.ndarray:
     return result
 
 
-def pixel_of(row: np.ndarray) -> np.ndarray:
-    """Half-pixel coordinates of `POINT` in the file's image size."""
-    matrix = row[:15].reshape(3, 5)
-    down, right, back = (POINT - matrix[:, 3]) @ matrix[:, :3]
-    return np.array([WIDTH / 2 + FOCAL * right / -back, HEIGHT / 2 + FOCAL * down / -back])
-
-
 def write(root: Path, array: np.ndarray, folder: str = "images_2") -> None:
     root.mkdir(exist_ok=True)
     np.save(root / "poses_bounds.npy", array)
@@ -42,43 +35,6 @@ def write(root: Path, array: np.ndarray, folder: str = "images_2") -> None:
     for i in range(COUNT):
         image = np.full((HEIGHT // 2, WIDTH // 2, 3), i, np.uint8)
         cv2.imwrite(str(root / folder / f"image{i:03d}.png"), image)
-
-
-def project(scene: Scene, index: int) -> np.ndarray:
-    point = torch.from_numpy(POINT) - scene.offset
-    return np.asarray(scene.train.camera(index).project(point.float()[None, None])[0, 0])
-
-
-def test_rows_belong_to_the_sorted_names_and_focal_lengths_to_the_images_read(tmp_path: Path) -> None:
-    write(tmp_path, rows())
-    scene = load_scene(tmp_path)
-    assert scene.test.names == ("image000.png", "image008.png")
-    for k, name in enumerate(scene.train.names):
-        i = int(name[5:8])
-        assert round(float(scene.train.images[k].mean()) * 255) == i
-        np.testing.assert_allclose(project(scene, k), pixel_of(rows()[i]) / 2 - 0.5, atol=1e-4)
-    assert float(scene.train.cameras.fx[0]) == FOCAL / 2
-    assert float(scene.train.cameras.cx[0]) == (WIDTH / 2 - 1) / 2
-    assert float(scene.train.cameras.cy[0]) == (HEIGHT / 2 - 1) / 2
-
-
-@pytest.mark.parametrize("downscale", [None, 2])
-def test_a_dot_is_where_the_camera_sees_its_point(tmp_path: Path, downscale: int | None) -> None:
-    """Image 1's camera is moved sideways until the format puts the point in the middle of one pixel."""
-    array, step = rows(), downscale or 1
-    column, row = 7, 5
-    target = 2 * step * (np.array([column, row]) + 0.5)
-    matrix = array[1, :15].reshape(3, 5)
-    depth = -(POINT - matrix[:, 3]) @ matrix[:, 2]
-    shift = (pixel_of(array[1]) - target) / FOCAL * depth
-    array[1, [3, 8, 13]] += shift[0] * matrix[:, 1] + shift[1] * matrix[:, 0]
-    write(tmp_path, array)
-    image = np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8)
-    image[row * step : (row + 1) * step, column * step : (column + 1) * step] = 255
-    cv2.imwrite(str(tmp_path / "images_2" / "image001.png"), image)
-    scene = load_scene(tmp_path, downscale=downscale)
-    assert torch.nonzero(scene.train.images[0, 0] > 0.99).tolist() == [[row, column]]
-    np.testing.assert_allclose(project(scene, 0), [column, row], atol=1e-4)
 
 
 def test_images_is_preferred_then_the_largest_reduced_ones(tmp_path: Path) -> None:
@@ -153,14 +109,6 @@ def test_depths_are_not_used_whatever_they_are(tmp_path: Path, bounds: tuple[flo
     assert torch.equal(load_scene(tmp_path).train.cameras.extrinsics, before.train.cameras.extrinsics)
 
 
-def test_left_handed_poses_are_refused(tmp_path: Path) -> None:
-    array = rows()
-    array[3, [1, 6, 11]] *= -1
-    write(tmp_path, array)
-    with pytest.raises(DataError, match="right-handed"):
-        load_scene(tmp_path)
-
-
 def header(shape: str, kind: str = "<f8") -> bytes:
     text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
@@ -185,12 +133,6 @@ def test_damaged_files_are_refused_before_memory_is_taken(tmp_path: Path, data: 
     (tmp_path / "poses_bounds.npy").write_bytes(data)
     with pytest.raises(DataError, match="poses_bounds"):
         load_scene(tmp_path)
-
-
-def test_model_points_need_a_model(tmp_path: Path) -> None:
-    write(tmp_path, rows())
-    with pytest.raises(DataError, match="model-points"):
-        load_scene(tmp_path, points="model-points")
 
 
 def test_model_points_need_the_same_poses(tmp_path: Path) -> None:
@@ -220,14 +162,3 @@ def test_model_points_need_the_same_poses(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="poses are not those"):
         load_scene(tmp_path, points="model-points")
     assert load_scene(tmp_path).init_kind == "none"
-
-
-@pytest.mark.parametrize(("name", "tests", "train"), [("fern", 3, (1, 10, 19)), ("flower", 5, (1, 17, 33))])
-def test_real_scenes(kgs_data: Path, name: str, tests: int, train: tuple[int, ...]) -> None:
-    scene = load_scene(kgs_data / "llff" / name, 3, points="model-points")
-    assert scene.train.names == tuple(f"image{i:03d}.png" for i in train)
-    assert len(scene.test) == tests
-    assert scene.train.images.shape == (3, 3, 378, 504)
-    # points of the model project into the training views where its tracks say they should be
-    pixels = scene.train.camera(1).project(scene.points[None])[0]
-    assert ((pixels > 0) & (pixels < torch.tensor([503.0, 377.0]))).all(dim=1).float().mean() > 0.7

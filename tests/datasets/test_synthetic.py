@@ -52,13 +52,13 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
         assert torch.equal(a.cameras.extrinsics, b.cameras.extrinsics)
         assert (a.images - c.images).abs().mean() > 0.05
         assert not torch.equal(a.cameras.extrinsics, c.cameras.extrinsics)
+    cameras = first.train.cameras
+    assert not torch.equal(synthetic_depths(cameras, kind, 1), synthetic_depths(cameras, kind, 0))
 
 
 @pytest.mark.slow
 def test_world_does_not_depend_on_the_number_of_views(scene):
     few = synthetic_scene(train_views=1, test_views=0, size=(84, 112))
-    depth = synthetic_depths(few.train.cameras)
-    torch.testing.assert_close(depth, _shown_depth(few.train), rtol=1e-9, atol=0.0)
     # the one camera and the middle one of three see one and the same world
     warped, seen, error = _photo_error(scene.train, 1, few.train, 0)
     assert seen.double().mean() > 0.5
@@ -72,14 +72,6 @@ def test_train_and_test_cameras_are_disjoint(scene, orbit):
         assert torch.cdist(*centers).min() > 0.01
         assert torch.pdist(torch.cat(centers)).min() > 0.01
         assert not set(both.train.names) & set(both.test.names)
-
-
-def test_forward_test_views_lie_around_the_training_views(scene):
-    train, test = (_centers(views.cameras.extrinsics) for views in (scene.train, scene.test))
-    extent = train.amax(0) - train.amin(0)
-    assert (test[:, :2] > train.amin(0)[:2] - extent[:2]).all()
-    assert (test[:, :2] < train.amax(0)[:2] + extent[:2]).all()
-    assert ((test[:, 0] > train[:, 0].min()) & (test[:, 0] < train[:, 0].max())).sum() >= 3
 
 
 @pytest.mark.parametrize(
@@ -123,15 +115,23 @@ def test_the_sky_shines_and_the_ground_is_shaded():
     assert (under < 0.8 * in_the_open).all()
 
 
-def test_the_work_of_an_orbit_is_bounded(orbit):
-    """Pairs of a triangle and a pixel in its box, of which a picture is made: some per ray."""
+def _pairs_per_ray(made, size, extrinsics):
+    """Pairs of a triangle and a pixel in its box, of which a picture is made."""
+    matrix, rays = _pinhole(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
+    corners = made.triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+    pairs, _, _ = _candidates(corners @ matrix.T, np.ones(len(made.triangles), dtype=bool), rays)
+    return len(pairs) / rays[0] / rays[1]
+
+
+def test_the_work_is_bounded(orbit):
+    ahead = np.eye(4)
+    ahead[:3, 3] = -room.EYE
+    made = room.make_room(0)
+    assert len(made.triangles) < 20_000
+    assert _pairs_per_ray(made, (189, 252), ahead) < 12
     made = garden.make_garden(0)
-    rays = (SMALL[0] * SUPERSAMPLING, SMALL[1] * SUPERSAMPLING)
-    matrix = np.array([[0.9 * rays[1], 0, rays[1] / 2], [0, 0.9 * rays[1], rays[0] / 2], [0, 0, 1.0]])
     for extrinsics in orbit.train.cameras.extrinsics.double().numpy():
-        corners = made.triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-        pairs, _, _ = _candidates(corners @ matrix.T, np.ones(len(made.triangles), dtype=bool), rays)
-        assert len(pairs) < 30 * rays[0] * rays[1]
+        assert _pairs_per_ray(made, SMALL, extrinsics) < 30
 
 
 def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
@@ -276,19 +276,6 @@ def _photo_error(source, i, target, j):
     seen = ((there[0, 0] - points[..., 2]).abs() < 0.05 * points[..., 2]) & (grid.abs() <= 1).all(-1)
     error = (warped - target.images[j : j + 1]).abs().mean(dim=1, keepdim=True)
     return warped, seen[None, None], error
-
-
-def _shown_depth(views):
-    """Depth by scaling the image plane: a camera of three times the pixels has the same centres at every third."""
-    triangles = room.make_room(0).triangles
-    depths = []
-    for k, e in zip(views.cameras.intrinsics.double(), views.cameras.extrinsics.double(), strict=True):
-        fine = k[:3, :3].numpy().copy()
-        fine[:2] *= 3
-        fine[:2, 2] += 1
-        height, width = views.images.shape[-2:]
-        depths.append(raycast(triangles, fine, e.numpy(), (3 * height, 3 * width))[0][1::3, 1::3])
-    return torch.from_numpy(np.stack(depths)[:, None])
 
 
 def _centers(extrinsics):

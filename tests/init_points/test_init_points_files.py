@@ -48,15 +48,6 @@ def test_file_without_colors_is_grey(tmp_path: Path) -> None:
         assert torch.equal(result.colors, torch.full((3, 3), 0.5))
 
 
-@pytest.mark.parametrize("content", [None, b"", b"ply\nformat ascii 1.0\nelement vertex 2\n", b"garbage"])
-def test_broken_file(tmp_path: Path, content: bytes | None) -> None:
-    path = tmp_path / "cloud.ply"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(DataError, match=r"cloud\.ply"):
-        initial_points(flat(), "file", file=path)
-
-
 def test_file_with_a_point_that_is_not_finite(tmp_path: Path) -> None:
     trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
     with pytest.raises(DataError, match="finite"):
