@@ -55,20 +55,27 @@ def write_photo(path: Path, value: int, channels: int = 3) -> None:
     cv2.imwrite(str(path), image)
 
 
-def write_llff(root: Path, cameras: Sequence[Pose]) -> None:
+def llff_rows(cameras: Sequence[Pose]) -> np.ndarray:
     """Columns of a row's matrix: down, right, backward, the centre, (height, width, focal length); two depths behind.
 
-    The file is of photos of twice the size.
+    They are of photos of twice the size.
     """
     array = np.ones((COUNT, 17))
     for row, (rotation, translation) in zip(array, cameras, strict=True):
         right, down, forward = rotation
         size = [2 * HEIGHT, 2 * WIDTH, 2 * CENTRED[0]]
         row[:15] = np.stack([down, right, -forward, -rotation.T @ translation, size], axis=1).ravel()
-    root.mkdir(exist_ok=True)
-    np.save(root / "poses_bounds.npy", array)
+    return array
+
+
+def write_rows(root: Path, array: np.ndarray, folder: str = "images_2") -> None:
     for i in range(COUNT):
-        write_photo(root / "images_2" / f"img{i}.png", i)
+        write_photo(root / folder / f"img{i}.png", i)
+    np.save(root / "poses_bounds.npy", array)
+
+
+def write_llff(root: Path, cameras: Sequence[Pose]) -> None:
+    write_rows(root, llff_rows(cameras))
 
 
 def opengl(pose: Pose) -> list[list[float]]:
