@@ -222,18 +222,6 @@ def test_raycast_closed_mesh_has_no_cracks_and_hides_what_is_behind():
     assert (faces == len(ball)).mean() > 0.4
 
 
-def test_raycast_follows_the_extrinsics():
-    mesh = np.asarray(trimesh.creation.icosphere(subdivisions=2).triangles)
-    pose = trimesh.transformations.euler_matrix(0.4, -0.3, 2.0)
-    pose[:3, 3] = 0.1, 0.2, 3.0
-    intrinsics, size = _pinhole(30, 40)
-    depths, faces = raycast(mesh, intrinsics, pose, size)
-    moved = mesh @ pose[:3, :3].T + pose[:3, 3]
-    expected_depths, expected_faces = raycast(moved, intrinsics, np.eye(4), size)
-    np.testing.assert_array_equal(faces, expected_faces)
-    np.testing.assert_allclose(depths, expected_depths, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [

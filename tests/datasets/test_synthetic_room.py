@@ -31,7 +31,7 @@ def depths(scene):
 
 
 @pytest.mark.slow
-def test_photos_are_filled_and_neither_dark_nor_burnt_out(scene, depths):
+def test_photos_are_neither_dark_nor_burnt_out(scene):
     assert scene.train.images.shape == (3, 3, *SIZE)
     assert scene.test.images.shape == (5, 3, *SIZE)
     for images in (scene.train.images, scene.test.images):
@@ -40,9 +40,6 @@ def test_photos_are_filled_and_neither_dark_nor_burnt_out(scene, depths):
         assert (images == 1.0).float().mean() < 0.05
         assert 0.35 < images.mean() < 0.7
         assert images.std() > 0.15
-    assert (depths > 1.0).all()
-    # the wall is the farthest thing in front of the cameras
-    assert (depths < room.WALL + 0.6).all()
 
 
 def test_test_cameras_lie_between_the_training_cameras_and_outside(scene):

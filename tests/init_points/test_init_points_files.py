@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
-import json
-import subprocess
-import sys
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,43 +47,6 @@ def test_file_with_a_point_that_is_not_finite(tmp_path: Path) -> None:
     trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
     with pytest.raises(DataError, match="finite"):
         initial_points(flat(), "file", file=tmp_path / "cloud.ply")
-
-
-ENDINGS = (".zip", ".ply.gz", ".gz", ".tar.gz", ".ply")
-
-
-@pytest.fixture(scope="module")
-def packed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]]:
-    """Gigabytes in small files, read in one process: the memory it took up to each of them, and what was said."""
-    header = "ply\nformat ascii 1.0\nelement vertex 8000000\n" + "".join(f"property float {x}\n" for x in "xyz")
-    cloud = f"{header}end_header\n".encode() + b"0 0 0\n" * 8_000_000
-    folder, archive = tmp_path_factory.mktemp("packed"), gzip.compress(cloud)
-    for ending in ENDINGS:
-        if ending == ".zip":
-            with zipfile.ZipFile(folder / "cloud.zip", "w", zipfile.ZIP_DEFLATED) as file:
-                file.writestr("cloud.ply", cloud)
-        else:
-            (folder / f"cloud{ending}").write_bytes(archive)
-    code = (
-        "import json, sys, kgs\nfrom kgs.machine import peak_rss_mb\n"
-        "from kgs.init_points.files import read_points\nfrom pathlib import Path\nbefore = peak_rss_mb()\n"
-        "for path in sys.argv[1:]:\n    try:\n        read_points(Path(path))\n"
-        "    except kgs.DataError as error:\n"
-        "        print(json.dumps([path, peak_rss_mb() - before, str(error)]))"
-    )
-    paths = [str(folder / f"cloud{ending}") for ending in ENDINGS]
-    done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, timeout=100, check=True)
-    rows = [json.loads(line) for line in done.stdout.splitlines()]
-    return {path.removeprefix(str(folder / "cloud")): (memory, said) for path, memory, said in rows}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_a_packed_file_is_refused_before_it_is_unpacked(ending: str, packed: dict[str, tuple[int, str]]) -> None:
-    """A few hundred kilobytes can hold gigabytes; whatever the file is called, its memory is bounded."""
-    memory, said = packed[ending]
-    assert memory < 16  # the cloud has 46
-    assert "unpack it first" in said
 
 
 def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
