@@ -30,12 +30,52 @@ def posed_photos(root: Path, count: int = 3) -> None:
     np.save(root / "poses_bounds.npy", np.tile(UPRIGHT, (count, 1)))
 
 
-@pytest.mark.parametrize("folder", [".", "images", "images_4"])
-def test_bare_photos_are_answered_with_what_is_needed(tmp_path: Path, folder: str) -> None:
-    photos(tmp_path / folder)
-    with pytest.raises(DataError, match=r"3 photos but no camera poses.*COLMAP.*ns-process-data") as error:
+PHOTOS = ["0.jpg", "1.jpg", "2.jpg"]
+WITHOUT_POSES = [
+    ([], r"poses_bounds\.npy.*sparse/0.*transforms_train\.json.*transforms\.json"),
+    (["notes.txt", "._IMG_1.HEIC"], r"is not a scene: looked for poses_bounds\.npy"),
+    (["IMG_1.HEIC", "IMG_2.HEIC"], "2 HEIC photos that cannot be read: convert them"),
+    (["a.dng", "b.avif", "c.AVIF"], "3 AVIF and DNG photos"),
+    (["walk.MP4"], "1 MP4 videos: take photos out"),
+    (PHOTOS, "3 photos but no camera poses.*COLMAP.*ns-process-data"),
+]
+# the first of these that is there is read, and these are empty files
+IN_ORDER = [
+    (["poses_bounds.npy", "sparse/0/images.bin", "transforms.json"], r"poses_bounds\.npy"),
+    (["sparse/0/images.bin", "transforms_train.json"], "cameras.bin or cameras.txt"),
+    (["sparse/images.txt", "transforms.json"], "cameras.bin or cameras.txt"),
+    (["transforms_train.json", "transforms.json"], r"transforms_train\.json"),
+    (["transforms.json"], r"transforms\.json"),
+    *[([*PHOTOS, other], f"{other} is not used") for other in ("reconstruction.json", "transform_train.json")],
+]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([f"{folder}/{name}" for name in names], said)
+        for folder in (".", "images", "images_4")
+        for names, said in WITHOUT_POSES
+    ]
+    + IN_ORDER,
+)
+def test_what_is_no_scene_is_named(tmp_path: Path, names: list[str], message: str) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=message) as error:
         load_scene(tmp_path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("nowhere", "there is none"), ("transforms.json", "got a file"), ("walk.mov", "got a video")]
+)
+def test_a_scene_is_a_folder(tmp_path: Path, name: str, message: str) -> None:
+    if name != "nowhere":
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path / name)
 
 
 def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path) -> None:
@@ -54,64 +94,12 @@ def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path
         load_scene(scene / "notes.txt")
 
 
-@pytest.mark.parametrize("folder", [".", "images"])
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        (["IMG_1.HEIC", "IMG_2.HEIC"], "holds 2 HEIC photos that cannot be read: convert them to JPEG or PNG"),
-        (["a.dng", "b.avif", "c.AVIF"], "holds 3 AVIF and DNG photos that cannot be read"),
-        (["walk.MP4"], "holds 1 MP4 videos: take photos out"),
-        (["notes.txt", "._IMG_1.HEIC"], r"is not a scene: looked for poses_bounds\.npy"),
-    ],
-)
-def test_what_is_no_scene_is_named(tmp_path: Path, folder: str, names: list[str], message: str) -> None:
-    (tmp_path / folder).mkdir(exist_ok=True)
-    for name in names:
-        (tmp_path / folder / name).touch()
-    with pytest.raises(DataError, match=message):
-        load_scene(tmp_path)
-
-
-def test_a_video_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "walk.mov").touch()
-    with pytest.raises(DataError, match="got a video: take photos out"):
-        load_scene(tmp_path / "walk.mov")
-
-
 def test_photos_of_several_sizes_are_told_in_their_own_pixels(tmp_path: Path) -> None:
     posed_photos(tmp_path)
     cv2.imwrite(str(tmp_path / "images" / "2.jpg"), np.zeros((8, 12, 3), np.uint8))
     for downscale in (None, 2):
         with pytest.raises(DataError, match=r"2\.jpg: expected 6x4 pixels as the other images, got 12x8"):
             load_scene(tmp_path, downscale=downscale)
-
-
-def test_other_folders_are_answered_with_what_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"poses_bounds\.npy.*sparse/0.*transforms_train\.json.*transforms\.json"):
-        load_scene(tmp_path)
-    with pytest.raises(DataError, match="there is none"):
-        load_scene(tmp_path / "nowhere")
-    (tmp_path / "transforms.json").touch()
-    with pytest.raises(DataError, match="got a file"):
-        load_scene(tmp_path / "transforms.json")
-
-
-@pytest.mark.parametrize(
-    ("files", "reason"),
-    [
-        (["poses_bounds.npy", "sparse/0/images.bin", "transforms.json"], r"poses_bounds\.npy"),
-        (["sparse/0/images.bin", "transforms_train.json"], "cameras.bin or cameras.txt"),
-        (["sparse/images.txt", "transforms.json"], "cameras.bin or cameras.txt"),
-        (["transforms_train.json", "transforms.json"], r"transforms_train\.json"),
-        (["transforms.json"], r"transforms\.json"),
-    ],
-)
-def test_the_layout_is_told_in_a_fixed_order(tmp_path: Path, files: list[str], reason: str) -> None:
-    for name in files:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    with pytest.raises(DataError, match=reason):
-        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -132,14 +120,6 @@ def test_what_is_there_and_not_used_is_named(tmp_path: Path, file: str, part: st
     (note,) = load_scene(tmp_path / "scene").notes
     assert (path.name if "dynamic" not in file and "masks" not in file else "masks") in note
     assert part in note
-
-
-@pytest.mark.parametrize("file", ["reconstruction.json", "transform_train.json"])
-def test_cameras_that_are_not_read_are_named_beside_bare_photos(tmp_path: Path, file: str) -> None:
-    photos(tmp_path)
-    (tmp_path / file).write_bytes(b"{}")
-    with pytest.raises(DataError, match=f"no camera poses.*{file} is not used"):
-        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize(

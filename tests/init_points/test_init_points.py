@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -169,14 +170,18 @@ def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixt
     ]
 
 
-def test_wrong_arguments() -> None:
-    views = flat()
-    with pytest.raises(ValueError, match="^kind:"):
-        initial_points(views, "stereo")
-    with pytest.raises(ValueError, match="^count:"):
-        initial_points(views, "random", count=0)
-    with pytest.raises(ValueError, match="^file:"):
-        initial_points(views, "file")
+@pytest.mark.parametrize(
+    ("name", "kind", "arguments"),
+    [
+        ("kind", "stereo", {}),
+        ("count", "random", {"count": 0}),
+        ("file", "file", {}),
+        ("draw", "dense", {"draw": "even"}),
+    ],
+)
+def test_wrong_arguments(name: str, kind: str, arguments: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"^{name}:"):
+        initial_points(flat(), kind, **arguments)
 
 
 def test_typical_depths_are_the_first_percentile_and_the_median() -> None:

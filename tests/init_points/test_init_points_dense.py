@@ -238,11 +238,6 @@ def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float,
     assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
 
 
-def test_another_draw_is_refused(views: Views) -> None:
-    with pytest.raises(ValueError, match="^draw:"):
-        initial_points(views, draw="even")
-
-
 @pytest.fixture(scope="module")
 def before_a_sky() -> tuple[Views, tuple[float, float]]:
     """Views with a sky, and the range of depths of what stands near."""
