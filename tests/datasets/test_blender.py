@@ -124,21 +124,26 @@ def test_the_last_row_of_an_inverse_is_that_of_a_pose(tmp_path: Path) -> None:
     assert torch.equal(load_scene(tmp_path).train.cameras.extrinsics, exact)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"frames": []}', '{"frames": [3]}', '{"camera_angle_x": NaN}', "[" * 100_000, "\xff"]
-)
+OVERFLOW = '{"camera_angle_x": 1e400}'
+TEXTS = [
+    "",
+    "{",
+    "[]",
+    "{}",
+    '{"frames": []}',
+    '{"frames": [3]}',
+    '{"camera_angle_x": NaN}',
+    "[" * 100_000,
+    "\xff",
+    OVERFLOW,
+]
+
+
+@pytest.mark.parametrize("text", TEXTS)
 def test_files_that_are_no_transforms(tmp_path: Path, text: str) -> None:
     write(tmp_path)
     (tmp_path / "transforms_train.json").write_text(text, encoding="latin-1")
-    with pytest.raises(DataError, match="transforms_train"):
-        load_scene(tmp_path)
-
-
-def test_an_infinity_by_overflow_is_noticed(tmp_path: Path) -> None:
-    write(tmp_path)
-    path = tmp_path / "transforms_train.json"
-    path.write_text(path.read_text().replace(f'"camera_angle_x": {ANGLE}', '"camera_angle_x": 1e400'))
-    with pytest.raises(DataError, match="transforms_train.*1e400"):
+    with pytest.raises(DataError, match="transforms_train.*1e400" if text == OVERFLOW else "transforms_train"):
         load_scene(tmp_path)
 
 
