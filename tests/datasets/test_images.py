@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -110,15 +111,23 @@ def rays(pinhole: Intrinsics) -> np.ndarray:
     return np.asarray(pixels @ np.linalg.inv(pinhole.matrix()).T)
 
 
-@pytest.mark.parametrize("k1", [-0.2, 0.0, 0.1, 0.3])
-def test_no_pixel_of_an_undistorted_image_is_blank_or_smeared(k1: float) -> None:
+@pytest.mark.parametrize(
+    ("k1", "fisheye"), [(-0.2, False), (0.0, False), (0.1, False), (0.3, False), (0.1, True), (0.6, True)]
+)
+def test_no_pixel_of_an_undistorted_image_is_blank_or_smeared(k1: float, fisheye: bool) -> None:
     """Every pixel of the result looks at a place inside the photo; barrel lenses keep their focal length."""
-    _, pinhole = undistort(blob(60.0, 45.0), lens(k1, 0.0, 0.0, 0.0))
+    given = replace(lens(k1, 0.0, 0.0, 0.0), fisheye=fisheye)
+    _, pinhole = undistort(blob(60.0, 45.0), given)
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     distortion = np.array([k1, 0.0, 0.0, 0.0])
-    pixels = cv2.projectPoints(rays(pinhole), np.zeros(3), np.zeros(3), lens().matrix(), distortion)[0][:, 0]
-    assert (pixels >= -1e-3).all()
-    assert (pixels <= np.array([WIDTH - 1, HEIGHT - 1]) + 1e-3).all()
-    assert pinhole.fx == 100.0 if k1 <= 0 else 100.0 < pinhole.fx < 150.0
+    pixels = project(rays(pinhole)[:, None], np.zeros(3), np.zeros(3), lens().matrix(), distortion)[0][:, 0]
+    room = np.minimum(pixels, np.array([WIDTH - 1, HEIGHT - 1]) - pixels).min()
+    assert room >= -1e-3
+    if k1 > (1 / 3 if fisheye else 0):  # the photo covers the result, and no more than that
+        assert 100.0 < pinhole.fx < 150.0
+        assert room < 1e-3
+    else:
+        assert pinhole.fx == 100.0
     assert pinhole.fy / pinhole.fx == pytest.approx(0.98)
 
 
