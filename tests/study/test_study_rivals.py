@@ -112,6 +112,12 @@ def test_each_cameras_row_has_its_own_selection():
     assert (out == 0).tolist() == [[False, False, False, True], [True, False, False, False]]
 
 
+@pytest.mark.parametrize(("rate", "count"), [(0.0, 0), (0.004, 0), (0.2, 20), (0.999, 100)])
+def test_the_number_is_the_rounded_share(rate, count):
+    out = layer(rate, torch.randperm(100, generator=torch.Generator().manual_seed(0)).float())(torch.ones(100))
+    assert int((out == 0).sum()) == count
+
+
 def test_equal_scores_go_in_order_and_nothing_is_random():
     drop = layer(0.5, torch.zeros(6))
     for _ in range(3):
