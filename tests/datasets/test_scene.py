@@ -100,15 +100,15 @@ def test_cameras_by_any_kind_of_integers(index, rows):
     assert chosen.batch_size == len(rows)
 
 
-@pytest.mark.parametrize(
-    ("index", "error"),
-    [
-        *[(kind, TypeError) for kind in (0.0, np.float32(1), [0.5], True, torch.tensor([True, False]))],
-        *[(absent, IndexError) for absent in (2, -3, [0, 5])],
-    ],
-)
-def test_cameras_by_other_things(index, error):
-    with pytest.raises(error, match="index: expected integers" if error is TypeError else ""):
+@pytest.mark.parametrize("index", [0.0, np.float32(1), [0.5], True, torch.tensor([True, False])])
+def test_cameras_by_other_things(index):
+    with pytest.raises(TypeError, match="index: expected integers"):
+        views(6, 8).camera(index)
+
+
+@pytest.mark.parametrize("index", [2, -3, [0, 5]])
+def test_cameras_that_are_not_there(index):
+    with pytest.raises(IndexError):
         views(6, 8).camera(index)
 
 

@@ -1,10 +1,10 @@
 """The synthetic scene against closed forms, against itself across views, and as OpenCV's SIFT sees it."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
+from epipolar import sampson_distances
 from init_point_scenes import garden_from_above
 from kornia.geometry.depth import warp_frame_depth
 
@@ -159,22 +159,10 @@ def test_views_agree_on_the_colour_of_the_surfaces_they_both_see(scene, source, 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_sift_matches_neighbouring_views_along_the_epipolar_lines(seed):
     train, _ = garden_from_above((189, 252), seed)
-    sift = cv2.SIFT_create()
-    gray = [cv2.cvtColor(_to_bytes(image), cv2.COLOR_RGB2GRAY) for image in train.images]
-    features = [sift.detectAndCompute(image, None) for image in gray]
-    inverse = np.linalg.inv(train.cameras.intrinsics[0, :3, :3].double().numpy())
-    extrinsics = train.cameras.extrinsics.double().numpy()
     for i in range(2):
-        pairs = cv2.BFMatcher().knnMatch(features[i][1], features[i + 1][1], k=2)
-        good = [best for best, second in pairs if best.distance < 0.75 * second.distance]
-        a = cv2.convertPointsToHomogeneous(np.array([features[i][0][m.queryIdx].pt for m in good]))[:, 0]
-        b = cv2.convertPointsToHomogeneous(np.array([features[i + 1][0][m.trainIdx].pt for m in good]))[:, 0]
-        motion = extrinsics[i + 1] @ np.linalg.inv(extrinsics[i])
-        cross = np.cross(motion[:3, 3], np.eye(3)).T
-        lines = a @ (inverse.T @ cross @ motion[:3, :3] @ inverse).T
-        distance = np.abs((lines * b).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
-        assert (distance < 1.0).sum() >= 150
-        assert (distance < 1.0).mean() > 0.9
+        distances = sampson_distances(train, i, i + 1, ratio=0.75)
+        assert (distances < 0.7).sum() >= 150
+        assert (distances < 0.7).double().mean() > 0.9
 
 
 def test_raycast_of_a_plane_has_its_closed_form_depth():
@@ -268,10 +256,6 @@ def _photo_error(source, i, target, j):
 
 def _centers(extrinsics):
     return torch.linalg.inv(extrinsics.double())[:, :3, 3]
-
-
-def _to_bytes(image):
-    return (image.permute(1, 2, 0) * 255).round().byte().numpy()
 
 
 def _pinhole(height, width):
