@@ -49,25 +49,16 @@ def test_a_border_of_changing_thickness_is_followed(scene):
     assert float((found - light).abs()[light < 1].mean()) < 0.1
 
 
-def test_photos_without_a_border_have_none(scene):
-    assert border_transmittance(scene.train.images) is None
-
-
 def test_the_scene_is_not_taken_for_a_border(scene):
     photos = scene.train.images.clone()
+    assert border_transmittance(photos) is None
+    assert border_transmittance(photos * behind(left=0, top=8.0, right=0)) is None  # too wide
+    assert border_transmittance(torch.rand(2, 3, 5, 5)) is None  # too small
     assert border_transmittance(photos * behind() * 0.02) is None  # too dark to tell
     photos[0, :, :2] = 0.0  # in one photo alone
     assert border_transmittance(photos) is None
     assert border_transmittance(scene.train.images[:1] * behind()) is None  # one photo tells nothing
     assert border_transmittance(torch.zeros(3, 3, 144, 192)) is None
-
-
-def test_a_dark_edge_that_is_too_wide_is_the_scene(scene):
-    assert border_transmittance(scene.train.images * behind(left=0, top=8.0, right=0)) is None
-
-
-def test_small_pictures_have_none():
-    assert border_transmittance(torch.rand(2, 3, 5, 5)) is None
 
 
 def with_border(scene, light):

@@ -2,107 +2,35 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from posed_scenes import COUNT, HEIGHT, WIDTH, WORLD_POINT, write_colmap
 
-from kgs.datasets import Scene, Views, load_scene
+from kgs.datasets import load_scene
 from kgs.errors import DataError
 
-WIDTH, HEIGHT, COUNT = 48, 32, 10
-FAR = np.array([100.0, -200.0, 0.0])  # the world is far from the origin, as georeferenced ones are
-WORLD_POINT = FAR + np.array([0.3, -0.2, 6.0])
-DISTORTED = {
-    "SIMPLE_RADIAL": [40.0, 24.3, 15.6, -0.1],
-    "RADIAL": [40.0, 24.3, 15.6, -0.1, 0.02],
-    "OPENCV": [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002],
-    "FULL_OPENCV": [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002, 0.01, 0.02, 0.01, 0.0],
-    "OPENCV_FISHEYE": [40.0, 42.0, 24.3, 15.6, 0.02, -0.01, 0.003, 0.001],
-    "SIMPLE_RADIAL_FISHEYE": [40.0, 24.3, 15.6, 0.02],
-    "RADIAL_FISHEYE": [40.0, 24.3, 15.6, 0.02, -0.01],
-}
-
-
-def poses(seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
-    """World-to-camera rotations and translations that look at `WORLD_POINT`, roughly."""
-    rng = np.random.default_rng(seed)
-    turns = [cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] for _ in range(COUNT)]
-    return [(turn, rng.normal(0, 0.4, 3) - FAR @ turn.T) for turn in turns]
-
-
-def pixel_of(rotation: np.ndarray, translation: np.ndarray, principal: tuple[float, float]) -> np.ndarray:
-    """The half-pixel coordinates of `WORLD_POINT` with a focal length of 40."""
-    x, y, z = rotation @ WORLD_POINT + translation
-    return np.array([40 * x / z + principal[0], 40 * y / z + principal[1]])
-
-
-def write_model(
-    root: Path, model: str = "PINHOLE", params: list[float] | None = None, text: bool = False, names: Any = None
-) -> None:
-    """A scene of ten black images; image i is called img{i}.png and has the id 100 - i, so ids sort backwards."""
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap writes the models")
-    scene = pycolmap.Reconstruction()
-    params = params or [40.0, 40.0, WIDTH / 2, HEIGHT / 2]
-    scene.add_camera_with_trivial_rig(
-        pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=7)
-    )
-    for i, (rotation, translation) in reversed(list(enumerate(poses()))):
-        name = names[i] if names else f"img{i}.png"
-        seen = pycolmap.Point2DList([pycolmap.Point2D(np.array([3.0, 4.0])) for _ in range(i % 3)])
-        image = pycolmap.Image(name=name, camera_id=7, image_id=100 - i, points2D=seen)
-        scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
-    # the first point is seen by images 1, 4 and 7, the second by 2 and 8
-    for position, color, views, slot in (
-        (WORLD_POINT, (255, 0, 51), (1, 4, 7), 0),
-        (WORLD_POINT + 1, (0, 51, 255), (2, 8), 1),
-    ):
-        track = pycolmap.Track()
-        for view in views:
-            track.add_element(100 - view, slot)
-        scene.add_point3D(np.asarray(position), track, np.array(color, np.uint8))
-    (root / "sparse" / "0").mkdir(parents=True)
-    (root / "images").mkdir()
-    (scene.write_text if text else scene.write_binary)(str(root / "sparse" / "0"))
-    for i in range(COUNT):
-        name = root / "images" / (names[i] if names else f"img{i}.png")
-        name.parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(name), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
-
-
-def project(scene: Scene, views: Views, index: int) -> np.ndarray:
-    point = torch.from_numpy(WORLD_POINT) - scene.offset
-    return np.asarray(views.camera(index).project(point.float()[None, None])[0, 0])
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_what_pycolmap_wrote(tmp_path: Path, text: bool) -> None:
-    write_model(tmp_path, text=text)
-    scene = load_scene(tmp_path)
-    assert scene.train.names == tuple(f"img{i}.png" for i in (1, 2, 3, 4, 5, 6, 7, 9))
-    assert scene.test.names == ("img0.png", "img8.png")
-    given = poses()
-    for views in (scene.train, scene.test):
-        for row, name in enumerate(views.names):
-            i = int(name[3])
-            assert int(views.images[row].max() * 255 + 0.5) == i  # its own pixels
-            rotation, translation = given[i]
-            np.testing.assert_allclose(views.cameras.extrinsics[row, :3, :3], rotation, atol=1e-6)
-            recentred = translation + rotation @ scene.offset.numpy()
-            np.testing.assert_allclose(views.cameras.extrinsics[row, :3, 3], recentred, atol=1e-5)
-            expected = pixel_of(rotation, translation, (WIDTH / 2, HEIGHT / 2)) - 0.5
-            np.testing.assert_allclose(project(scene, views, row), expected, atol=1e-4)
-    assert scene.init_kind == "none"
-    assert len(scene.points) == 0
+DISTORTED = [
+    ("SIMPLE_RADIAL", [40.0, 24.3, 15.6, -0.1]),
+    ("RADIAL", [40.0, 24.3, 15.6, -0.1, 0.02]),
+    ("OPENCV", [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002]),
+    ("FULL_OPENCV", [40.0, 42.0, 24.3, 15.6, -0.1, 0.02, 0.003, -0.002, 0.01, 0.02, 0.01, 0.0]),
+    ("OPENCV_FISHEYE", [40.0, 42.0, 24.3, 15.6, 0.02, -0.01, 0.003, 0.001]),
+    ("SIMPLE_RADIAL_FISHEYE", [40.0, 24.3, 15.6, 0.02]),
+    ("RADIAL_FISHEYE", [40.0, 24.3, 15.6, 0.02, -0.01]),
+    ("OPENCV", [40.0, 42.0, 24.3, 15.6, 0.15, 0.02, 0.004, -0.006]),
+    ("OPENCV_FISHEYE", [40.0, 42.0, 24.3, 15.6, 0.0, 0.0, 0.0, 0.0]),
+]
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_model_points_need_two_training_images(tmp_path: Path, text: bool) -> None:
-    write_model(tmp_path, text=text)
+    write_colmap(tmp_path, text=text)
     scene = load_scene(tmp_path, points="model-points")  # 8 is a test image: the second point has one view left
     assert scene.init_kind == "model-points"
     np.testing.assert_allclose((scene.points.double() + scene.offset).numpy(), [WORLD_POINT], atol=1e-5)
@@ -113,36 +41,18 @@ def test_model_points_need_two_training_images(tmp_path: Path, text: bool) -> No
     assert len(load_scene(tmp_path, 3, points="model-points").points) == 0
 
 
-@pytest.mark.parametrize("downscale", [None, 2])
-def test_a_dot_is_where_the_camera_sees_its_point(tmp_path: Path, downscale: int | None) -> None:
-    """The half pixel: a dot is drawn where COLMAP's rule puts the point, and found where Kornia's camera puts it."""
-    step = downscale or 1
-    column, row = 11, 8  # of the image that is loaded
-    rotation, translation = poses()[1]
-    x, y, z = rotation @ WORLD_POINT + translation
-    principal = [(column + 0.5) * step - 40 * x / z, (row + 0.5) * step - 40 * y / z]
-    write_model(tmp_path, params=[40.0, 40.0, *principal])
-    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    image[row * step : (row + 1) * step, column * step : (column + 1) * step] = 255
-    cv2.imwrite(str(tmp_path / "images" / "img1.png"), image)
-    scene = load_scene(tmp_path, downscale=downscale)
-    found = torch.nonzero(scene.train.images[0, 0] > 0.99)
-    assert found.tolist() == [[row, column]]
-    np.testing.assert_allclose(project(scene, scene.train, 0), [column, row], atol=1e-4)
-
-
-@pytest.mark.parametrize("model", DISTORTED)
-def test_distorted_lenses_become_pinholes(tmp_path: Path, model: str) -> None:
+@pytest.mark.parametrize(("model", "params"), DISTORTED)
+def test_distorted_lenses_become_pinholes(tmp_path: Path, model: str, params: list[float]) -> None:
     """Ramps say where each pixel comes from; pycolmap's own projection says where it should."""
     pycolmap = pytest.importorskip("pycolmap")
-    write_model(tmp_path, model, DISTORTED[model])
+    write_colmap(tmp_path, model=model, params=params)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     ramps = np.stack([np.zeros_like(rows), rows * 1000, columns * 1000], axis=2).astype(np.uint16)  # red: columns
     cv2.imwrite(str(tmp_path / "images" / "img1.png"), ramps)
     scene = load_scene(tmp_path)
     matrix = scene.train.cameras.intrinsics[0, :3, :3].double()
     pixels = torch.from_numpy(np.stack([columns, rows, np.ones_like(rows)], axis=2).reshape(-1, 3)).double()
-    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=DISTORTED[model])
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
     expected = camera.img_from_cam((pixels @ torch.linalg.inv(matrix).T).numpy()) - 0.5
     got = scene.train.images[0, :2].permute(1, 2, 0).reshape(-1, 2).numpy() * 65.535
     np.testing.assert_allclose(got, expected, atol=0.02)
@@ -150,7 +60,7 @@ def test_distorted_lenses_become_pinholes(tmp_path: Path, model: str) -> None:
 
 def test_several_lenses_and_names_with_spaces_and_folders(tmp_path: Path) -> None:
     names = [f"cam {i % 2}/img {i}.png" for i in range(COUNT)]
-    write_model(tmp_path, text=True, names=names)
+    write_colmap(tmp_path, text=True, names=names)
     cameras = tmp_path / "sparse" / "0" / "cameras.txt"
     cameras.write_text(cameras.read_text() + f"9 SIMPLE_PINHOLE {WIDTH} {HEIGHT} 55 20 10\n")
     images = tmp_path / "sparse" / "0" / "images.txt"
@@ -163,7 +73,7 @@ def test_several_lenses_and_names_with_spaces_and_folders(tmp_path: Path) -> Non
 
 
 def test_intrinsics_follow_the_size_of_the_images(tmp_path: Path) -> None:
-    write_model(tmp_path)
+    write_colmap(tmp_path)
     for path in (tmp_path / "images").iterdir():
         cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
     scene = load_scene(tmp_path)
@@ -177,20 +87,9 @@ def test_intrinsics_follow_the_size_of_the_images(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_names_with_backslashes_and_further_models(tmp_path: Path) -> None:
-    write_model(tmp_path, text=True, names=[f"cam/img{i}.png" for i in range(COUNT)])
-    before = load_scene(tmp_path)
-    assert before.notes == ()
-    images = tmp_path / "sparse" / "0" / "images.txt"
-    images.write_text(images.read_text().replace("cam/", "cam\\"))
-    after = load_scene(tmp_path)
-    assert torch.equal(after.train.images, before.train.images)
-    assert after.notes == ()
-
-
 @pytest.mark.parametrize("small", ["0", "1"])
 def test_of_several_models_the_one_with_most_images_is_read(tmp_path: Path, small: str) -> None:
-    write_model(tmp_path, text=True)
+    write_colmap(tmp_path, text=True)
     (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / str(1 - int(small)))
     shutil.copytree(tmp_path / "sparse" / str(1 - int(small)), tmp_path / "sparse" / small)
     images = tmp_path / "sparse" / small / "images.txt"
@@ -209,7 +108,7 @@ def test_of_several_models_the_one_with_most_images_is_read(tmp_path: Path, smal
 @pytest.mark.parametrize("text", [False, True])
 def test_a_model_beside_its_photos_or_their_folder(tmp_path: Path, text: bool, beside: bool) -> None:
     """As RealityScan exports it."""
-    write_model(tmp_path, text=text)
+    write_colmap(tmp_path, text=text)
     before = load_scene(tmp_path, points="model-points")
     for path in [*(tmp_path / "sparse" / "0").iterdir(), *((tmp_path / "images").iterdir() if beside else [])]:
         path.rename(tmp_path / path.name)
@@ -226,7 +125,7 @@ def test_a_model_beside_its_photos_or_their_folder(tmp_path: Path, text: bool, b
 
 
 def test_a_model_without_photos_is_no_scene(tmp_path: Path) -> None:
-    write_model(tmp_path, text=True)
+    write_colmap(tmp_path, text=True)
     for path in (tmp_path / "sparse" / "0").iterdir():
         path.rename(tmp_path / path.name)
     (tmp_path / "images").rename(tmp_path / "photos")
@@ -235,35 +134,42 @@ def test_a_model_without_photos_is_no_scene(tmp_path: Path) -> None:
 
 
 def test_photos_that_are_gone_are_left_out_and_named(tmp_path: Path) -> None:
-    write_model(tmp_path)
+    write_colmap(tmp_path)
+    cv2.imwrite(str(tmp_path / "images" / "aaa.png"), np.zeros((5, 5, 3), np.uint8))  # one that the model lacks
     before = load_scene(tmp_path)
-    for i in (2, 5):
-        (tmp_path / "images" / f"img{i}.png").unlink()
+    assert len(before.train) + len(before.test) == COUNT
+    gone = {"img2.png", "img5.png"}
+    for name in gone:
+        (tmp_path / "images" / name).unlink()
     scene = load_scene(tmp_path, points="model-points")
-    assert {*scene.train.names, *scene.test.names} == {*before.train.names, *before.test.names} - {
-        "img2.png",
-        "img5.png",
-    }
+    assert {*scene.train.names, *scene.test.names} == {*before.train.names, *before.test.names} - gone
     (note,) = scene.notes
     assert "2 of 10" in note
-    assert "img2.png" in note
-    assert "img5.png" in note
+    assert all(name in note for name in gone)
+    for i in (3, 4, 6, 7, 8):
+        (tmp_path / "images" / f"img{i}.png").unlink()
+    with pytest.raises(DataError, match=r"7 of 10 images.*img2\.png.*img5\.png.*img8\.png"):
+        load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("written", ["img3.PNG", "IMG3.png"])
-def test_photos_whose_names_differ_in_case(tmp_path: Path, written: str) -> None:
-    write_model(tmp_path)
+@pytest.mark.parametrize("change", ["backslashes", "img3.PNG", "IMG3.png"])
+def test_names_with_backslashes_or_in_another_case(tmp_path: Path, change: str) -> None:
+    write_colmap(tmp_path, text=True, names=[f"cam/img{i}.png" for i in range(COUNT)])
     before = load_scene(tmp_path)
-    (tmp_path / "images" / "img3.png").rename(tmp_path / "images" / written)
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    if change == "backslashes":
+        images.write_text(images.read_text().replace("cam/", "cam\\"))
+    else:
+        (tmp_path / "images" / "cam" / "img3.png").rename(tmp_path / "images" / "cam" / change)
     after = load_scene(tmp_path)
-    assert after.notes == ()
-    assert after.train.names == before.train.names
+    assert before.notes == after.notes == ()
+    assert [name[-8:] for name in after.train.names] == [name[-8:] for name in before.train.names]
     assert torch.equal(after.train.images, before.train.images)
 
 
 def test_a_size_that_is_rounded_in_the_model(tmp_path: Path) -> None:
     """A lens of 2400x1799 for photos of 2592x1944, at a twelfth of their pixels."""
-    write_model(tmp_path, text=True)
+    write_colmap(tmp_path, text=True)
     cameras = tmp_path / "sparse" / "0" / "cameras.txt"
     cameras.write_text(cameras.read_text().replace(f" {WIDTH} {HEIGHT} ", " 200 149 "))
     for path in (tmp_path / "images").iterdir():
@@ -277,7 +183,7 @@ def test_a_size_that_is_rounded_in_the_model(tmp_path: Path) -> None:
 def test_points_without_tracks_are_told_from_no_points(tmp_path: Path, text: bool) -> None:
     """LiDAR's: nothing says which photos see them."""
     pycolmap = pytest.importorskip("pycolmap")
-    write_model(tmp_path, text=text)
+    write_colmap(tmp_path, text=text)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     for point_id in list(model.points3D):
         model.delete_point3D(point_id)
@@ -287,37 +193,6 @@ def test_points_without_tracks_are_told_from_no_points(tmp_path: Path, text: boo
     (model.write_text if text else model.write_binary)(str(tmp_path / "sparse" / "0"))
     with pytest.raises(DataError, match="points with a track.*got 5 without"):
         load_scene(tmp_path, points="model-points")
-
-
-def test_all_missing_images_are_named_at_once_and_extra_ones_do_no_harm(tmp_path: Path) -> None:
-    write_model(tmp_path)
-    before = load_scene(tmp_path)
-    cv2.imwrite(str(tmp_path / "images" / "aaa.png"), np.zeros((5, 5, 3), np.uint8))
-    assert load_scene(tmp_path).train.names == before.train.names
-    for i in range(2, 9):
-        (tmp_path / "images" / f"img{i}.png").unlink()
-    with pytest.raises(DataError, match=r"7 of 10 images.*img2\.png.*img5\.png.*img8\.png"):
-        load_scene(tmp_path)
-
-
-def test_test_poses_never_reach_the_training_cameras(tmp_path: Path) -> None:
-    write_model(tmp_path, text=True)
-    before = load_scene(tmp_path, points="model-points")
-    images = tmp_path / "sparse" / "0" / "images.txt"
-    lines = images.read_text().split("\n")
-    for i, line in enumerate(lines):
-        if line.endswith(("img0.png", "img8.png")):
-            number, name = line.split()[0], line.split()[-1]
-            lines[i] = f"{number} 0.5 0.5 0.5 0.5 17 -3 900 7 {name}"
-    images.write_text("\n".join(lines))
-    for i in (0, 8):
-        cv2.imwrite(str(tmp_path / "images" / f"img{i}.png"), np.full((HEIGHT, WIDTH, 3), 200, np.uint8))
-    after = load_scene(tmp_path, points="model-points")
-    assert not torch.equal(before.test.cameras.extrinsics, after.test.cameras.extrinsics)
-    assert torch.equal(before.offset, after.offset)
-    assert torch.equal(before.train.cameras.extrinsics, after.train.cameras.extrinsics)
-    assert torch.equal(before.train.images, after.train.images)
-    assert torch.equal(before.points, after.points)
 
 
 @pytest.mark.parametrize(
@@ -330,40 +205,19 @@ def test_test_poses_never_reach_the_training_cameras(tmp_path: Path) -> None:
         ("cameras", " 40 40 ", " nan 40 ", "finite"),
         ("cameras", "\n7 ", "\n8 ", "camera 7, which cameras.txt lacks"),
         ("images", " 7 img3.png", " 7 ../img3.png", "inside the scene"),
-        ("images", " 7 img3.png", " 7 /img3.png", "inside the scene"),
-        ("images", " 7 img3.png", " 7 C:\\img3.png", "inside the scene"),
         ("images", " 7 img3.png", " 7 img4.png", "img4.png.*several times"),
         ("images", "\n97 ", "\n96 ", "image 96: occurs twice"),
         ("images", " 7 img3.png", " seven img3.png", "line"),
+        ("images", r"\n97 \S+ \S+ \S+ \S+ ", "\n97 0 0 0 0 ", r"img3\.png.*finite 4x4 pose"),
+        ("images", r"\n97 \S+ ", "\n97 nan ", r"img3\.png.*finite 4x4 pose"),
+        ("images", r"\n97 (\S+ ){5}", "\n97 1 0 0 0 inf ", r"img3\.png.*finite 4x4 pose"),
     ],
 )
 def test_text_models_that_are_wrong(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
-    write_model(tmp_path, text=True)
+    write_colmap(tmp_path, text=True)
     path = tmp_path / "sparse" / "0" / f"{file}.txt"
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
+    text, count = re.subn(old, lambda _: new, path.read_text())
+    assert count
+    path.write_text(text)
     with pytest.raises(DataError, match=message):
         load_scene(tmp_path)
-
-
-@pytest.mark.parametrize("pose", ["0 0 0 0 1 2 3", "nan 0 0 1 1 2 3", "1 0 0 0 inf 2 3"])
-def test_poses_that_are_none(tmp_path: Path, pose: str) -> None:
-    write_model(tmp_path, text=True)
-    path = tmp_path / "sparse" / "0" / "images.txt"
-    lines = [f"97 {pose} 7 img3.png" if line.endswith("img3.png") else line for line in path.read_text().split("\n")]
-    path.write_text("\n".join(lines))
-    with pytest.raises(DataError, match=r"img3\.png.*finite 4x4 pose"):
-        load_scene(tmp_path)
-
-
-def test_real_scene(kgs_data: Path) -> None:
-    scene = load_scene(kgs_data / "colmap" / "trex", 3, points="model-points")
-    assert scene.train.names == ("img002.jpg", "img029.jpg", "img055.jpg")
-    assert len(scene.test) == 7
-    assert scene.train.images.shape == (3, 3, 375, 501)
-    assert float(scene.train.cameras.cx[0]) == pytest.approx(250.82686 - 0.5, abs=1e-4)
-    # the points are in front of the training cameras and most of them inside their images
-    pixels = scene.train.camera(0).project(scene.points[None])[0]
-    inside = ((pixels > 0) & (pixels < torch.tensor([500.0, 374.0]))).all(dim=1)
-    assert len(scene.points) > 1000
-    assert inside.float().mean() > 0.7

@@ -12,6 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from PIL import ImageCms
+from tiny_scenes import png_chunk
 
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets.image_file import read_image
@@ -79,8 +80,7 @@ def test_alpha_stays_and_16_bits_are_converted_too(tmp_path: Path) -> None:
     np.testing.assert_array_equal(image[..., 3:], alpha / np.float32(255))
     np.testing.assert_allclose(image[..., :3] * 255, srgb_of_p3(patches()), atol=1.5)
     data = cv2.imencode(".png", patches()[..., ::-1].astype(np.uint16) * 257)[1].tobytes()
-    body = b"iCCP" + b"P3\0\0" + zlib.compress(p3_profile())
-    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    chunk = png_chunk(b"iCCP", b"P3\0\0" + zlib.compress(p3_profile()))
     (tmp_path / "deep.png").write_bytes(data[:33] + chunk + data[33:])  # behind the header
     np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), image[..., :3])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -27,8 +28,8 @@ def centroid(image: np.ndarray) -> np.ndarray:
     return np.array([(image * columns).sum() / image.sum(), (image * rows).sum() / image.sum()])
 
 
-def lens(*distortion: float, fisheye: bool = False) -> Intrinsics:
-    return Intrinsics(WIDTH, HEIGHT, 100.0, 98.0, 58.0, 47.0, distortion, fisheye)
+def lens(*distortion: float) -> Intrinsics:
+    return Intrinsics(WIDTH, HEIGHT, 100.0, 98.0, 58.0, 47.0, distortion)
 
 
 def undistort(image: np.ndarray, given: Intrinsics) -> tuple[np.ndarray, Intrinsics]:
@@ -103,17 +104,6 @@ def test_reducing_by_a_fraction_moves_a_spot_as_its_camera_says() -> None:
     np.testing.assert_allclose(centroid(small), expected, atol=2e-3)
 
 
-def sources(result: np.ndarray) -> np.ndarray:
-    """Where the pixels of an undistorted `ramps` come from, `(H, W, 2)` in pixels."""
-    return np.asarray(result * np.array([WIDTH, HEIGHT]))
-
-
-def ramps() -> np.ndarray:
-    """An image whose two channels say x / W and y / H; bilinear resampling keeps it exact."""
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
-    return np.stack([columns / WIDTH, rows / HEIGHT], axis=2)
-
-
 def rays(pinhole: Intrinsics) -> np.ndarray:
     """The direction of each pixel, `(H * W, 3)`, z = 1."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
@@ -122,41 +112,22 @@ def rays(pinhole: Intrinsics) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "coefficients",
-    [(-0.2, 0.03, 0.0, 0.0), (0.15, 0.02, 0.004, -0.006), (-0.3, 0.1, 0.002, 0.001, 0.02, 0.05, 0.01, 0.0)],
+    ("k1", "fisheye"), [(-0.2, False), (0.0, False), (0.1, False), (0.3, False), (0.1, True), (0.6, True)]
 )
-def test_undistortion_is_the_inverse_of_opencvs_projection(coefficients: tuple[float, ...]) -> None:
-    given = lens(*coefficients)
-    result, pinhole = undistort(ramps(), given)
-    expected = cv2.projectPoints(rays(pinhole), np.zeros(3), np.zeros(3), given.matrix(), np.array(coefficients))[0]
-    # half a pixel in the principal point would show as 0.1 px; OpenCV interpolates in steps of 1/32 px
-    np.testing.assert_allclose(sources(result), expected.reshape(HEIGHT, WIDTH, 2), atol=0.02)
-    assert not pinhole.distortion
-
-
-@pytest.mark.parametrize("coefficients", [(0.0, 0.0, 0.0, 0.0), (0.05, -0.01, 0.002, 0.0)])
-def test_fisheye_undistortion_also_with_all_coefficients_zero(coefficients: tuple[float, ...]) -> None:
-    k1, k2, k3, _ = coefficients
-    given = lens(*coefficients, fisheye=True)
-    result, pinhole = undistort(ramps(), given)
-    xy = rays(pinhole)[:, :2]
-    radius = np.hypot(*xy.T)[:, None]
-    theta = np.arctan(radius)
-    bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6)
-    expected = xy / radius * bent * (given.fx, given.fy) + given.matrix()[:2, 2]
-    np.testing.assert_allclose(sources(result), expected.reshape(HEIGHT, WIDTH, 2), atol=0.02)
-    assert not pinhole.fisheye
-
-
-@pytest.mark.parametrize("k1", [-0.2, 0.0, 0.1, 0.3])
-def test_no_pixel_of_an_undistorted_image_is_blank_or_smeared(k1: float) -> None:
+def test_no_pixel_of_an_undistorted_image_is_blank_or_smeared(k1: float, fisheye: bool) -> None:
     """Every pixel of the result looks at a place inside the photo; barrel lenses keep their focal length."""
-    _, pinhole = undistort(blob(60.0, 45.0), lens(k1, 0.0, 0.0, 0.0))
+    given = replace(lens(k1, 0.0, 0.0, 0.0), fisheye=fisheye)
+    _, pinhole = undistort(blob(60.0, 45.0), given)
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     distortion = np.array([k1, 0.0, 0.0, 0.0])
-    pixels = cv2.projectPoints(rays(pinhole), np.zeros(3), np.zeros(3), lens().matrix(), distortion)[0][:, 0]
-    assert (pixels >= -1e-3).all()
-    assert (pixels <= np.array([WIDTH - 1, HEIGHT - 1]) + 1e-3).all()
-    assert pinhole.fx == 100.0 if k1 <= 0 else 100.0 < pinhole.fx < 150.0
+    pixels = project(rays(pinhole)[:, None], np.zeros(3), np.zeros(3), lens().matrix(), distortion)[0][:, 0]
+    room = np.minimum(pixels, np.array([WIDTH - 1, HEIGHT - 1]) - pixels).min()
+    assert room >= -1e-3
+    if k1 > (1 / 3 if fisheye else 0):  # the photo covers the result, and no more than that
+        assert 100.0 < pinhole.fx < 150.0
+        assert room < 1e-3
+    else:
+        assert pinhole.fx == 100.0
     assert pinhole.fy / pinhole.fx == pytest.approx(0.98)
 
 

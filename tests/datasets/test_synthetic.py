@@ -1,10 +1,10 @@
 """The synthetic scene against closed forms, against itself across views, and as OpenCV's SIFT sees it."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
+from epipolar import sampson_distances
 from init_point_scenes import garden_from_above
 from kornia.geometry.depth import warp_frame_depth
 
@@ -52,13 +52,13 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
         assert torch.equal(a.cameras.extrinsics, b.cameras.extrinsics)
         assert (a.images - c.images).abs().mean() > 0.05
         assert not torch.equal(a.cameras.extrinsics, c.cameras.extrinsics)
+    cameras = first.train.cameras
+    assert not torch.equal(synthetic_depths(cameras, kind, 1), synthetic_depths(cameras, kind, 0))
 
 
 @pytest.mark.slow
 def test_world_does_not_depend_on_the_number_of_views(scene):
     few = synthetic_scene(train_views=1, test_views=0, size=(84, 112))
-    depth = synthetic_depths(few.train.cameras)
-    torch.testing.assert_close(depth, _shown_depth(few.train), rtol=1e-9, atol=0.0)
     # the one camera and the middle one of three see one and the same world
     warped, seen, error = _photo_error(scene.train, 1, few.train, 0)
     assert seen.double().mean() > 0.5
@@ -72,14 +72,6 @@ def test_train_and_test_cameras_are_disjoint(scene, orbit):
         assert torch.cdist(*centers).min() > 0.01
         assert torch.pdist(torch.cat(centers)).min() > 0.01
         assert not set(both.train.names) & set(both.test.names)
-
-
-def test_forward_test_views_lie_around_the_training_views(scene):
-    train, test = (_centers(views.cameras.extrinsics) for views in (scene.train, scene.test))
-    extent = train.amax(0) - train.amin(0)
-    assert (test[:, :2] > train.amin(0)[:2] - extent[:2]).all()
-    assert (test[:, :2] < train.amax(0)[:2] + extent[:2]).all()
-    assert ((test[:, 0] > train[:, 0].min()) & (test[:, 0] < train[:, 0].max())).sum() >= 3
 
 
 @pytest.mark.parametrize(
@@ -123,15 +115,23 @@ def test_the_sky_shines_and_the_ground_is_shaded():
     assert (under < 0.8 * in_the_open).all()
 
 
-def test_the_work_of_an_orbit_is_bounded(orbit):
-    """Pairs of a triangle and a pixel in its box, of which a picture is made: some per ray."""
+def _pairs_per_ray(made, size, extrinsics):
+    """Pairs of a triangle and a pixel in its box, of which a picture is made."""
+    matrix, rays = _pinhole(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
+    corners = made.triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+    pairs, _, _ = _candidates(corners @ matrix.T, np.ones(len(made.triangles), dtype=bool), rays)
+    return len(pairs) / rays[0] / rays[1]
+
+
+def test_the_work_is_bounded(orbit):
+    ahead = np.eye(4)
+    ahead[:3, 3] = -room.EYE
+    made = room.make_room(0)
+    assert len(made.triangles) < 20_000
+    assert _pairs_per_ray(made, (189, 252), ahead) < 12
     made = garden.make_garden(0)
-    rays = (SMALL[0] * SUPERSAMPLING, SMALL[1] * SUPERSAMPLING)
-    matrix = np.array([[0.9 * rays[1], 0, rays[1] / 2], [0, 0.9 * rays[1], rays[0] / 2], [0, 0, 1.0]])
     for extrinsics in orbit.train.cameras.extrinsics.double().numpy():
-        corners = made.triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-        pairs, _, _ = _candidates(corners @ matrix.T, np.ones(len(made.triangles), dtype=bool), rays)
-        assert len(pairs) < 30 * rays[0] * rays[1]
+        assert _pairs_per_ray(made, SMALL, extrinsics) < 30
 
 
 def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
@@ -159,22 +159,10 @@ def test_views_agree_on_the_colour_of_the_surfaces_they_both_see(scene, source, 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_sift_matches_neighbouring_views_along_the_epipolar_lines(seed):
     train, _ = garden_from_above((189, 252), seed)
-    sift = cv2.SIFT_create()
-    gray = [cv2.cvtColor(_to_bytes(image), cv2.COLOR_RGB2GRAY) for image in train.images]
-    features = [sift.detectAndCompute(image, None) for image in gray]
-    inverse = np.linalg.inv(train.cameras.intrinsics[0, :3, :3].double().numpy())
-    extrinsics = train.cameras.extrinsics.double().numpy()
     for i in range(2):
-        pairs = cv2.BFMatcher().knnMatch(features[i][1], features[i + 1][1], k=2)
-        good = [best for best, second in pairs if best.distance < 0.75 * second.distance]
-        a = cv2.convertPointsToHomogeneous(np.array([features[i][0][m.queryIdx].pt for m in good]))[:, 0]
-        b = cv2.convertPointsToHomogeneous(np.array([features[i + 1][0][m.trainIdx].pt for m in good]))[:, 0]
-        motion = extrinsics[i + 1] @ np.linalg.inv(extrinsics[i])
-        cross = np.cross(motion[:3, 3], np.eye(3)).T
-        lines = a @ (inverse.T @ cross @ motion[:3, :3] @ inverse).T
-        distance = np.abs((lines * b).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
-        assert (distance < 1.0).sum() >= 150
-        assert (distance < 1.0).mean() > 0.9
+        distances = sampson_distances(train, i, i + 1, ratio=0.75)
+        assert (distances < 0.7).sum() >= 150
+        assert (distances < 0.7).double().mean() > 0.9
 
 
 def test_raycast_of_a_plane_has_its_closed_form_depth():
@@ -222,18 +210,6 @@ def test_raycast_closed_mesh_has_no_cracks_and_hides_what_is_behind():
     assert (faces == len(ball)).mean() > 0.4
 
 
-def test_raycast_follows_the_extrinsics():
-    mesh = np.asarray(trimesh.creation.icosphere(subdivisions=2).triangles)
-    pose = trimesh.transformations.euler_matrix(0.4, -0.3, 2.0)
-    pose[:3, 3] = 0.1, 0.2, 3.0
-    intrinsics, size = _pinhole(30, 40)
-    depths, faces = raycast(mesh, intrinsics, pose, size)
-    moved = mesh @ pose[:3, :3].T + pose[:3, 3]
-    expected_depths, expected_faces = raycast(moved, intrinsics, np.eye(4), size)
-    np.testing.assert_array_equal(faces, expected_faces)
-    np.testing.assert_allclose(depths, expected_depths, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [
@@ -278,25 +254,8 @@ def _photo_error(source, i, target, j):
     return warped, seen[None, None], error
 
 
-def _shown_depth(views):
-    """Depth by scaling the image plane: a camera of three times the pixels has the same centres at every third."""
-    triangles = room.make_room(0).triangles
-    depths = []
-    for k, e in zip(views.cameras.intrinsics.double(), views.cameras.extrinsics.double(), strict=True):
-        fine = k[:3, :3].numpy().copy()
-        fine[:2] *= 3
-        fine[:2, 2] += 1
-        height, width = views.images.shape[-2:]
-        depths.append(raycast(triangles, fine, e.numpy(), (3 * height, 3 * width))[0][1::3, 1::3])
-    return torch.from_numpy(np.stack(depths)[:, None])
-
-
 def _centers(extrinsics):
     return torch.linalg.inv(extrinsics.double())[:, :3, 3]
-
-
-def _to_bytes(image):
-    return (image.permute(1, 2, 0) * 255).round().byte().numpy()
 
 
 def _pinhole(height, width):

@@ -6,11 +6,11 @@ import torch
 import trimesh
 from kornia.geometry.depth import depth_to_3d_v2
 
-from kgs.datasets.synthetic import SUPERSAMPLING, room, synthetic_depths, synthetic_scene, world
-from kgs.datasets.synthetic.furniture import albedo, book, plain, printed, wood
+from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene, world
+from kgs.datasets.synthetic.furniture import printed
 from kgs.datasets.synthetic.light import daylight, received
-from kgs.datasets.synthetic.pictures import blank, spine, tone
-from kgs.datasets.synthetic.raycast import _candidates, raycast
+from kgs.datasets.synthetic.pictures import blank
+from kgs.datasets.synthetic.raycast import raycast
 
 SIZE = (84, 112)
 
@@ -31,7 +31,7 @@ def depths(scene):
 
 
 @pytest.mark.slow
-def test_photos_are_filled_and_neither_dark_nor_burnt_out(scene, depths):
+def test_photos_are_neither_dark_nor_burnt_out(scene):
     assert scene.train.images.shape == (3, 3, *SIZE)
     assert scene.test.images.shape == (5, 3, *SIZE)
     for images in (scene.train.images, scene.test.images):
@@ -40,17 +40,6 @@ def test_photos_are_filled_and_neither_dark_nor_burnt_out(scene, depths):
         assert (images == 1.0).float().mean() < 0.05
         assert 0.35 < images.mean() < 0.7
         assert images.std() > 0.15
-    assert (depths > 1.0).all()
-    # the wall is the farthest thing in front of the cameras
-    assert (depths < room.WALL + 0.6).all()
-
-
-def test_one_room_a_seed(scene):
-    again, other = (synthetic_scene("room", 1, 0, SIZE, seed) for seed in (0, 1))
-    assert torch.equal(synthetic_scene("room", 1, 0, SIZE, 0).train.images, again.train.images)
-    assert (again.train.images - other.train.images).abs().mean() > 0.03
-    assert not torch.equal(again.train.cameras.extrinsics, other.train.cameras.extrinsics)
-    assert (synthetic_depths(again.train.cameras, "room", 1) - synthetic_depths(again.train.cameras, "room")).any()
 
 
 def test_test_cameras_lie_between_the_training_cameras_and_outside(scene):
@@ -97,16 +86,6 @@ def test_a_point_has_its_colour_where_the_camera_projects_it(made, scene, depths
         assert there.abs().mean() < 0.6 * beside.abs().mean()  # the same three pixels beside the truth
 
 
-def test_the_work_is_bounded(made):
-    """Pairs of a triangle and a pixel in its box, of which a picture is made: some per ray, whatever the machine."""
-    rays = (189 * SUPERSAMPLING, 252 * SUPERSAMPLING)
-    matrix = np.array([[0.9 * rays[1], 0, rays[1] / 2], [0, 0.9 * rays[1], rays[0] / 2], [0, 0, 1.0]])
-    corners = (made.triangles - room.EYE).transpose(1, 0, 2) @ matrix.T
-    pairs, _, _ = _candidates(corners, np.ones(len(made.triangles), dtype=bool), rays)
-    assert len(made.triangles) < 20_000
-    assert len(pairs) < 12 * rays[0] * rays[1]
-
-
 def test_normals_are_smooth_over_a_ball_and_sharp_at_an_edge():
     ball, brick = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box((1.0, 2.0, 3.0))
     np.testing.assert_allclose(world._normals(ball), ball.triangles, atol=0.02)
@@ -139,26 +118,6 @@ def test_a_picture_lies_upright_on_its_rectangle():
     paint = printed(picture, 0.2, 0.1)
     corners = np.array([[-0.09, 0, 0.04], [0.09, 0, 0.04], [-0.09, 0, -0.04], [0.09, 0, -0.04]], dtype=np.float32)
     np.testing.assert_allclose(paint(corners), [[1, 0, 1], [1, 0, 0], [0, 0, 1], [0, 0, 0]], atol=1e-6)
-
-
-def test_the_title_is_on_the_spine_alone():
-    cover, ink = tone(0.6, 0.7, 0.6), (250, 240, 230)
-    picture = spine("ATLAS", 0.3, 0.07, cover, ink)
-    middle = picture[:, picture.shape[1] // 5 : -picture.shape[1] // 5]
-    assert 0.1 < (np.abs(middle - np.float64(ink)).max(axis=-1) < 30).mean() < 0.5
-    ((mesh, texture),) = book("ATLAS", 0.3, 0.2, 0.07, cover, ink)
-    points, faces = trimesh.sample.sample_surface(mesh, 2000, seed=1)
-    inked = np.abs(texture(points.astype(np.float32)) - albedo(ink)).max(axis=1) < 0.02
-    assert inked.sum() > 20
-    assert (mesh.face_normals[faces][inked] @ [0, -1, 0] > 0.99).all()
-
-
-def test_wood_has_planks_of_their_own_shades():
-    boards = wood(np.random.default_rng(0), (158, 107, 66), plank=0.1)
-    rows = np.stack(np.meshgrid(np.linspace(0, 1, 50), np.arange(8) * 0.1 + 0.05, [0.0]), axis=-1).astype(np.float32)
-    shades = boards(rows.reshape(-1, 3)).reshape(8, 50, 3).mean(axis=1)[:, 0]
-    assert shades.std() > 0.02
-    assert (plain((255, 0, 51))(np.zeros((2, 3))) == np.float32([1, 0, 0.2])).all()
 
 
 def test_a_room_is_hit_by_every_ray(made):

@@ -74,12 +74,13 @@ def test_a_frame_of_its_own_model_among_others(tmp_path: Path, layout: str) -> N
 
 @BOTH
 def test_lenses_of_own_data(tmp_path: Path, layout: str) -> None:
-    write(tmp_path, layout, {**LENS, "camera_angle_x": 0.76, "k1": -0.1, "k2": 0.02, "p1": 0.004, "p2": -0.003})
-    check_undistorted(tmp_path, (-0.1, 0.02, 0.004, -0.003), fisheye=False)
-    write(tmp_path, layout, LENS)
-    np.testing.assert_allclose(
-        load_scene(tmp_path).train.cameras.intrinsics[0, :2, :3], [[50, 0, 20.5], [0, 52, 14]], atol=1e-6
-    )
+    distortion = {"k1": -0.1, "k2": 0.02, "p1": 0.004, "p2": -0.003, "k3": 0.01}
+    write(tmp_path, layout, {**LENS, "camera_angle_x": 0.76, **distortion})
+    check_undistorted(tmp_path, (-0.1, 0.02, 0.004, -0.003, 0.01), fisheye=False)
+    write(tmp_path, layout, LENS, {}, {"cx": 19.0})
+    cameras = load_scene(tmp_path).train.cameras
+    np.testing.assert_allclose(cameras.intrinsics[0, :2, :3], [[50, 0, 18.5], [0, 52, 14]], atol=1e-6)
+    np.testing.assert_allclose(cameras.intrinsics[1, :2, :3], [[50, 0, 20.5], [0, 52, 14]], atol=1e-6)
 
 
 def focal(length: float, angle: float) -> float:
@@ -97,6 +98,8 @@ def focal(length: float, angle: float) -> float:
         ({"fl_x": 55.0, "camera_angle_y": 0.5}, {}, (55.0, focal(HEIGHT, 0.5))),
         ({"camera_angle_x": 0.8}, {"camera_angle_x": 0.6}, (focal(WIDTH, 0.6), focal(WIDTH, 0.6))),
         ({"fl_x": 55.0, "fl_y": 56.0}, {"camera_angle_x": 0.6}, (focal(WIDTH, 0.6), 56.0)),
+        ({"fl_x": 55.0, "fl_y": 56.0}, {"fl_x": 70.0}, (70.0, 56.0)),
+        ({"fl_x": 110.0, "fl_y": 112.0, "w": 80, "h": 60}, {}, (55.0, 56.0)),
         ({"camera_angle_x": 0.8, "w": 80, "h": 60}, {}, (focal(WIDTH, 0.8), focal(WIDTH, 0.8))),
     ],
 )
@@ -145,6 +148,57 @@ def test_what_cannot_be_used_is_refused(tmp_path: Path, layout: str, where: str,
     assert Path(error.value.path).parent == path.parent
 
 
+LENSES: list[tuple[dict[str, Any], str]] = [
+    ({"camera_type": "EQUIRECTANGULAR"}, "camera_type"),
+    ({"camera_type": "orthographic"}, "camera_type"),
+    ({"camera_type": 3}, "camera_type"),
+    ({"lens_model": "fisheye"}, "lens_model"),
+    ({"image_width": WIDTH + 1}, "image_width"),
+    ({"height": 2 * HEIGHT}, "height"),
+    ({"image_height": None, "width": True}, "width"),
+    ({"camera_make": "Insta360", "camera_model": "EQUIRECTANGULAR"}, "camera_model"),
+    ({"camera_model": 3}, "camera_model"),
+    ({"fl_x": 0}, "focal length"),
+    ({"fl_y": "50"}, "fl_y"),
+    ({"fl_x": None, "fl_y": None}, "fl_"),
+    ({"cx": None}, "cx"),
+    ({"w": 40.5}, "whole numbers"),
+    ({"w": 0}, "image size"),
+    ({"w": HEIGHT, "h": WIDTH}, "not a scaled version"),
+    ({"k1": -4.0}, "distortion"),
+    ({"k1": [0.1]}, "k1"),
+]
+SPLITS: list[tuple[dict[str, Any], str]] = [
+    ({"train_filenames": ["images/0.png"], "test_filenames": ["images/0.png"]}, "training and in the test"),
+    ({"train_filenames": ["images/9.png"]}, "images/9.png"),
+    ({"test_filenames": "images/0.png"}, "test_filenames.*list"),
+    ({"test_filenames": [3]}, "test_filenames.*list"),
+    ({"train_filenames": [f"images/{i}.png" for i in range(COUNT)]}, "others to test on"),
+    ({"test_filenames": [f"images/{i}.png" for i in range(COUNT)]}, "others to test on"),
+    ({"test_filenames": ["../0.png"]}, "inside the scene"),
+]
+
+
+@pytest.mark.parametrize(
+    ("layout", "said", "message"),
+    [(layout, *case) for layout in ("nerfstudio", "blender") for case in LENSES]
+    + [("nerfstudio", *case) for case in SPLITS],
+)
+def test_wrong_lenses_and_splits(tmp_path: Path, layout: str, said: dict[str, Any], message: str) -> None:
+    write(tmp_path, layout, {**LENS, **said})
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path)
+
+
+def test_names_stay_in_the_folder_and_a_lens_has_a_focal_length(tmp_path: Path) -> None:
+    write(tmp_path, "nerfstudio", {**LENS}, {"file_path": "../a.png"})
+    with pytest.raises(DataError, match="inside the scene"):
+        load_scene(tmp_path)
+    write(tmp_path, "nerfstudio", {"w": WIDTH, "h": HEIGHT})
+    with pytest.raises(DataError, match="camera_angle_x"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize("flag", [True, False])
 def test_a_fisheye_that_is_none_is_refused(tmp_path: Path, flag: bool) -> None:
     write(tmp_path, "nerfstudio", {**LENS, "is_fisheye": flag, "camera_model": "OPENCV" if flag else "OPENCV_FISHEYE"})
@@ -185,26 +239,6 @@ def test_what_describes_a_camera_is_passed_over(tmp_path: Path, layout: str, whe
     scene = load_scene(tmp_path)
     assert scene.notes == ()
     assert scene.train.cameras.intrinsics.equal(before.intrinsics)
-
-
-@BOTH
-@pytest.mark.parametrize(
-    "said",
-    [
-        {"camera_type": "EQUIRECTANGULAR"},
-        {"camera_type": "orthographic"},
-        {"camera_type": 3},
-        {"lens_model": "fisheye"},
-        {"image_width": WIDTH + 1},
-        {"height": 2 * HEIGHT},
-        {"image_height": None, "width": True},
-        {"camera_make": "Insta360", "camera_model": "EQUIRECTANGULAR"},
-    ],
-)
-def test_descriptions_of_another_camera_are_refused(tmp_path: Path, layout: str, said: dict[str, Any]) -> None:
-    write(tmp_path, layout, {**LENS, **said})
-    with pytest.raises(DataError, match=list(said)[-1]):
-        load_scene(tmp_path)
 
 
 @BOTH
@@ -262,24 +296,6 @@ def test_the_files_own_split(
     assert scene.test.names == tuple(f"images/{i}.png" for i in test)
     assert any("neither" in note for note in scene.notes) == (len(train) + len(test) < COUNT)
     assert load_scene(tmp_path, 2).train.names == (scene.train.names[0], scene.train.names[-1])
-
-
-@pytest.mark.parametrize(
-    ("lists", "message"),
-    [
-        ({"train_filenames": ["images/0.png"], "test_filenames": ["images/0.png"]}, "training and in the test"),
-        ({"train_filenames": ["images/9.png"]}, "images/9.png"),
-        ({"test_filenames": "images/0.png"}, "test_filenames.*list"),
-        ({"test_filenames": [3]}, "test_filenames.*list"),
-        ({"train_filenames": [f"images/{i}.png" for i in range(COUNT)]}, "others to test on"),
-        ({"test_filenames": [f"images/{i}.png" for i in range(COUNT)]}, "others to test on"),
-        ({"test_filenames": ["../0.png"]}, "inside the scene"),
-    ],
-)
-def test_wrong_splits_are_refused(tmp_path: Path, lists: dict[str, Any], message: str) -> None:
-    write(tmp_path, "nerfstudio", {**LENS, **lists})
-    with pytest.raises(DataError, match=message):
-        load_scene(tmp_path)
 
 
 def test_a_photo_that_both_blender_files_name_is_refused(tmp_path: Path) -> None:

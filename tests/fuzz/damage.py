@@ -9,13 +9,13 @@ import io
 import json
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from typing import Any
 
 import safetensors.torch
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
+from tiny_scenes import png_chunk
 
 from kgs.fit.checkpoint import _digest_all
 
@@ -164,8 +164,7 @@ def damaged_png_chunk(draw: DrawFn, data: bytes) -> bytes:
         at += size + 12
     chosen = draw(st.integers(0, len(chunks) - 1))
     chunks[chosen] = chunks[chosen][0], draw(damaged_bytes(chunks[chosen][1]))
-    packed = [struct.pack(">I", len(x)) + kind + x + struct.pack(">I", zlib.crc32(kind + x)) for kind, x in chunks]
-    return data[:8] + b"".join(packed)
+    return data[:8] + b"".join(png_chunk(kind, body) for kind, body in chunks)
 
 
 @st.composite

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import json
-import struct
 import sys
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 from cost import read_within_bounds
 from damage import GEOMETRIC_KEYS
-from tiny_scenes import write_blender, write_image, write_nerfstudio
+from tiny_scenes import plain_png, write_blender, write_image, write_nerfstudio
 
 from kgs.datasets import Views, load_scene
 from kgs.datasets.image_file import read_image
@@ -26,14 +25,7 @@ SIDE = 8000
 
 
 def grey_png(path: Path) -> None:
-    """62 kB, as no encoder at hand writes it without taking the memory."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    rows = zlib.compress(bytes(SIDE * (SIDE + 1)))
-    head = struct.pack(">IIBBBBB", SIDE, SIDE, 8, 0, 0, 0, 0)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    path.write_bytes(plain_png(SIDE, SIDE))
 
 
 def grey_jpeg(path: Path) -> None:
@@ -45,6 +37,11 @@ def zipped_points(path: Path) -> None:
         archive.writestr("points.xyz", b"1 2 3\n" * 30_000_000)
 
 
+def gzipped_points(path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 30000000\n" + "".join(f"property float {x}\n" for x in "xyz")
+    path.write_bytes(gzip.compress(f"{header}end_header\n".encode() + b"0 0 0\n" * 30_000_000, 6))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is measured on Linux")
 @pytest.mark.parametrize(
     ("name", "write", "read", "largest"),
@@ -52,6 +49,10 @@ def zipped_points(path: Path) -> None:
         ("image.png", grey_png, read_image, 100_000),
         ("image.jpg", grey_jpeg, read_image, 1_100_000),
         ("points.zip", zipped_points, read_points, 600_000),
+        *[
+            pytest.param(f"points.{ending}", gzipped_points, read_points, 600_000, marks=pytest.mark.slow)
+            for ending in ("ply.gz", "gz", "tar.gz", "ply")
+        ],
     ],
 )
 def test_small_files_that_ask_for_much_memory_are_refused(

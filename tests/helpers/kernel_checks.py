@@ -1,6 +1,7 @@
 """What tests of kernels have in common."""
 
 import pytest
+import torch
 
 
 def assembly(kernel, *types):
@@ -19,3 +20,16 @@ def avx_assembly(kernel, *types):
     if "ymm" not in text:
         pytest.skip("no AVX")
     return text
+
+
+def check_bits(run, threads):
+    """Each of these numbers of threads gives the same tensors, to the bit."""
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for count in threads:
+            torch.set_num_threads(count)
+            results.append(run())
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for some in results for a, b in zip(some, results[0], strict=True))

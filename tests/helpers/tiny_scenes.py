@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import zlib
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel
 from kgs.ply import save_ply
 
-__all__ = ["narrow_lpips", "write_blender", "write_colmap", "write_llff", "write_nerfstudio", "write_photos"]
-__all__ += ["write_config", "write_image", "write_lpips", "write_ply"]
+__all__ = ["narrow_lpips", "plain_png", "png_chunk", "png_of", "write_blender", "write_colmap", "write_config"]
+__all__ += ["write_image", "write_llff", "write_lpips", "write_nerfstudio", "write_photos", "write_ply"]
 
 _SIZE = (16, 12)
 _NAMES = ("0.png", "1.png", "2.png")
@@ -121,6 +122,23 @@ def write_nerfstudio(root: Path) -> None:
 def write_image(folder: Path, suffix: str, channels: int = 3) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (12, 16, channels), np.uint8)
     cv2.imwrite(str(folder / f"image.{suffix}"), noise)
+
+
+def png_chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png_of(rows: bytes, width: int, height: int, color_type: int = 0) -> bytes:
+    """A PNG of 8 bits, of rows that are compressed already."""
+    head = struct.pack(">IIBBBBB", width, height, 8, color_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", head) + png_chunk(b"IDAT", rows) + png_chunk(b"IEND", b"")
+
+
+def plain_png(width: int, height: int) -> bytes:
+    """A black PNG whose data are as small as they can be: no encoder at hand writes it without taking the memory."""
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes(width + 1)) for _ in range(height)) + packer.flush()
+    return png_of(rows, width, height)
 
 
 def write_ply(folder: Path, text: bool = False) -> None:

@@ -4,7 +4,7 @@ import re
 
 import pytest
 import torch
-from kernel_checks import avx_assembly
+from kernel_checks import avx_assembly, check_bits
 
 from kgs.init_points import matching
 
@@ -52,14 +52,7 @@ def test_the_first_of_equal_pairs_has_the_other_as_its_rival(monkeypatch):
 
 
 def test_bits_do_not_depend_on_threads():
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(matches(keypoints(333, 444), "numba"))
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for some in results for a, b in zip(some, results[0], strict=True))
+    check_bits(lambda: matches(keypoints(333, 444), "numba"), (1, 2, 3))
 
 
 @pytest.mark.slow

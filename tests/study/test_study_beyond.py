@@ -55,12 +55,6 @@ def test_the_orbit_s_cameras_lie_on_a_larger_circle():
     torch.testing.assert_close(far - middle, 2 * (near - middle), atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("out", "count"), [(0.0, 6), (float("nan"), 6), (1.0, 0)])
-def test_places_out_of_range_are_named(out, count):
-    with pytest.raises(ValueError, match=r"^out, count: expected"):
-        views_beyond("room", out, count, (6, 8))
-
-
 @pytest.mark.slow
 def test_the_sky_of_the_arc_is_as_good_as_infinitely_far_away(arc):
     depths = synthetic_depths(arc.train.cameras, "arc")

@@ -7,6 +7,7 @@ import torch
 from study_rows import made_up, tiny_cell
 
 from kgs import DataError
+from kgs.datasets.synthetic import views_beyond
 from kgs.study.beyond import beyond_cell, beyond_cells
 from kgs.study.cells import sparse_cell
 from kgs.study.grid import read_rows, run_grid
@@ -40,6 +41,10 @@ CASES = [
     ("FOLDER: llff/fern", DataError, lambda folder: beyond_cells(folder)),
     ("llff/fern", DataError, lambda _: sparse_cell(tiny_cell() | {"scene": "llff/fern"})),
     ("llff/fern", DataError, lambda _: beyond_cell(tiny_cell() | {"scene": "llff/fern"})),
+    *[
+        ("out, count", ValueError, lambda _, out=out, count=count: views_beyond("room", out, count, (6, 8)))
+        for out, count in ((0.0, 6), (float("nan"), 6), (1.0, 0))
+    ],
     ("cells", ValueError, lambda folder: run_grid([{"x": 1}, {"x": 1}], json.dumps, folder / "g.jsonl")),
     ("processes", ValueError, lambda folder: run_grid([{"x": 1}], json.dumps, folder / "g.jsonl", processes=0)),
     ("FOLDER/g.jsonl: line 1", ValueError, damaged_lines),

@@ -1,5 +1,7 @@
-"""Scores of Gaussians, and the fits that use them."""
+"""Scores of Gaussians, the selections and the penalty by scores, and the fits that use them."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import pytest
@@ -8,7 +10,7 @@ import torch
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
-from kgs.study.rivals import Rival, RivalTrainer, gaussian_scores
+from kgs.study.rivals import Rival, RivalTrainer, SelectiveDrop, gaussian_scores, opacity_l1
 
 CONFIG = FitConfig(steps=40, drop=0.4, seed=2, evaluations=1, recipe=Recipe(grad_threshold=1e-5))
 
@@ -84,3 +86,101 @@ def test_the_penalty_lowers_opacities_the_more_the_higher_the_score(scene, point
         distances = [gaussian_scores("far", without.state.densifier, camera) for camera in cameras]
         order = torch.stack(distances).mean(0).argsort()
         assert float(fall[order[75:]].mean()) > float(fall[order[:75]].mean())
+
+
+# -- which Gaussians go when a selection replaces chance -------------------------------------------------------------
+
+
+def layer(rate, scores):
+    drop = SelectiveDrop(p=rate, schedule="constant")
+    drop.scores = scores
+    return drop
+
+
+@pytest.mark.parametrize("shape", [(10,), (10, 1)])
+def test_the_highest_scores_go_and_the_rest_is_scaled(shape):
+    scores = torch.tensor([3.0, 9.0, 1.0, 7.0, 5.0, 0.0, 8.0, 2.0, 6.0, 4.0]).reshape(shape)
+    out = layer(0.3, scores)(torch.full(shape, 0.7))
+    expected = torch.full((10,), 0.7 / 0.7)
+    expected[[1, 6, 3]] = 0.0
+    torch.testing.assert_close(out, expected.reshape(shape))
+
+
+def test_each_cameras_row_has_its_own_selection():
+    scores = torch.tensor([[1.0, 2.0, 3.0, 4.0], [4.0, 3.0, 2.0, 1.0]])
+    out = layer(0.25, scores)(torch.ones(2, 4))
+    assert (out == 0).tolist() == [[False, False, False, True], [True, False, False, False]]
+
+
+@pytest.mark.parametrize(("rate", "count"), [(0.0, 0), (0.004, 0), (0.2, 20), (0.999, 100)])
+def test_the_number_is_the_rounded_share(rate, count):
+    out = layer(rate, torch.randperm(100, generator=torch.Generator().manual_seed(0)).float())(torch.ones(100))
+    assert int((out == 0).sum()) == count
+
+
+def test_equal_scores_go_in_order_and_nothing_is_random():
+    drop = layer(0.5, torch.zeros(6))
+    for _ in range(3):
+        assert drop(torch.ones(6)).tolist() == [0.0, 0.0, 0.0, 2.0, 2.0, 2.0]
+
+
+def test_eval_is_the_identity_and_none_brings_chance_back():
+    drop, x = layer(0.5, torch.arange(1000.0)), torch.ones(1000)
+    assert drop.eval()(x) is x
+    drop.train().scores = None
+    assert 400 < int((drop(x)[:] == 0).sum()) < 600
+    assert int((drop(x)[:500] == 0).sum()) > 0
+
+
+def test_gradients_are_the_factor_or_zero():
+    x = torch.full((4,), 0.3, requires_grad=True)
+    layer(0.25, torch.tensor([0.0, 5.0, 1.0, 2.0]))(x).sum().backward()
+    torch.testing.assert_close(x.grad, torch.tensor([4 / 3, 0.0, 4 / 3, 4 / 3]))
+
+
+def test_scores_do_not_touch_the_stream_of_masks():
+    plain, scored = (SelectiveDrop(p=0.4, schedule="constant", seed=3) for _ in range(2))
+    scored.scores = torch.arange(50.0)
+    scored(torch.ones(50))
+    scored.scores = None
+    assert torch.equal(plain(torch.ones(50)), scored(torch.ones(50)))
+
+
+def test_they_are_plain_attributes():
+    drop = layer(0.5, torch.arange(4.0))
+    assert drop.state_dict() == {}
+    assert list(drop.parameters()) == []
+    for twin in (copy.deepcopy(drop), pickle.loads(pickle.dumps(drop))):
+        assert twin(torch.ones(4)).tolist() == [2.0, 2.0, 0.0, 0.0]
+    assert SelectiveDrop().scores is None
+
+
+# -- the L1 penalty on opacities --------------------------------------------------------------------------------------
+
+
+def test_against_scipys_ranks():
+    stats = pytest.importorskip("scipy.stats")
+    generator = torch.Generator().manual_seed(0)
+    scores = torch.randint(0, 30, (200,), generator=generator).double()
+    opacities = torch.rand(200, generator=generator, dtype=torch.float64)
+    weights = (torch.from_numpy(stats.rankdata(scores.numpy())) - 0.5) / 200
+    torch.testing.assert_close(opacity_l1(opacities, scores), (weights * opacities).mean(), rtol=1e-13, atol=0)
+
+
+def test_gradcheck_and_no_gradient_for_scores():
+    x = torch.rand(6, dtype=torch.float64, requires_grad=True)
+    scores = torch.rand(6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: opacity_l1(x, scores), (x,))
+    opacity_l1(x, scores).backward()
+    assert scores.grad is None
+
+
+def test_no_gaussians_and_one():
+    assert float(opacity_l1(torch.empty(0), torch.empty(0))) == 0.0
+    assert float(opacity_l1(torch.tensor([0.8]), torch.tensor([5.0]))) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("name", "x", "scores"), [("opacities", (3, 1), (3, 1)), ("scores", (3,), (4,))])
+def test_other_shapes_are_refused(name, x, scores):
+    with pytest.raises(ValueError, match=name):
+        opacity_l1(torch.rand(x), torch.rand(scores))
