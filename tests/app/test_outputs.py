@@ -2,6 +2,7 @@
 
 import json
 import os
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -101,6 +102,103 @@ def test_what_is_about_to_be_written_is_own_and_kinds_do_not_touch_each_other(li
 def test_a_damaged_list_names_nothing(listed, content):
     (listed / LIST).write_text(content)
     assert not is_own(listed / "a.txt")
+
+
+@pytest.mark.parametrize("name", ["../mine.txt", "{}/mine.txt", "deeper/../../mine.txt", "", ".", "deeper"])
+def test_a_list_that_names_more_than_files_below_its_folder_removes_nothing_else(tmp_path, name):
+    out = tmp_path / "out"
+    (out / "deeper").mkdir(parents=True)
+    (tmp_path / "mine.txt").write_text("mine")
+    write_json(out / LIST, {"fit": {name.format(tmp_path): None}})
+    assert not is_own(out / "../mine.txt")
+    write_results(Staging(out), {"a.txt": "new"})
+    Staging(out).complete()
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert contents(out) == {"a.txt": "new"}
+
+
+def write_results(staging, files):
+    """Write and seal results."""
+    staging.start()
+    for name, text in files.items():
+        (staging.unfinished / name).parent.mkdir(exist_ok=True)
+        (staging.unfinished / name).write_text(text)
+    staging.seal()
+
+
+def contents(folder):
+    """The texts of all files that are not hidden."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name[0] != "."]
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+
+
+def test_a_kill_at_any_call_leaves_old_or_new_results(tmp_path, monkeypatch):
+    old = {"a.txt": "old", "test/0.txt": "old", "test/1.txt": "old"}
+    new = {"a.txt": "new", "b.txt": "new", "test/0.txt": "new"}
+    steps = ("mkdir", "replace", "rmdir", "unlink")
+    plain = {name: getattr(os, name) for name in steps}
+    calls = 0
+    kill_at = 0
+    found = []
+    is_done = False
+
+    def until_killed(name, *arguments, **options):
+        nonlocal calls
+        calls += 1
+        if calls > kill_at:
+            raise KeyboardInterrupt
+        return plain[name](*arguments, **options)
+
+    while not is_done:
+        staging = Staging(tmp_path / str(kill_at))
+        write_results(staging, old)
+        staging.complete()
+        (staging.unfinished / "test").mkdir(parents=True)
+        for name in (LIST, "test/0.txt"):
+            (staging.unfinished / name).write_text("{}")  # of a fit that was killed
+        calls = 0
+        with monkeypatch.context() as patch:
+            for name in steps:
+                patch.setattr(os, name, partial(until_killed, name))
+            try:
+                write_results(staging, new)
+                staging.complete()
+                is_done = True
+            except KeyboardInterrupt:
+                is_done = False
+        for folder in (staging.unfinished, staging.finished):
+            assert not folder.exists() or is_own(folder), kill_at
+        moved = [staging.out / name for name in old | new if (staging.out / name).exists()]
+        assert all(map(is_own, moved)), kill_at
+        staging.complete()
+        assert not staging.finished.exists()
+        staging.start()
+        now = contents(staging.out)
+        assert now in (old, new), kill_at
+        found.append(now)
+        kill_at += 1
+    first_new = found.index(new)
+    assert first_new > 0
+    assert found[first_new:] == [new] * (len(found) - first_new)
+
+
+def test_a_kill_while_waiting_results_are_discarded_does_not_publish_half_of_them(tmp_path, monkeypatch):
+    staging = Staging(tmp_path, "photos")
+    write_results(staging, {"a.txt": "old", "b.txt": "old"})
+    staging.complete()
+    write_results(staging, {"a.txt": "new", "b.txt": "new"})
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", lambda *_, **__: (staging.finished / "a.txt").unlink(missing_ok=True))
+        staging.discard()
+    assert staging.finished.exists()
+    staging.complete()
+    assert (tmp_path / "a.txt").read_text() == (tmp_path / "b.txt").read_text() == "old"
+
+
+def test_a_picture_with_a_hidden_name_is_kept(tmp_path):
+    write_results(Staging(tmp_path), {"test/.0.png": "picture"})
+    Staging(tmp_path).complete()
+    assert (tmp_path / "test" / ".0.png").exists()
 
 
 def test_a_folder_is_own_with_a_list_or_empty(tmp_path):

@@ -14,12 +14,11 @@ from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
 from kgs.app.cli import main
-from kgs.app.cli.unposed import settle
 from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import record
+from kgs.app.files.results_folder import photo_staging
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
-from kgs.app.sfm.place import photo_staging
 from kgs.app.sfm.read import blurred, open_photos, read_photos
 from kgs.errors import DataError
 from kgs.json_files import write_json
@@ -334,7 +333,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         assert (report["reused"], report["folder"]) == (reused, str(out / "finished-photos"))
         assert len(report["photos"]) == 4
         assert placed() == (3, 3)
-    settle(out)
+    photo_staging(out).complete()
     assert placed() == (4, 4)
     assert not (out / "finished-photos").exists()
     (folder / "IMG_4.png").unlink()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.errors import printable
+from kgs.errors import DataError, printable
 from kgs.fit.config import DEMO, DEMO_STEPS, Backend, FitConfig
 
 from .options import Out
@@ -130,6 +130,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
 def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:
     """Check the arguments of `kgs demo`."""
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.ownership import read_list
 
     from .checks import check_installed
 
@@ -138,10 +139,13 @@ def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backen
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     check_installed(device, backend, "matplotlib", "jinja2")
     check_folder(out, _files(), make=False)
+    if "fit" in read_list(out):
+        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
 
 
 def _files() -> list[str]:
     """The files that the demo writes."""
     from kgs.app.files.outputs import EXPORTS
 
-    return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS]
+    folders = ["unfinished-demo", "finished-demo"]
+    return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS, *folders]

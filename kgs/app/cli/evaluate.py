@@ -28,7 +28,8 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.ownership import is_own, record
+    from kgs.app.files.outputs import NOT_OWN
+    from kgs.app.files.ownership import claim, is_own, record
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.json_files import write_json
@@ -41,15 +42,17 @@ def evaluate(
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
     metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
+    has_own_page = is_own(out / PAGE) or not (out / PAGE).exists()
+    written = [path.name, PAGE] if has_own_page else [path.name]
+    claim(out, "fit", written)
     write_json(path, metrics)
-    written = [path.name]
-    if (out / PAGE).exists() and not is_own(out / PAGE):
-        say(f"{printable(out / PAGE)} was not written by kgs, or was changed since, and is kept")
-    else:
+    if has_own_page:
         write_own_page(out, out, replace(fit, metrics=metrics), request)
-        written.append(PAGE)
     record(out, "fit", written)
     say(as_text(metrics))
+    if not has_own_page:
+        say(f"{printable(path)} is up to date; {printable(out / PAGE)} {NOT_OWN}, and is kept")
+        return
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")
 

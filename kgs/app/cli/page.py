@@ -84,6 +84,7 @@ def check_page(
     cameras: Path, out: Path, downscale: float | None, roll: float, device: str, backend: str, **_: Any
 ) -> None:
     """Check the arguments of `kgs page`."""
+    from kgs.app.files.outputs import NOT_OWN
     from kgs.app.files.ownership import is_own
     from kgs.datasets.options import check_options
 
@@ -95,9 +96,7 @@ def check_page(
     if out.suffix != ".html":
         raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
     if out.exists() and not is_own(out):
-        raise DataError(
-            out, "", "was not written by kgs, or was changed since, and would be overwritten: choose another file"
-        )
+        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
     check_scene(cameras)

@@ -5,7 +5,7 @@ in it, or that was changed since, is the user's, and kgs neither overwrites nor 
 """
 
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from kgs.errors import DataError
@@ -17,9 +17,9 @@ Entries = dict[str, Any]  # [size, modification time in ns] by name; None: about
 
 
 def is_own(path: Path) -> bool:
-    """Whether kgs wrote this file, and nothing has changed it since; an own folder has a list, or is empty."""
+    """Whether kgs wrote this file, and nothing has changed it since; an own folder has a list, or own files alone."""
     if path.is_dir():
-        return (path / LIST).is_file() or not any(path.iterdir())
+        return not path.is_symlink() and ((path / LIST).is_file() or holds_only_own(path))
     if not path.is_file():
         return False
     for folder in path.absolute().parents[:_DEPTH]:
@@ -39,12 +39,16 @@ def holds_only_own(folder: Path) -> bool:
 
 
 def read_list(folder: Path) -> dict[str, Entries]:
-    """The list of a folder: entries by kind of result; empty if there is none, or it is damaged."""
+    """The list of a folder: entries by kind of result; empty if there is none, or it is damaged.
+
+    Names that lead out of the folder are left out: what is listed may be removed.
+    """
     try:
         kinds = read_json(folder / LIST)
     except DataError:
         return {}
-    return {kind: entries for kind, entries in kinds.items() if isinstance(entries, dict)}
+    lists = {kind: entries for kind, entries in kinds.items() if isinstance(entries, dict)}
+    return {kind: {name: entries[name] for name in filter(_is_below, entries)} for kind, entries in lists.items()}
 
 
 def claim(folder: Path, kind: str, names: Iterable[str]) -> None:
@@ -69,6 +73,12 @@ def stamps(folder: Path, names: Iterable[str]) -> Entries:
 
 def _merge(folder: Path, kind: str, entries: Entries) -> None:
     replace_entries(folder, kind, read_list(folder).get(kind, {}) | entries)
+
+
+def _is_below(name: str) -> bool:
+    """Whether a name leads to a place below the folder that it is relative to."""
+    path = PurePath(name)
+    return not path.anchor and ".." not in path.parts
 
 
 def _stamp(path: Path) -> list[int]:
