@@ -61,8 +61,9 @@ def load_fit(
     if backend == "auto" and model.means.device.type == "cpu":
         backend = values["backend"]
     if values["step"] != metrics.get("steps"):
-        reason = f"expected that of metrics.json, {metrics.get('steps')}, got {values['step']}"
-        raise DataError(path, "step", f"{damage or reason}: resume the fit")
+        whose = "that of the previous checkpoint, " if damage else ""
+        reason = f"expected that of metrics.json, {metrics.get('steps')}, got {whose}{values['step']}: resume the fit"
+        raise DataError(path, "step", reason)
     if damage and say is not None:
         say(f"{damage}; the previous checkpoint is used")
     scene = _place(request.load(out, say), path, values)

@@ -33,6 +33,7 @@ from kgs.fit.plan import make_plan, with_pace
 from kgs.fit.prune import prune
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
+from kgs.metrics import evaluate as measures
 
 CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))
 OTHER = replace(CONFIG, seed=1)
@@ -280,6 +281,19 @@ def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done:
     save_checkpoint(done / CHECKPOINT, state | {"step": 4})
     with pytest.raises(DataError, match="step: expected that of metrics.json, 5, got 4"):
         load_fit(done)
+
+
+def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Path, monkeypatch: Any) -> None:
+    plain = measures.measure_again
+
+    def meanwhile(*arguments: Any) -> Any:
+        fit(scene, OTHER, done)
+        return plain(*arguments)
+
+    monkeypatch.setattr(measures, "measure_again", meanwhile)
+    with pytest.raises(DataError, match="a new fit took the place"):
+        evaluate(done)
+    assert seed_of(done) == 1
 
 
 def test_an_eval_that_fails_while_it_writes_leaves_files_of_kgs(scene: Any, done: Path, monkeypatch: Any) -> None:

@@ -53,7 +53,7 @@ def demo(
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
-    level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
+    level = {name: [_level(run[part]) for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():
         columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
         say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
@@ -110,7 +110,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
         say(note)
     write_json(folder / "metrics.json", runs)
     write_curve(folder / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
-    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs[name]["test"]["views"]]
+    levels = list(map(_level, runs[name]["test"]["views"]))
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
     cameras = [scene.test.camera(i) for i in range(len(scene.test))]
     renders = {title: [one.render(camera)[0] for camera in cameras] for title, one in fits.items()}
@@ -125,6 +125,11 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     staging.seal()
     staging.complete()
     return runs
+
+
+def _level(measures: dict[str, Any]) -> float:
+    """The PSNR among measures, in dB."""
+    return math.inf if measures["psnr"] is None else float(measures["psnr"])
 
 
 def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:

@@ -32,7 +32,7 @@ def evaluate(
     from kgs.app.files.ownership import claim, is_own, record
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
-    from kgs.json_files import write_json
+    from kgs.json_files import read_json, write_json
     from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
@@ -44,6 +44,8 @@ def evaluate(
     metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
     has_own_page = is_own(out / PAGE) or not (out / PAGE).exists()
     written = [path.name, PAGE] if has_own_page else [path.name]
+    if read_json(path) != fit.metrics:
+        raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
     claim(out, "fit", written)
     write_json(path, metrics)
     if has_own_page:

@@ -73,7 +73,7 @@ def page(
     )
     record(out.parent, "page", [out.name])
     level = fit.metrics["views"]["psnr"]
-    measured = f", PSNR {level:.4g}" if level else ""
+    measured = f", PSNR {level:.4g}" if level is not None else ""
     say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos{measured}")
     if cost:
         say(f"the page shows {cost}; {printable(ply)} has everything")
