@@ -18,7 +18,7 @@ import torch
 
 from kgs.app import fit_folder as app
 from kgs.app.cli.demo import check_demo
-from kgs.app.cli.evaluate import evaluate
+from kgs.app.cli.evaluate import check_evaluate, evaluate
 from kgs.app.files import staging
 from kgs.app.files.ownership import is_own
 from kgs.app.files.results_folder import CHECKPOINT, locked, photo_staging
@@ -294,6 +294,12 @@ def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Pa
     with pytest.raises(DataError, match="a new fit took the place"):
         evaluate(done)
     assert seed_of(done) == 1
+
+
+def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
+    staging.Staging(tmp_path).start()
+    with pytest.raises(DataError, match="kgs fit --resume"):
+        check_evaluate(tmp_path, None, "cpu", "auto")
 
 
 def test_an_eval_that_fails_while_it_writes_leaves_files_of_kgs(scene: Any, done: Path, monkeypatch: Any) -> None:

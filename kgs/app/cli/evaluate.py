@@ -70,7 +70,11 @@ def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: 
     check_installed(device, backend, "jinja2")
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    if not Staging(out).finished.exists():
-        if not (out / "config.json").exists():
-            raise DataError(out / "config.json", "", "cannot be read: expected the folder of the results of kgs fit")
-        read_json(out / "config.json")
+    staging = Staging(out)
+    config = out / "config.json"
+    if not staging.finished.exists():
+        if not config.exists() and staging.unfinished.exists():
+            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        if not config.exists():
+            raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
+        read_json(config)

@@ -42,7 +42,7 @@ def find_scene(
     from kgs.app.sfm import pose_photos
     from kgs.app.sfm.find import notes_on
 
-    complete_stopped_move(out)  # its cameras are in the place of those that may have to wait now
+    complete_stopped_move(out)  # with its cameras, before others wait in their place
     for note in notes_on(photos):
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
