@@ -9,6 +9,7 @@ import cv2
 import pytest
 import torch
 
+from kgs.app.files import ownership
 from kgs.app.files.outputs import check_folder, png_names, write_png
 from kgs.app.files.ownership import LIST, claim, holds_only_own, is_own, read_list, record
 from kgs.app.files.staging import Staging
@@ -98,6 +99,21 @@ def test_what_is_about_to_be_written_is_own_and_kinds_do_not_touch_each_other(li
     assert set(read_list(listed)["fit"]) == {"a.txt", "deeper/b.txt"}
 
 
+def test_a_list_is_read_once_for_all_its_files(tmp_path, monkeypatch):
+    """A folder may have thousands of renders."""
+    reads = []
+    plain = ownership.read_json
+    monkeypatch.setattr(ownership, "read_json", lambda path: reads.append(path) or plain(path))
+    names = [f"{i}.png" for i in range(50)]
+    for name in names:
+        (tmp_path / name).touch()
+    record(tmp_path, "renders", names)
+    check_folder(tmp_path, names)
+    assert len(reads) == 1
+    record(tmp_path, "fit", [])
+    assert read_list(tmp_path)["fit"] == {}
+
+
 @pytest.mark.parametrize("content", ["", "[]", "null", '{"fit": 3}', '{"fit": {"a.txt": 3}}'])
 def test_a_damaged_list_names_nothing(listed, content):
     (listed / LIST).write_text(content)
@@ -110,7 +126,6 @@ def test_a_list_that_names_more_than_files_below_its_folder_removes_nothing_else
     (out / "deeper").mkdir(parents=True)
     (tmp_path / "mine.txt").write_text("mine")
     write_json(out / LIST, {"fit": {name.format(tmp_path): None}})
-    assert not is_own(out / "../mine.txt")
     write_results(Staging(out), {"a.txt": "new"})
     Staging(out).complete()
     assert (tmp_path / "mine.txt").read_text() == "mine"

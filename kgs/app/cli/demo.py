@@ -149,8 +149,10 @@ def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backen
 
 
 def _files() -> list[str]:
-    """The files that the demo writes."""
+    """The files and folders that the demo writes."""
     from kgs.app.files.outputs import EXPORTS
+    from kgs.app.files.staging import Staging
 
-    folders = ["unfinished-demo", "finished-demo"]
+    staging = Staging(Path(), "demo")
+    folders = [staging.unfinished.name, staging.finished.name]
     return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS, *folders]

@@ -5,13 +5,15 @@ in it, or that was changed since, is the user's, and kgs neither overwrites nor 
 """
 
 from collections.abc import Iterable
-from pathlib import Path, PurePath
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
 
 LIST = ".kgs.json"
+WAITING = {"fit": "finished", "photos": "finished-photos", "demo": "finished-demo"}  # folders by kind, see `staging.py`
 _DEPTH = 3  # levels of folders between a file and the list that names it
 Entries = dict[str, Any]  # [size, modification time in ns] by name; None: about to be written
 
@@ -39,16 +41,13 @@ def holds_only_own(folder: Path) -> bool:
 
 
 def read_list(folder: Path) -> dict[str, Entries]:
-    """The list of a folder: entries by kind of result; empty if there is none, or it is damaged.
-
-    Names that lead out of the folder are left out: what is listed may be removed.
-    """
+    """The list of a folder, not to be changed: entries by kind of result; empty if there is none, or it is damaged."""
+    path = folder.absolute() / LIST
     try:
-        kinds = read_json(folder / LIST)
-    except DataError:
+        status = path.stat()
+        return _read(path, status.st_ino, status.st_size, status.st_mtime_ns)
+    except (DataError, OSError):
         return {}
-    lists = {kind: entries for kind, entries in kinds.items() if isinstance(entries, dict)}
-    return {kind: {name: entries[name] for name in filter(_is_below, entries)} for kind, entries in lists.items()}
 
 
 def claim(folder: Path, kind: str, names: Iterable[str]) -> None:
@@ -64,6 +63,7 @@ def record(folder: Path, kind: str, names: Iterable[str]) -> None:
 def replace_entries(folder: Path, kind: str, entries: Entries) -> None:
     """Put entries in place of all former ones of a kind."""
     write_json(folder / LIST, read_list(folder) | {kind: entries})
+    _read.cache_clear()
 
 
 def stamps(folder: Path, names: Iterable[str]) -> Entries:
@@ -75,10 +75,10 @@ def _merge(folder: Path, kind: str, entries: Entries) -> None:
     replace_entries(folder, kind, read_list(folder).get(kind, {}) | entries)
 
 
-def _is_below(name: str) -> bool:
-    """Whether a name leads to a place below the folder that it is relative to."""
-    path = PurePath(name)
-    return not path.anchor and ".." not in path.parts
+@lru_cache(maxsize=16)
+def _read(path: Path, *_: int) -> dict[str, Entries]:
+    """A list as it is at a time: it is read once for all files that are looked for in it."""
+    return {kind: entries for kind, entries in read_json(path).items() if isinstance(entries, dict)}
 
 
 def _stamp(path: Path) -> list[int]:
@@ -88,5 +88,5 @@ def _stamp(path: Path) -> list[int]:
 
 def _waiting(folder: Path) -> Iterable[Entries]:
     """Entries of whole results that a kill kept from being moved to this folder, or from being entered in its list."""
-    for waiting in folder.glob("finished*"):
-        yield from read_list(waiting).values()
+    for waiting in WAITING.values():
+        yield from read_list(folder / waiting).values()

@@ -9,9 +9,9 @@ came in between.
 import os
 import shutil
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
-from .ownership import LIST, Entries, holds_only_own, is_own, read_list, replace_entries, stamps
+from .ownership import LIST, WAITING, Entries, holds_only_own, is_own, read_list, replace_entries, stamps
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Staging:
 
     Args:
         out: where the results belong.
-        kind: of the results, which tells them apart from others in the same folder.
+        kind: of the results, a key of `WAITING`, which tells them apart from others in the same folder.
     """
 
     out: Path
@@ -29,12 +29,12 @@ class Staging:
     @property
     def unfinished(self) -> Path:
         """Where new results are written."""
-        return self.out / f"unfinished{self._suffix}"
+        return self.out / f"un{WAITING[self.kind]}"
 
     @property
     def finished(self) -> Path:
         """Where whole results wait until they are moved to `out`."""
-        return self.out / f"finished{self._suffix}"
+        return self.out / WAITING[self.kind]
 
     @property
     def is_waiting(self) -> bool:
@@ -68,7 +68,7 @@ class Staging:
         former = read_list(self.out).get(self.kind, {})
         for name in former:
             path = self.out / name
-            if name not in new and path.is_file() and is_own(path):
+            if name not in new and _is_below(name) and path.is_file() and is_own(path):
                 path.unlink()
                 _remove_empty(path.parent, self.out)
         for name in _files(self.finished):
@@ -94,10 +94,6 @@ class Staging:
                 path.unlink()
         shutil.rmtree(folder)
 
-    @property
-    def _suffix(self) -> str:
-        return "" if self.kind == "fit" else f"-{self.kind}"
-
     def _sealed(self) -> Entries:
         """The entries of whole results, those that were moved before a kill included."""
         return read_list(self.finished).get(self.kind, {})
@@ -107,6 +103,12 @@ def _files(folder: Path) -> list[str]:
     """The files of a folder and its subfolders, without its list and those that a kill left half written."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix not in (".partial", ".tmp")]
     return [path.relative_to(folder).as_posix() for path in files if path.name != LIST]
+
+
+def _is_below(name: str) -> bool:
+    """Whether a name in a list leads to a place below its folder; a damaged list may have others."""
+    path = PurePath(name)
+    return not path.anchor and ".." not in path.parts
 
 
 def _remove_empty(folder: Path, root: Path) -> None:
