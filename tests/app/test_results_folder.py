@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import time
 import warnings
 from dataclasses import replace
@@ -19,6 +20,7 @@ import torch
 from kgs.app import fit_folder as app
 from kgs.app.cli.demo import check_demo
 from kgs.app.cli.evaluate import check_evaluate, evaluate
+from kgs.app.cli.unposed import find_scene
 from kgs.app.files import staging
 from kgs.app.files.ownership import is_own
 from kgs.app.files.results_folder import CHECKPOINT, locked, photo_staging
@@ -269,6 +271,21 @@ def test_cameras_that_waited_for_a_fit_come_with_it(
     assert seed_of(done) == 1
     assert (done / "photos.json").exists() == is_placed
     assert photos.is_waiting != is_placed
+
+
+def test_a_stopped_move_is_completed_before_other_cameras_are_found(scene: Any, done: Path, monkeypatch: Any) -> None:
+    """They may have to wait in the place of the cameras of the fit that is moved."""
+    with monkeypatch.context() as patch:
+        patch.setattr(staging.Staging, "complete", lambda self: None)
+        fit(scene, OTHER, done)
+    found = []
+    monkeypatch.setattr("kgs.app.sfm.find.notes_on", lambda photos: [])
+    monkeypatch.setattr(
+        "kgs.app.sfm.pose_photos", lambda *_, **__: found.append(seed_of(done)) or sys.exit("no cameras")
+    )
+    with pytest.raises(SystemExit):
+        find_scene(Path("/photos"), done, SceneRequest("/photos"), seed=0)
+    assert found == [1]
 
 
 def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done: Path) -> None:
