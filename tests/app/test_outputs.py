@@ -2,6 +2,7 @@
 
 import json
 import os
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 
 from kgs.app.files import ownership
 from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.ownership import LIST, claim, holds_only_own, is_own, read_list, record
+from kgs.app.files.ownership import LIST, holds_only_own, is_own, read_list, writing
 from kgs.app.files.staging import Staging
 from kgs.errors import DataError
 from kgs.json_files import write_json, write_whole
@@ -56,7 +57,8 @@ def listed(tmp_path):
     (tmp_path / "deeper").mkdir()
     for name in ("a.txt", "deeper/b.txt"):
         (tmp_path / name).write_text("kgs")
-    record(tmp_path, "fit", ["a.txt", "deeper/b.txt"])
+    with writing(tmp_path, "fit", ["a.txt", "deeper/b.txt"]):
+        pass
     return tmp_path
 
 
@@ -90,13 +92,21 @@ def test_an_own_file_that_was_changed_is_the_users(listed, change):
 
 
 def test_what_is_about_to_be_written_is_own_and_kinds_do_not_touch_each_other(listed):
-    claim(listed, "renders", ["a.txt", "new.png"])
-    write_png(listed / "new.png", torch.zeros(3, 4, 5))
-    assert is_own(listed / "new.png")  # a kill may come before its entry
-    record(listed, "renders", ["new.png"])
+    with writing(listed, "renders", ["a.txt", "new.png"]):
+        write_png(listed / "new.png", torch.zeros(3, 4, 5))
+        assert is_own(listed / "new.png")  # a kill may come now
     (listed / "new.png").write_text("mine")
     assert not is_own(listed / "new.png")
     assert set(read_list(listed)["fit"]) == {"a.txt", "deeper/b.txt"}
+
+
+def test_what_a_command_that_failed_did_not_write_is_not_own(listed):
+    with suppress(KeyboardInterrupt), writing(listed, "renders", ["0.png", "1.png"]):
+        write_png(listed / "0.png", torch.zeros(3, 4, 5))
+        raise KeyboardInterrupt
+    (listed / "1.png").write_text("mine")
+    assert is_own(listed / "0.png")
+    assert not is_own(listed / "1.png")
 
 
 def test_a_list_is_read_once_for_all_its_files(tmp_path, monkeypatch):
@@ -107,10 +117,13 @@ def test_a_list_is_read_once_for_all_its_files(tmp_path, monkeypatch):
     names = [f"{i}.png" for i in range(50)]
     for name in names:
         (tmp_path / name).touch()
-    record(tmp_path, "renders", names)
+    with writing(tmp_path, "renders", names):
+        pass
+    reads.clear()
     check_folder(tmp_path, names)
     assert len(reads) == 1
-    record(tmp_path, "fit", [])
+    with writing(tmp_path, "fit", []):
+        pass
     assert read_list(tmp_path)["fit"] == {}
 
 
@@ -255,7 +268,8 @@ def test_no_results_among_the_files_of_a_scene(tmp_path):
         check_folder(scene, ["other.png"], tmp_path / "another scene")
     check_folder(scene / "results", ["a.png"], scene)
     write_png(scene / "results" / "a.png", torch.zeros(3, 4, 5))
-    record(scene / "results", "renders", ["a.png"])
+    with writing(scene / "results", "renders", ["a.png"]):
+        pass
     check_folder(scene / "results", ["a.png"], scene)  # again: those pictures are kgs's
 
 

@@ -29,7 +29,7 @@ def evaluate(
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
     from kgs.app.files.outputs import NOT_OWN
-    from kgs.app.files.ownership import claim, is_own, record
+    from kgs.app.files.ownership import is_own, writing
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.json_files import read_json, write_json
@@ -46,11 +46,10 @@ def evaluate(
     written = [path.name, PAGE] if has_own_page else [path.name]
     if read_json(path) != fit.metrics:
         raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
-    claim(out, "fit", written)
-    write_json(path, metrics)
-    if has_own_page:
-        write_own_page(out, out, replace(fit, metrics=metrics), request)
-    record(out, "fit", written)
+    with writing(out, "fit", written):
+        write_json(path, metrics)
+        if has_own_page:
+            write_own_page(out, out, replace(fit, metrics=metrics), request)
     say(as_text(metrics))
     if not has_own_page:
         say(f"{printable(path)} is up to date; {printable(out / PAGE)} {NOT_OWN}, and is kept")

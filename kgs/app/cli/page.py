@@ -43,7 +43,7 @@ def page(
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.ownership import claim, record
+    from kgs.app.files.ownership import writing
     from kgs.app.page.fit_page import MOST_PICTURES, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
@@ -60,18 +60,17 @@ def page(
     pictured = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train
     pictured = replace(pictured, cameras=scene.train.camera(few))  # in the frame of `scene`, whose offset differs
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
-    claim(out.parent, "page", [out.name])
-    cost = write_fit_page(
-        out,
-        f"{ply.stem}, {Path(cameras).resolve().name}",
-        {"": fit},
-        beside=pictured,
-        words=("photo", "test"),
-        notes=["Whether the splat was fitted to these photos is not known here."],
-        photos=photos,
-        roll=roll,
-    )
-    record(out.parent, "page", [out.name])
+    with writing(out.parent, "page", [out.name]):
+        cost = write_fit_page(
+            out,
+            f"{ply.stem}, {Path(cameras).resolve().name}",
+            {"": fit},
+            beside=pictured,
+            words=("photo", "test"),
+            notes=["Whether the splat was fitted to these photos is not known here."],
+            photos=photos,
+            roll=roll,
+        )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""
     say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos{measured}")

@@ -4,7 +4,8 @@ The list holds name, size and modification time of each file that kgs wrote ther
 in it, or that was changed since, is the user's, and kgs neither overwrites nor removes it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -50,14 +51,20 @@ def read_list(folder: Path) -> dict[str, Entries]:
         return {}
 
 
-def claim(folder: Path, kind: str, names: Iterable[str]) -> None:
-    """Enter files that are about to be written, so that what a killed process leaves counts as own."""
-    _merge(folder, kind, dict.fromkeys(names))
+@contextmanager
+def writing(folder: Path, kind: str, names: Iterable[str]) -> Iterator[None]:
+    """Enter the files that the block writes: before it, since a killed process leaves them, and as they are after it.
 
-
-def record(folder: Path, kind: str, names: Iterable[str]) -> None:
-    """Enter files that were written, with their sizes and times."""
-    _merge(folder, kind, stamps(folder, names))
+    What a block that fails did not write is in the list no longer.
+    """
+    names = list(names)
+    replace_entries(folder, kind, read_list(folder).get(kind, {}) | dict.fromkeys(names))
+    try:
+        yield
+    finally:
+        others = {name: entry for name, entry in read_list(folder).get(kind, {}).items() if name not in names}
+        written = [name for name in names if (folder / name).is_file()]
+        replace_entries(folder, kind, others | stamps(folder, written))
 
 
 def replace_entries(folder: Path, kind: str, entries: Entries) -> None:
@@ -69,10 +76,6 @@ def replace_entries(folder: Path, kind: str, entries: Entries) -> None:
 def stamps(folder: Path, names: Iterable[str]) -> Entries:
     """Entries of files that are there."""
     return {name: _stamp(folder / name) for name in names}
-
-
-def _merge(folder: Path, kind: str, entries: Entries) -> None:
-    replace_entries(folder, kind, read_list(folder).get(kind, {}) | entries)
 
 
 @lru_cache(maxsize=16)
