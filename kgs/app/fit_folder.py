@@ -15,7 +15,7 @@ from kgs.app.console import each, progress, say
 from kgs.app.files.figures import write_curve
 from kgs.app.files.outputs import check_folder, png_names, write_png
 from kgs.app.files.ownership import is_own
-from kgs.app.files.results_folder import CHECKPOINT, is_finished, locked, replaced_files
+from kgs.app.files.results_folder import CHECKPOINT, complete_move, is_finished, locked, replaced_files
 from kgs.app.files.staging import Staging
 from kgs.app.page.fit_page import write_own_page
 from kgs.datasets.scene import Scene
@@ -92,8 +92,8 @@ def fit_folder(
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene, names)
     with locked(out):
+        complete_move(out)
         staging = Staging(out)
-        staging.complete()
         trainer, source = _trainer(scene, config, plan, out, resume, say, stages)
         notes = _Notes(trainer, say)
         new = staging.unfinished
@@ -124,11 +124,12 @@ def fit_folder(
         folder = out
         if stopped_by and is_finished(out):
             folder = new
+            staging.enter()
             kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
             trainer.state.note(f"{kept}, where a resumed fit goes on")
         else:
             staging.seal()
-            staging.complete()
+            complete_move(out)
         notes.say_new()
     return Published(fit, stopped_by, folder)
 
@@ -164,8 +165,11 @@ def _trainer(
                 say(f"resumed at step {trainer.step}")
                 return trainer, folder
         say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
-    if is_own(out / "splat.ply"):
-        say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, resume")
+    new = Staging(out).unfinished
+    if (new / CHECKPOINT).exists():
+        say(f"{printable(new)}: the unfinished fit there is replaced now; to go on with it, use --resume")
+    elif is_own(out / "splat.ply"):
+        say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, use --resume")
     stages.begin("initial points")
     points = choose_points(scene, config, each)
     say(f"initial points: {len(points.points)} ({points.kind})")

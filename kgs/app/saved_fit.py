@@ -55,13 +55,20 @@ def load_fit(
     complete_stopped_move(out)
     request, settings = read_settings(out / "config.json")
     path = out / CHECKPOINT
-    values, _ = newest_checkpoint(path)
+    metrics = read_json(out / "metrics.json")
+    values, damage = newest_checkpoint(path)
     model = _read_model(path, values).to(device)
     if backend == "auto" and model.means.device.type == "cpu":
         backend = values["backend"]
+    if values["step"] != metrics.get("steps"):
+        whose = "that of the previous checkpoint, " if damage else ""
+        reason = f"expected that of metrics.json, {metrics.get('steps')}, got {whose}{values['step']}: resume the fit"
+        raise DataError(path, "step", reason)
+    if damage and say is not None:
+        say(f"{damage}; the previous checkpoint is used")
     scene = _place(request.load(out, say), path, values)
     options = RasterOptions(near_plane=float(values["near_plane"]), max_bytes=settings.max_bytes)
-    return request, Fit(scene, model, options, backend, settings, metrics=read_json(out / "metrics.json"))
+    return request, Fit(scene, model, options, backend, settings, metrics=metrics)
 
 
 def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:

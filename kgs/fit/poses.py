@@ -66,7 +66,9 @@ class MovingPoses:
         if self._seen is None or (found := self._seen[1].grad) is None or not bool(found.isfinite().all()):
             return scene
         view = self._seen[0]
-        motion, pose, units = self._motions[view], self.extrinsics[view], torch.ones(6, dtype=torch.float64)
+        motion = self._motions[view]
+        pose = self.extrinsics[view]
+        units = torch.ones(6, dtype=torch.float64)
         units[:3] = TRANSLATION * self.depth
         gradient = found[0].double().cpu() @ pose.mT  # with respect to a matrix that multiplies the pose from the left
         turn = gradient[:3, :3] - gradient[:3, :3].mT
@@ -75,7 +77,8 @@ class MovingPoses:
             group["lr"] = decayed(self._rate, LAST * self._rate, progress)
         self._optimizer.step()
         self.extrinsics[view] = Se3.exp((units * motion)[None]).matrix()[0] @ pose
-        motion.grad, self._seen = None, None
+        self._seen = None
+        motion.grad = None
         motion.zero_()
         self._fix_gauge()
         return place_cameras(scene, self.extrinsics)
@@ -102,10 +105,11 @@ class MovingPoses:
 
     def _fix_gauge(self) -> None:
         """Turn, move and scale the world so that mean rotation, mean centre and spread of the centres are as given."""
-        now, given = self.extrinsics, self.given
-        left, _, right = torch.linalg.svd((now[:, :3, :3].mT @ given[:, :3, :3]).sum(dim=0))
+        now = self.extrinsics
+        left, _, right = torch.linalg.svd((now[:, :3, :3].mT @ self.given[:, :3, :3]).sum(dim=0))
         turn = (left @ right).mT  # rotation of the world
-        centers, wanted = camera_centers(now), camera_centers(given)
+        centers = camera_centers(now)
+        wanted = camera_centers(self.given)
         spreads = [(places - places.mean(dim=0)).norm() for places in (centers, wanted)]
         scale = spreads[1] / spreads[0] if float(min(spreads)) > 1e-9 * self.depth else 1.0
         now[:, :3, :3] @= turn.mT

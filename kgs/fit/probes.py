@@ -16,7 +16,7 @@ from statistics import fmean, stdev
 from kgs.datasets.scene import Scene
 from kgs.datasets.splits import select_evenly
 from kgs.init_points import InitialPoints
-from kgs.metrics.evaluate import BEST
+from kgs.metrics.evaluate import comparable
 from kgs.progress import Stage, silent
 
 from .config import FitConfig, Recipe
@@ -66,7 +66,7 @@ def decide(scene: Scene, plan: Plan, choose: Choose, stage: Stage = silent) -> P
                 start = small, choose(small, short)
         small, points = start
         fit = Trainer(small, make_plan(small, short), points).fit()
-        levels[view, degree] = fit.psnr(small.test) or BEST
+        levels[view, degree] = comparable(fit.psnr(small.test))
     gains = [levels[view, DEGREE] - levels[view, 0] for view in left_out]
     gain = fmean(gains)
     noise = stdev(gains) / math.sqrt(len(gains))

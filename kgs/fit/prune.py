@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 from kgs.datasets.scene import Views
-from kgs.metrics.evaluate import BEST
+from kgs.metrics.evaluate import comparable
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -85,7 +85,7 @@ def _is_close(levels: list[float], others: list[float]) -> bool:
 def _levels(fit: Fit) -> list[float]:
     """The PSNR of each training view."""
     views = fit.scene.train
-    return [min(fit.psnr(views.select([i])) or BEST, BEST) for i in range(len(views))]
+    return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
 
 
 def contributions(model: GaussianModel, views: Views, near_plane: float, **options: Any) -> Tensor:

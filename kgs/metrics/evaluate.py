@@ -66,6 +66,11 @@ def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float 
     return round(mean, 4) if math.isfinite(mean) else None
 
 
+def comparable(level: float | None) -> float:
+    """A PSNR in dB for comparisons: one that is infinite (None), or above `BEST`, counts as `BEST`."""
+    return BEST if level is None else min(level, BEST)
+
+
 def measure_again(
     path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:

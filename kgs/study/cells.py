@@ -85,13 +85,13 @@ def fit_and_measure(
     "cpu_seconds" are those of probes, training, curve and leaving out, "wall_seconds" those of the training alone.
     `probed`, or else `config`, is what probes decide for; `rival` replaces random dropping.
     """
-    start = time.process_time()
+    begin = time.process_time()
     decided = decide(scene, make_plan(scene, probed or config), choose_points)
     plan = make_plan(scene, replace(config, sh_degree=decided.config.sh_degree))
     plan = replace(plan, needs=decided.needs)
     trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
     fit = prune(trainer.fit())
-    cpu_seconds = time.process_time() - start
+    cpu_seconds = time.process_time() - begin
     fit = replace(fit, metrics=measure(fit, lpips))
     stored = {
         "cpu_seconds": round(cpu_seconds, 2),

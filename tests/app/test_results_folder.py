@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import time
 import warnings
 from dataclasses import replace
@@ -17,9 +18,12 @@ import pytest
 import torch
 
 from kgs.app import fit_folder as app
+from kgs.app.cli.demo import check_demo
+from kgs.app.cli.evaluate import check_evaluate, evaluate
+from kgs.app.cli.unposed import find_scene
 from kgs.app.files import staging
 from kgs.app.files.ownership import is_own
-from kgs.app.files.results_folder import CHECKPOINT, locked
+from kgs.app.files.results_folder import CHECKPOINT, locked, photo_staging
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
@@ -31,6 +35,7 @@ from kgs.fit.plan import make_plan, with_pace
 from kgs.fit.prune import prune
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
+from kgs.metrics import evaluate as measures
 
 CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))
 OTHER = replace(CONFIG, seed=1)
@@ -249,6 +254,95 @@ def test_a_kill_between_seal_and_complete(scene: Any, done: Path, monkeypatch: A
     assert not (done / "finished").exists()
 
 
+@pytest.mark.parametrize(("root", "is_placed"), [(".", True), ("/photos", False)])
+def test_cameras_that_waited_for_a_fit_come_with_it(
+    scene: Any, done: Path, monkeypatch: Any, root: str, is_placed: bool
+) -> None:
+    """After a kill, too: a fit never shows itself beside the cameras of another one."""
+    photos = photo_staging(done)
+    photos.start()
+    (photos.unfinished / "photos.json").write_text("{}")
+    photos.seal()
+    with monkeypatch.context() as patch:
+        patch.setattr(staging.Staging, "complete", lambda self: None)
+        app.fit_folder(scene, OTHER, done, SceneRequest(root), say=lambda line: None)
+    assert not (done / "photos.json").exists()
+    load_fit(done)
+    assert seed_of(done) == 1
+    assert (done / "photos.json").exists() == is_placed
+    assert photos.is_waiting != is_placed
+
+
+def test_a_stopped_move_is_completed_before_other_cameras_are_found(scene: Any, done: Path, monkeypatch: Any) -> None:
+    """They may have to wait in the place of the cameras of the fit that is moved."""
+    with monkeypatch.context() as patch:
+        patch.setattr(staging.Staging, "complete", lambda self: None)
+        fit(scene, OTHER, done)
+    found = []
+    monkeypatch.setattr("kgs.app.sfm.find.notes_on", lambda photos: [])
+    monkeypatch.setattr(
+        "kgs.app.sfm.pose_photos", lambda *_, **__: found.append(seed_of(done)) or sys.exit("no cameras")
+    )
+    with pytest.raises(SystemExit):
+        find_scene(Path("/photos"), done, SceneRequest("/photos"), seed=0)
+    assert found == [1]
+
+
+def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done: Path) -> None:
+    fit(scene, replace(CONFIG, steps=5), done, resume=True)
+    (done / CHECKPOINT).write_bytes(b"damaged")
+    state = load_checkpoint(previous(done / CHECKPOINT))
+    lines: list[str] = []
+    load_fit(done, say=lines.append)
+    assert "the previous checkpoint is used" in lines[0]
+    save_checkpoint(done / CHECKPOINT, state | {"step": 4})
+    with pytest.raises(DataError, match="step: expected that of metrics.json, 5, got 4"):
+        load_fit(done)
+
+
+def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Path, monkeypatch: Any) -> None:
+    plain = measures.measure_again
+
+    def meanwhile(*arguments: Any) -> Any:
+        fit(scene, OTHER, done)
+        return plain(*arguments)
+
+    monkeypatch.setattr(measures, "measure_again", meanwhile)
+    with pytest.raises(DataError, match="a new fit took the place"):
+        evaluate(done)
+    assert seed_of(done) == 1
+
+
+def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
+    staging.Staging(tmp_path).start()
+    with pytest.raises(DataError, match="kgs fit --resume"):
+        check_evaluate(tmp_path, None, "cpu", "auto")
+
+
+def test_an_eval_that_fails_while_it_writes_leaves_files_of_kgs(scene: Any, done: Path, monkeypatch: Any) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("kgs.app.page.fit_page.write_own_page", full)
+        with pytest.raises(OSError, match="space"):
+            evaluate(done)
+    fit(scene, OTHER, done)
+    assert seed_of(done) == 1
+
+
+def test_what_an_unfinished_fit_is_replaced_by_is_said(scene: Any, done: Path) -> None:
+    assert "is replaced when this one is done; to go on with it, use --resume" in fit(scene, CONFIG, done)[0]
+    staging.Staging(done).start()
+    shutil.copy(done / CHECKPOINT, done / "unfinished")
+    assert "unfinished: the unfinished fit there is replaced now" in fit(scene, CONFIG, done)[0]
+
+
+def test_a_demo_does_not_mix_with_a_fit(done: Path) -> None:
+    with pytest.raises(DataError, match="holds the results of kgs fit"):
+        check_demo(done, size=(24, 32), steps=3, device="cpu", backend="auto")
+
+
 def test_a_file_of_kgs_that_the_user_changed_is_the_users(scene: Any, done: Path) -> None:
     (done / "cameras.json").write_text("[]")
     with pytest.raises(DataError, match="not written by kgs"):
@@ -295,6 +389,7 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done:
     assert f"{done} keeps its finished fit" in lines[-1]
     assert seed_of(done) == 0
     assert seed_of(done / "unfinished") == 1
+    assert is_own(done / "unfinished" / "index.html")  # so that `kgs eval` can write it again
     monkeypatch.undo()
     assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 2"
     assert seed_of(done) == 1

@@ -14,12 +14,11 @@ from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
 from kgs.app.cli import main
-from kgs.app.cli.unposed import settle
 from kgs.app.files.outputs import write_png
-from kgs.app.files.ownership import record
+from kgs.app.files.ownership import writing
+from kgs.app.files.results_folder import photo_staging
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
-from kgs.app.sfm.place import photo_staging
 from kgs.app.sfm.read import blurred, open_photos, read_photos
 from kgs.errors import DataError
 from kgs.json_files import write_json
@@ -254,7 +253,8 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     refused(images, "choose another folder", out=tmp_path)
     for path in images.iterdir():  # as renders of kgs are
         write_png(path, torch.rand(3, 8, 8))
-    record(images, "renders", [path.name for path in images.glob("*.png")])
+    with writing(images, "renders", [path.name for path in images.glob("*.png")]):
+        pass
     with pytest.raises(DataError, match="holds the photos themselves"):
         pose_photos(images, tmp_path)
     assert len(list(images.glob("*.png"))) == 3
@@ -298,7 +298,8 @@ def test_a_users_photos_among_pictures_of_kgs_stay(folder, tmp_path):
     out = tmp_path / "project"
     images = save(out / "images", planes()[:1], ["IMG_1.png"])
     write_png(images / "render.png", torch.rand(3, 8, 8))
-    record(images, "renders", ["render.png"])
+    with writing(images, "renders", ["render.png"]):
+        pass
     before = (images / "IMG_1.png").read_bytes()
     with pytest.raises(DataError, match="kgs did not write"):
         pose_photos(write_planes(folder), out)
@@ -334,7 +335,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
         assert (report["reused"], report["folder"]) == (reused, str(out / "finished-photos"))
         assert len(report["photos"]) == 4
         assert placed() == (3, 3)
-    settle(out)
+    photo_staging(out).complete()
     assert placed() == (4, 4)
     assert not (out / "finished-photos").exists()
     (folder / "IMG_4.png").unlink()

@@ -10,7 +10,7 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from kgs.app import cli, sfm
 from kgs.app.cli.unposed import is_unposed
-from kgs.app.files.ownership import record
+from kgs.app.files.ownership import writing
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
 from kgs.json_files import write_json
@@ -74,7 +74,8 @@ def asked(truth, monkeypatch):
         }
         write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
         written = [path for path in out.rglob("*") if path.is_file()]
-        record(out, "photos", [path.relative_to(out).as_posix() for path in written])
+        with writing(out, "photos", [path.relative_to(out).as_posix() for path in written]):
+            pass
         return report | {"folder": str(out)}
 
     monkeypatch.setattr(sfm, "pose_photos", true_cameras)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
-from kgs.metrics.evaluate import evaluate
+from kgs.metrics.evaluate import BEST, comparable, evaluate, mean_psnr
 from kgs.metrics.lpips import Lpips
 
 KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
@@ -84,6 +85,14 @@ def test_renders_are_clamped_before_they_are_measured():
     views = make_views(count=1)
     render = distort(views.images, amount=0.5)
     assert evaluate(renderer_of(render), views) == evaluate(renderer_of(render.clamp(0, 1)), views)
+
+
+def test_the_worst_psnr_does_not_count_as_the_best():
+    """A black render of a white photo has 0 dB, a render that equals its photo an infinite PSNR, None."""
+    views = make_views()
+    white = replace(views, images=torch.ones_like(views.images))
+    assert comparable(mean_psnr(renderer_of(torch.zeros_like(white.images)), white)) == 0.0
+    assert comparable(mean_psnr(renderer_of(white.images), white)) == BEST
 
 
 def test_result_can_go_to_json_and_an_infinite_psnr_is_none():

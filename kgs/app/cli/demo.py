@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.errors import printable
+from kgs.errors import DataError, printable
 from kgs.fit.config import DEMO, DEMO_STEPS, Backend, FitConfig
 
 from .options import Out
@@ -53,7 +53,7 @@ def demo(
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
-    level = {name: [run[part]["psnr"] or math.inf for part in ("test", "train")] for name, run in runs.items()}
+    level = {name: [_level(run[part]) for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():
         columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
         say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
@@ -110,7 +110,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
         say(note)
     write_json(folder / "metrics.json", runs)
     write_curve(folder / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
-    levels = [math.inf if view["psnr"] is None else view["psnr"] for view in runs[name]["test"]["views"]]
+    levels = list(map(_level, runs[name]["test"]["views"]))
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
     cameras = [scene.test.camera(i) for i in range(len(scene.test))]
     renders = {title: [one.render(camera)[0] for camera in cameras] for title, one in fits.items()}
@@ -127,9 +127,15 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     return runs
 
 
+def _level(measures: dict[str, Any]) -> float:
+    """The PSNR among measures, in dB."""
+    return math.inf if measures["psnr"] is None else float(measures["psnr"])
+
+
 def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:
     """Check the arguments of `kgs demo`."""
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.ownership import read_list
 
     from .checks import check_installed
 
@@ -138,10 +144,15 @@ def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backen
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     check_installed(device, backend, "matplotlib", "jinja2")
     check_folder(out, _files(), make=False)
+    if "fit" in read_list(out):
+        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
 
 
 def _files() -> list[str]:
-    """The files that the demo writes."""
+    """The files and folders that the demo writes."""
     from kgs.app.files.outputs import EXPORTS
+    from kgs.app.files.staging import Staging
 
-    return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS]
+    staging = Staging(Path(), "demo")
+    folders = [staging.unfinished.name, staging.finished.name]
+    return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS, *folders]

@@ -28,10 +28,11 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.ownership import is_own, record
+    from kgs.app.files.outputs import NOT_OWN
+    from kgs.app.files.ownership import is_own, writing
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
-    from kgs.json_files import write_json
+    from kgs.json_files import read_json, write_json
     from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
@@ -41,15 +42,18 @@ def evaluate(
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
     metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
-    write_json(path, metrics)
-    written = [path.name]
-    if (out / PAGE).exists() and not is_own(out / PAGE):
-        say(f"{printable(out / PAGE)} was not written by kgs, or was changed since, and is kept")
-    else:
-        write_own_page(out, out, replace(fit, metrics=metrics), request)
-        written.append(PAGE)
-    record(out, "fit", written)
+    has_own_page = is_own(out / PAGE) or not (out / PAGE).exists()
+    written = [path.name, PAGE] if has_own_page else [path.name]
+    if read_json(path) != fit.metrics:
+        raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
+    with writing(out, "fit", written):
+        write_json(path, metrics)
+        if has_own_page:
+            write_own_page(out, out, replace(fit, metrics=metrics), request)
     say(as_text(metrics))
+    if not has_own_page:
+        say(f"{printable(path)} is up to date; {printable(out / PAGE)} {NOT_OWN}, and is kept")
+        return
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")
 
@@ -65,7 +69,11 @@ def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: 
     check_installed(device, backend, "jinja2")
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    if not Staging(out).finished.exists():
-        if not (out / "config.json").exists():
-            raise DataError(out / "config.json", "", "cannot be read: expected the folder of the results of kgs fit")
-        read_json(out / "config.json")
+    staging = Staging(out)
+    config = out / "config.json"
+    if not staging.finished.exists():
+        if not config.exists() and staging.unfinished.exists():
+            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        if not config.exists():
+            raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
+        read_json(config)

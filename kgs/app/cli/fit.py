@@ -87,7 +87,7 @@ def fit(
     from kgs.metrics.lpips import Lpips
 
     from .checks import SMALLEST
-    from .unposed import find_scene, is_unposed, on_ctrl_c, settle
+    from .unposed import find_scene, is_unposed, on_ctrl_c
 
     check_packages("matplotlib", "safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
@@ -125,8 +125,6 @@ def fit(
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, stages=stages)
     metrics = published.fit.metrics
-    if unposed and published.folder == out:
-        settle(out)
     say(as_text(metrics))
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"

@@ -43,7 +43,7 @@ def page(
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.ownership import claim, record
+    from kgs.app.files.ownership import writing
     from kgs.app.page.fit_page import MOST_PICTURES, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
@@ -60,20 +60,19 @@ def page(
     pictured = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train
     pictured = replace(pictured, cameras=scene.train.camera(few))  # in the frame of `scene`, whose offset differs
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
-    claim(out.parent, "page", [out.name])
-    cost = write_fit_page(
-        out,
-        f"{ply.stem}, {Path(cameras).resolve().name}",
-        {"": fit},
-        beside=pictured,
-        words=("photo", "test"),
-        notes=["Whether the splat was fitted to these photos is not known here."],
-        photos=photos,
-        roll=roll,
-    )
-    record(out.parent, "page", [out.name])
+    with writing(out.parent, "page", [out.name]):
+        cost = write_fit_page(
+            out,
+            f"{ply.stem}, {Path(cameras).resolve().name}",
+            {"": fit},
+            beside=pictured,
+            words=("photo", "test"),
+            notes=["Whether the splat was fitted to these photos is not known here."],
+            photos=photos,
+            roll=roll,
+        )
     level = fit.metrics["views"]["psnr"]
-    measured = f", PSNR {level:.4g}" if level else ""
+    measured = f", PSNR {level:.4g}" if level is not None else ""
     say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos{measured}")
     if cost:
         say(f"the page shows {cost}; {printable(ply)} has everything")
@@ -84,6 +83,7 @@ def check_page(
     cameras: Path, out: Path, downscale: float | None, roll: float, device: str, backend: str, **_: Any
 ) -> None:
     """Check the arguments of `kgs page`."""
+    from kgs.app.files.outputs import NOT_OWN
     from kgs.app.files.ownership import is_own
     from kgs.datasets.options import check_options
 
@@ -95,9 +95,7 @@ def check_page(
     if out.suffix != ".html":
         raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
     if out.exists() and not is_own(out):
-        raise DataError(
-            out, "", "was not written by kgs, or was changed since, and would be overwritten: choose another file"
-        )
+        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
     check_scene(cameras)

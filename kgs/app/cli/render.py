@@ -42,7 +42,7 @@ def render(
     import torch
 
     from kgs.app.files.outputs import check_folder, png_names, write_png
-    from kgs.app.files.ownership import claim, record
+    from kgs.app.files.ownership import writing
     from kgs.camera import move_camera
     from kgs.machine import check_tools
     from kgs.renderer import GaussianRenderer
@@ -54,17 +54,15 @@ def render(
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
     check_folder(out, names.values(), scene.root)
-    claim(out, "renders", names.values())
     color = scene.background.to(place)
     outputs = ("image", "alpha") if is_transparent else ("image",)
-    for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
-        with torch.no_grad():
+    with writing(out, "renders", names.values()), torch.no_grad():
+        for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
             rendering = renderer(fit.model(), move_camera(scene.train.camera(i), place), color, outputs)
-        image = rendering.image
-        if is_transparent:  # PNG's colours are not multiplied by alpha
-            image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
-        write_png(out / names[name], image[0])
-    record(out, "renders", names.values())
+            image = rendering.image
+            if is_transparent:  # PNG's colours are not multiplied by alpha
+                image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
+            write_png(out / names[name], image[0])
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kgs.app.console import each, say
-from kgs.app.files.results_folder import locked
+from kgs.app.files.results_folder import complete_stopped_move
 from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def find_scene(
     from kgs.app.sfm import pose_photos
     from kgs.app.sfm.find import notes_on
 
+    complete_stopped_move(out)  # with its cameras, before others wait in their place
     for note in notes_on(photos):
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
@@ -69,11 +70,3 @@ def on_ctrl_c(remains: str) -> Iterator[None]:
         yield
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(remains) from stop
-
-
-def settle(out: Path) -> None:
-    """Move cameras that waited for a fit to their place beside its results."""
-    from kgs.app.sfm.place import photo_staging
-
-    with locked(out):
-        photo_staging(out).complete()

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
 EXPORTS = ("cameras.json", "splat.glb", *FILMS)  # for other programs
+NOT_OWN = "was not written by kgs, or was changed since (a copy: cp -a keeps what tells that it was not)"
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name
@@ -44,9 +45,7 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
         raise DataError(out, "", f"holds files of a scene: {advice}")
     for path in (out / name for name in files):
         if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(path.parent) and not path.parent.is_dir()):
-            raise DataError(
-                path, "", f"was not written by kgs, or was changed since, and would be overwritten: {advice}"
-            )
+            raise DataError(path, "", f"{NOT_OWN}, and would be overwritten: {advice}")
     if make:
         out.mkdir(parents=True, exist_ok=True)
 

@@ -68,9 +68,29 @@ def is_finished(out: Path) -> bool:
         return False
 
 
+def photo_staging(out: Path) -> Staging:
+    """How unposed photos and their cameras get to their folder."""
+    return Staging(out, "photos")
+
+
+def complete_move(out: Path) -> None:
+    """Move whole results of a fit to their places, and before them the photos and cameras that waited for it."""
+    staging = Staging(out)
+    if _is_of_own_photos(staging.finished):
+        photo_staging(out).complete()
+    staging.complete()
+
+
 def complete_stopped_move(out: Path) -> None:
     """Complete the move of a fit's results that a kill stopped, if there is one."""
-    staging = Staging(out)
-    if staging.finished.exists():
+    if Staging(out).finished.exists():
         with locked(out):
-            staging.complete()
+            complete_move(out)
+
+
+def _is_of_own_photos(folder: Path) -> bool:
+    """Whether the scene of a fit is in the folder of its results."""
+    try:
+        return bool(read_json(folder / "config.json")["request"]["scene"] == ".")
+    except (DataError, KeyError, TypeError):
+        return False

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.app.files.ownership import holds_only_own, is_own
-from kgs.app.files.staging import Staging
+from kgs.app.files.results_folder import photo_staging
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.errors import DataError
 from kgs.json_files import read_json
@@ -17,11 +17,6 @@ from kgs.json_files import read_json
 REPORT = CAMERAS_REPORT
 IMAGES = "images"
 MODEL = "sparse/0"
-
-
-def photo_staging(out: Path) -> Staging:
-    """How photos and cameras get to their folder."""
-    return Staging(out, "photos")
 
 
 def check_place(out: Path, folder: Path) -> None:

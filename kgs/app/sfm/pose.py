@@ -15,7 +15,7 @@ import torch
 
 from kgs.app.console import say
 from kgs.app.files.outputs import png_names
-from kgs.app.files.results_folder import locked
+from kgs.app.files.results_folder import locked, photo_staging
 from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
@@ -37,7 +37,7 @@ from .gates import (
 )
 from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verified
 from .match import exif_focal, lens_of, write_matches
-from .place import IMAGES, MODEL, REPORT, check_place, is_reusable, photo_staging
+from .place import IMAGES, MODEL, REPORT, check_place, is_reusable
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .write import level_and_scale, write_images, write_model
 
