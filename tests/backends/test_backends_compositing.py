@@ -11,7 +11,6 @@ from compositing_checks import STOP, TH, THRESHOLDS, assert_close, drawn, footpr
 from compositing_checks import many_bands as many_bands  # a fixture for all
 from factories import random_camera, random_gaussians
 from oracles import near_threshold
-from tile_checks import scene
 
 import kgs
 import kgs.reference
@@ -41,14 +40,6 @@ def test_image_sizes(run, size):
     projected, certain = sample(60, size=size)
     expected = outcome(projected, projected.colors, certain)
     assert_close(run(projected, projected.colors, certain), expected, certain)
-
-
-def test_several_cameras_do_not_mix(run):
-    projected, certain = scene(0, cameras=3), torch.ones(())
-    features = random(len(projected), 3)
-    expected = outcome(projected, features, certain, alpha_threshold=0.0, transmittance_stop=0.0)
-    got = run(projected, features, certain, alpha_threshold=0.0, transmittance_stop=0.0)
-    assert_close(got, expected, certain)
 
 
 @pytest.mark.parametrize("width", [0, 3])

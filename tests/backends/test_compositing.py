@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import pinhole, random_camera, random_gaussians, staged
+from compositing_checks import DTYPES, STOP, TH, footprints, leaves
+from factories import FIELDS, pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from oracles import near_threshold, theta_mass
 
@@ -14,8 +14,6 @@ import kgs.reference
 from kgs import GaussianRenderer, RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
 # -- closed forms --------------------------------------------------------------------------------------------------
@@ -99,12 +97,6 @@ def test_equal_layers_are_a_geometric_series_and_weights_partition_unity(dtype, 
     assert (total - color[:, None, None]).abs().max() <= 4 * n * torch.finfo(dtype).eps
 
 
-def test_two_coincident_halves_are_one():
-    whole = composite(footprints([0.84]), torch.ones(1, 3, dtype=torch.float64))
-    half = composite(footprints([0.6, 0.6]), torch.ones(2, 3, dtype=torch.float64))
-    assert (whole.features - half.features).abs().max() <= 1e-12
-
-
 def against_reference(seed, dtype, thresholds, sh_degree, opacities=(0.05, 0.95)):
     """Largest image difference at certain and at doubtful pixels, share of the latter, relative gradient errors."""
     height, width, n = 40, 48, 80
@@ -186,36 +178,3 @@ def test_median_depth_is_only_made_when_asked_for_and_has_no_gradient():
     found = composite(projected, inputs[-1], median_depth=True).median_depth
     assert found.shape == (1, 1, 3, 4)
     assert not found.requires_grad
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_features_of_any_width(dtype):
-    projected, _, _ = scene_footprints(40, 6, dtype)
-    features = torch.randn(len(projected), 7, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    wide, wide_inputs = leaves(projected, features)
-    full = composite(wide, wide_inputs[-1])
-    full.features.sum().backward()
-    bound = 1e-6 if dtype == torch.float32 else 1e-14
-    for width in (0, 1, 3, 7):
-        narrow, inputs = leaves(projected, features[:, :width])
-        out = composite(narrow, inputs[-1])
-        assert out.features.shape == (1, width, 40, 56)
-        assert torch.equal(out.transmittance, full.transmittance)
-        assert ((out.features - full.features[:, :width]).abs() <= bound).all()
-        (out.features.sum() + out.transmittance.sum()).backward()
-        assert inputs[-1].grad.shape == (len(projected), width)
-        assert ((inputs[-1].grad - wide_inputs[-1].grad[:, :width]).abs() <= bound * wide_inputs[-1].grad.max()).all()
-
-
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("backend", "cuda"),
-        ("chunk_size", 0),
-    ],
-)
-def test_options_out_of_range_are_named(option, value):
-    layers = footprints([0.5])
-    with pytest.raises(ValueError, match=option):
-        composite(layers, layers.colors, **staged(**{option: value}))

@@ -6,11 +6,11 @@ import itertools
 import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import random_camera, random_gaussians, staged
+from factories import random_camera, random_gaussians
 
 import kgs
 import kgs.reference
-from kgs import GaussianRenderer, RasterOptions, composite, project
+from kgs import GaussianRenderer, RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -182,42 +182,6 @@ def test_transmittance_of_many_layers_is_accurate(n):
 
 
 # -- what it takes -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize("rows", [0, 1, 4, 30])
-def test_features_need_a_row_for_each_projected_gaussian(rows):
-    layers = footprints([0.5, 0.5])
-    with pytest.raises(ValueError, match="^features:"):
-        composite(layers, torch.zeros(rows, 3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="^features:"):
-        composite(layers, torch.zeros(2, dtype=torch.float64))
-
-
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize("name", ["projected", "features", "opacities", "factors"])
-def test_other_types_and_dtypes_are_named(name):
-    layers = footprints([0.5, 0.5])
-    given = {"projected": layers, "features": layers.colors}
-    if name in given:
-        with pytest.raises(TypeError, match=f"^{name}:"):
-            composite(**staged(**given | {name: [1.0]}))
-    else:
-        given["projected"] = dataclasses.replace(layers, **{name: getattr(layers, name).float()})
-        with pytest.raises(TypeError, match=f"^{name}:"):
-            composite(**staged(**given))
-    with pytest.raises(TypeError, match="^features:"):
-        composite(layers, layers.colors.float())
-
-
-@pytest.mark.usefixtures("torch_alone")
-def test_projection_checks_its_options():
-    gaussians, camera = random_gaussians(3, 0), random_camera(8, 8, 0)
-    for name, value in (("alpha_threshold", -1.0), ("near_plane", -0.1), ("eps2d", float("nan")), ("backend", "cuda")):
-        with pytest.raises(ValueError, match=f"^{name}:"):
-            project(gaussians, camera, **staged(**{name: value}))
-    with pytest.raises(TypeError, match="^gaussians:"):
-        project([gaussians], camera)
 
 
 @pytest.mark.parametrize("ids", [[0, 1], [-1, 0], [0, 2**40]])

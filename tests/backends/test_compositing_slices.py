@@ -291,31 +291,3 @@ def test_too_small_a_budget_is_an_error_with_the_numbers():
     projected, colors, _ = scene_footprints(50, 1, torch.float32)
     with pytest.raises(ValueError, match=r"max_bytes.*\d+ bytes"):
         composite(projected, colors, options=RasterOptions(max_bytes=160))
-
-
-@pytest.mark.slow
-def test_many_screen_filling_gaussians_under_a_budget():
-    n, size = 2000, (256, 256)
-    generator = torch.Generator().manual_seed(0)
-    centres = 256 * torch.rand(n, 2, generator=generator)
-    factors = 150 * torch.eye(2, 3) + 10 * torch.randn(n, 2, 3, generator=generator)
-    projected = footprints(torch.full((n,), 0.01), centres, factors, size=size, dtype=torch.float32, eps2d=0.3)
-    colors = torch.rand(n, 3, generator=generator)
-    weights = torch.randn(1, 4, *size, generator=generator)
-    free, free_gradients = loss_and_gradients(projected, colors, weights)
-    tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=64 * 2**20)
-    assert torch.equal(tight, free)
-    assert_gradients_close(tight_gradients, free_gradients, 1e-5)
-
-
-def test_cameras_in_one_call_do_not_mix():
-    projected, colors, weights = scene_footprints(60, 2, torch.float64)
-    n = len(projected)
-    names = ("gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
-    twice = {name: torch.cat([getattr(projected, name)] * 2) for name in names}
-    both = dataclasses.replace(projected, **twice, camera_ids=torch.arange(2).repeat_interleave(n), num_cameras=2)
-    single, single_gradients = loss_and_gradients(projected, colors, weights)
-    double, gradients = loss_and_gradients(both, torch.cat([colors, colors]), torch.cat([weights, 3 * weights]))
-    assert torch.equal(double, torch.cat([single, single]))
-    for got, expected in zip(gradients, single_gradients, strict=True):
-        assert_gradients_close([got[:n], got[n:]], [expected, 3 * expected], 1e-13)

@@ -135,12 +135,6 @@ def test_opacity_zero_or_below_the_threshold_is_in_no_tile(threshold):
     assert got[2::3].any()
 
 
-@pytest.mark.parametrize("opacity", [0.0, 0.99 / 255])
-def test_too_faint_a_dot_is_in_no_tile_even_when_it_sits_on_a_pixel(opacity):
-    assert len(bin_to_tiles(dots([3.0, 3.0], (8, 8), opacity)).entries) == 0
-    assert len(bin_to_tiles(dots([3.0, 3.0], (8, 8), 1.01 / 255)).entries) == 1
-
-
 def test_opacities_above_one_reach_farther():
     assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 0.99)).offsets.tolist() == [0, 1, 1]
     assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 5.0)).offsets.tolist() == [0, 1, 2]

@@ -2,14 +2,13 @@
 
 import pytest
 import torch
-from factories import random_camera, random_gaussians
+from factories import FIELDS, random_camera, random_gaussians
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kgs import GaussianRenderer, Gaussians, PosedCamera, backends
 
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 PRODUCTS = {"mm", "bmm", "addmm", "addbmm", "baddbmm", "mv", "addmv", "dot", "vdot", "matmul", "linear", "einsum"}
 LENSES = {

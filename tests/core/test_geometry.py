@@ -109,13 +109,6 @@ def test_cameras_around_an_object_meet_in_it_and_parallel_or_diverging_ones_nowh
     assert meeting_point(rig(centres, outwards)) is None
 
 
-def test_scale_is_the_root_of_the_mean_of_squared_distances():
-    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 4.0]])
-    scales = GaussianModel.from_points(points, torch.zeros(4, 3))().scales
-    expected = [math.sqrt((1 + 4 + 16) / 3), math.sqrt((1 + 5 + 17) / 3)]
-    assert torch.allclose(scales[:2], torch.tensor(expected)[:, None], rtol=1e-6)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_scales_agree_with_scipy(dtype):
     spatial = pytest.importorskip("scipy.spatial", reason="scipy is the oracle for nearest neighbours")

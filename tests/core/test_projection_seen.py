@@ -4,25 +4,12 @@ import math
 
 import pytest
 import torch
-from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
+from factories import FIELDS, pinhole, random_camera, random_gaussians, replace, select
 from projection_checks import HEIGHT, PACKED, WIDTH, assert_same, scene, sigma_route, values_and_gradients
 
-from kgs import DropGaussian, Gaussians, RasterOptions, project
+from kgs import Gaussians, RasterOptions, project
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-
-def select(gaussians, ids):
-    return Gaussians(
-        *(
-            getattr(gaussians, name)[..., ids] if name == "opacities" else getattr(gaussians, name)[ids]
-            for name in FIELDS
-        )
-    )
-
-
-def join(*parts):
-    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in FIELDS))
 
 
 def wide_scene(dtype=torch.float64):
@@ -69,19 +56,6 @@ def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
     assert got.radii.tolist() == [2.0] * 4
 
 
-def test_nothing_that_could_be_drawn_is_left_out():
-    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
-    listed = torch.zeros(len(gaussians), dtype=torch.bool)
-    listed[project(gaussians, cameras).gaussian_ids] = True
-    pixels, sigma, depths = sigma_route(gaussians, cameras)
-    y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
-    d = torch.stack([x.flatten(), y.flatten()], 1)[None] - pixels[:, None]
-    alphas = gaussians.opacities[:, None] * torch.exp(-0.5 * ((d @ torch.linalg.inv(sigma)) * d).sum(2))
-    drawn = (alphas.amax(1) >= 1 / 255) & (depths > 0.01)
-    assert drawn.sum() > 40
-    assert listed[drawn].all()
-
-
 def test_the_list_is_ordered_by_camera_and_then_by_gaussian():
     gaussians, cameras = scene(cameras=3)
     got = project(gaussians, cameras)
@@ -89,20 +63,6 @@ def test_the_list_is_ordered_by_camera_and_then_by_gaussian():
     assert (key.diff() > 0).all()
     assert got.camera_ids.unique().tolist() == [0, 1, 2]
     assert got.camera_ids.dtype == got.gaussian_ids.dtype == torch.int64
-
-
-@pytest.mark.parametrize("threshold", [1 / 255, 0.0])
-def test_dropped_gaussians_stay_listed_and_only_the_opacities_tell_them(threshold):
-    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
-    opacities = DropGaussian(p=0.45, schedule="constant", seed=0)(gaussians.opacities)
-    assert opacities.max() > 1
-    full = project(gaussians, cameras, options=RasterOptions(alpha_threshold=threshold))
-    dropped = project(
-        replace(gaussians, opacities=opacities), cameras, options=RasterOptions(alpha_threshold=threshold)
-    )
-    assert (dropped.opacities == 0).sum() > 20
-    for name in ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "colors"):
-        assert torch.equal(getattr(full, name), getattr(dropped, name))
 
 
 def test_with_threshold_0_every_gaussian_in_front_is_listed():
@@ -145,17 +105,6 @@ def test_near_plane_is_exclusive_and_nothing_behind_it_has_a_gradient(near, dtyp
         for leaf in leaves.values():
             assert leaf.grad.isfinite().all()
             assert len(got) or (leaf.grad == 0).all()
-
-
-def test_a_thousand_gaussians_behind_the_camera_change_nothing():
-    gaussians, cameras = scene(dtype=torch.float32)
-    behind = random_gaussians(1000, 9, torch.float32, 1)
-    behind = replace(behind, means=-behind.means)
-    first = project(gaussians, cameras)
-    for joined, shift in ((join(gaussians, behind), 0), (join(behind, gaussians), 1000)):
-        second = project(joined, cameras)
-        assert_same(first, second)
-        assert torch.equal(second.gaussian_ids, first.gaussian_ids + shift)
 
 
 # -- parameters that are not finite --------------------------------------------------------------------------------

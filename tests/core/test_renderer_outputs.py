@@ -101,13 +101,6 @@ def test_features_of_any_width_are_drawn_as_colours_are(width):
 # --- background -------------------------------------------------------------------------------------------------
 
 
-def test_one_picture_behind_all_cameras():
-    gaussians, cameras = random_scene(0, torch.float32, 60, SIZE, cameras=2)
-    picture = torch.rand(3, *SIZE)
-    expected = GaussianRenderer()(gaussians, cameras, picture.expand(2, 3, *SIZE)).image
-    assert torch.equal(GaussianRenderer()(gaussians, cameras, picture).image, expected)
-
-
 @pytest.mark.parametrize("shape", [(3,), (1, 3), (3, *SIZE), (1, 3, *SIZE)])
 def test_an_infinite_background_shows_only_where_light_is_left(shape):
     wall = [one_gaussian((50.0, 50.0, 0.01), mean=(0.0, 0.0, z), opacity=0.99) for z in (3.0, 4.0, 5.0)]

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from factories import join, pinhole, random_camera, random_gaussians, select, with_camera
+from factories import FIELDS, OUTPUTS, join, random_camera, random_gaussians, select, with_camera
 from kornia.geometry.camera import PinholeCamera
 from oracles import quaternion_product
 
@@ -12,8 +12,6 @@ from kgs import GaussianRenderer, Gaussians
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
-OUTPUTS = ("image", "alpha", "depth", "median_depth")
 # dtype, and the bound for images that are computed along different roads
 DTYPES = [(torch.float32, 5e-6), (torch.float64, 1e-12)]
 EXACT = GaussianRenderer(alpha_threshold=0, transmittance_stop=0)
@@ -203,14 +201,3 @@ def test_k_times_the_pixels_coincide_at_the_coarse_centres(k, dtype, bound):
     first = (k - 1) // 2
     assert b.image.shape == (1, 3, 16 * k, 20 * k)
     assert (a.image - b.image[:, :, first::k, first::k]).abs().max() <= bound
-
-
-def test_an_integer_shift_of_the_principal_point_shifts_the_image():
-    gaussians = random_gaussians(30, 0)
-    inner = EXACT(gaussians, pinhole(24, 32, (30.0, 30.0), (15.0, 11.0))).projected.means2d
-    x, y = inner.unbind(1)
-    gaussians = select(gaussians, (x > 0) & (x < 31) & (y > 0) & (y < 23))
-    assert len(gaussians) > 5
-    plain = EXACT(gaussians, pinhole(24, 32, (30.0, 30.0), (15.0, 11.0))).image
-    shifted = EXACT(gaussians, pinhole(24, 32, (30.0, 30.0), (17.0, 10.0))).image
-    assert (plain[:, :, 1:, :-2] - shifted[:, :, :-1, 2:]).abs().max() <= 1e-12

@@ -152,29 +152,6 @@ def test_a_foreign_trainer_needs_one_line(seed):
         assert torch.equal(network(), network())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [pytest.param(None, marks=pytest.mark.slow), 3])
-@pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
-def test_a_compiled_step_is_the_step(seed, dtype):
-    def run(compiled):
-        torch._dynamo.reset()
-        torch.manual_seed(0)
-        network, target = Blobs(DropGaussian(p=0.3, seed=seed)).to(dtype), photo(dtype)
-
-        def step(network):
-            return photometric_loss(network(), target)
-
-        return fit(network, torch.compile(step, backend="aot_eager") if compiled else step, 3), network
-
-    (losses, network), (expected, eager) = run(True), run(False)
-    assert losses == pytest.approx(expected, abs=1e-6)
-    # Adam divides a gradient by its own size: where one is nearly 0, its rounding moves the parameter. In float64 that
-    # is little; in float32 it depends on the processor's order of sums, here on that of a product of matrices
-    if dtype == torch.float64:
-        for one, two in zip(network.parameters(), eager.parameters(), strict=True):
-            torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
-
-
 # -- other contexts ------------------------------------------------------------------------------------------------
 
 

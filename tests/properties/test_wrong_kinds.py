@@ -24,7 +24,7 @@ from kgs.densify import Densifier
 from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
 from kgs.fit.plan import make_plan
 from kgs.geometry import camera_extent
-from kgs.losses import photometric_loss, target_moments
+from kgs.losses import photometric_loss
 
 UPRIGHT = torch.eye(3)
 CONFIG = FitConfig(steps=2, evaluations=1, init="random", init_points=50, backend="torch")
@@ -157,11 +157,6 @@ def test_paths_may_be_text(tmp_path):
     published = fit_folder(scene(), CONFIG, str(tmp_path / "out"), SceneRequest("."))
     assert published.folder == tmp_path / "out"
     assert (tmp_path / "out" / "index.html").exists()
-
-
-def test_moments_of_the_target_are_taken():
-    target = torch.rand(1, 3, 16, 16)
-    assert torch.equal(photometric_loss(PHOTO, target, moments=target_moments(target)), photometric_loss(PHOTO, target))
 
 
 @pytest.mark.parametrize("package", ["jinja2", "matplotlib"])
