@@ -7,14 +7,10 @@ from itertools import product
 
 import pytest
 import torch
-from compositing_checks import STOP, TH, THRESHOLDS, assert_close, drawn, footprints, leaves, outcome, random, sample
+from compositing_checks import TH, THRESHOLDS, assert_close, drawn, footprints, leaves, outcome, random, sample
 from compositing_checks import many_bands as many_bands  # a fixture for all
-from factories import random_camera, random_gaussians
-from oracles import near_threshold
 
-import kgs
-import kgs.reference
-from kgs import GaussianRenderer, RasterOptions, composite
+from kgs import RasterOptions, composite
 
 
 @pytest.fixture
@@ -40,25 +36,6 @@ def test_image_sizes(run, size):
     projected, certain = sample(60, size=size)
     expected = outcome(projected, projected.colors, certain)
     assert_close(run(projected, projected.colors, certain), expected, certain)
-
-
-@pytest.mark.parametrize("width", [0, 3])
-def test_no_gaussians(run, width):
-    projected, certain = sample(0)
-    (sums, light, median), gradients = run(projected, torch.zeros(0, width), certain)
-    assert sums.shape == (1, width, 40, 56)
-    assert not sums.any()
-    assert not median.any()
-    assert (light == 1).all()
-    assert [len(x) for x in gradients] == [0] * 4
-
-
-def test_the_renderer_is_the_reference(kernel_backend):
-    for seed in range(3):
-        gaussians, camera = random_gaussians(120, seed, torch.float32, 2), random_camera(40, 56, seed, torch.float32)
-        certain = ~near_threshold(gaussians, camera, TH, STOP)
-        image = GaussianRenderer(backend=kernel_backend)(gaussians, camera).image
-        assert ((image - kgs.reference.render(gaussians, camera)).abs() * certain).max() <= 5e-6
 
 
 # -- bits ----------------------------------------------------------------------------------------------------------

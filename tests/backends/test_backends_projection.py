@@ -146,17 +146,6 @@ def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(ke
         torch.autograd.grad(loss, inputs[:3])
 
 
-def test_without_gradients_and_in_inference_mode(kernel_backend):
-    gaussians, cameras = wide_scene()
-    expected = project(gaussians, cameras, backend=kernel_backend)
-    assert not expected.means2d.requires_grad
-    for mode in (torch.no_grad, torch.inference_mode):
-        with mode():
-            got = project(leaves(gaussians)[0], cameras, backend=kernel_backend)
-        assert not got.means2d.requires_grad
-        assert torch.equal(got.means2d, expected.means2d)
-
-
 # -- what is left to torch -----------------------------------------------------------------------------------------
 
 

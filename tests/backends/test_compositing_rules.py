@@ -182,18 +182,3 @@ def test_transmittance_of_many_layers_is_accurate(n):
 
 
 # -- what it takes -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("ids", [[0, 1], [-1, 0], [0, 2**40]])
-def test_cameras_that_are_not_there_are_refused(ids, each_backend):
-    layers = dataclasses.replace(footprints([0.5, 0.5], dtype=torch.float32), camera_ids=torch.tensor(ids))
-    with pytest.raises(ValueError, match="^camera_ids:"):
-        composite(layers, layers.colors)
-
-
-@pytest.mark.parametrize(("name", "shape"), [("means2d", (2, 3)), ("factors", (2, 3, 2)), ("depths", (1,))])
-def test_shapes_that_do_not_fit_are_refused(name, shape, each_backend):
-    layers = footprints([0.5, 0.5], dtype=torch.float32)
-    layers = dataclasses.replace(layers, **{name: torch.zeros(shape)})
-    with pytest.raises(ValueError, match=f"^{name}:"):
-        composite(layers, torch.zeros(2, 3))

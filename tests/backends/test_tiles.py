@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from factories import footprints, random_camera, random_gaussians
-from tile_checks import INTEGERS, THRESHOLD, check_structure, dots, listed, scene
+from factories import footprints
+from tile_checks import THRESHOLD, check_structure, dots, listed, scene
 
-from kgs import Gaussians, project
 from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
 
 
@@ -162,14 +161,6 @@ def test_image_sizes_that_are_no_multiple_of_the_tile(size):
 # -- order ---------------------------------------------------------------------------------------------------------
 
 
-def test_each_tile_is_sorted_by_depth_and_ties_by_index():
-    depths = torch.tensor([3.0, 1.0, 3.0, 2.0, 1.0, 3.0])
-    projected = dots([[3.0, 3.0]] * 6, (8, 8), depths=depths)
-    for _ in range(3):
-        bins = bin_to_tiles(projected)
-        assert bins.ids[bins.entries.long()].tolist() == [1, 4, 3, 0, 2, 5]
-
-
 def test_many_ties_and_negative_depths():
     projected = scene(0, n=300)
     for depths in ((projected.depths * 2).round(), -projected.depths, torch.zeros_like(projected.depths)):
@@ -177,16 +168,6 @@ def test_many_ties_and_negative_depths():
             projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths
         )
         check_structure(tied, bin_to_tiles(tied))
-
-
-def test_the_lists_are_integers_without_gradient_and_repeatable():
-    gaussians = Gaussians(*(x.requires_grad_() for x in vars(random_gaussians(50, 0, torch.float32)).values()))
-    projected = project(gaussians, random_camera(45, 67, 0, torch.float32))
-    assert projected.means2d.requires_grad
-    first, second = bin_to_tiles(projected), bin_to_tiles(projected)
-    for name in INTEGERS:
-        assert torch.equal(getattr(first, name), getattr(second, name))
-        assert not getattr(first, name).is_floating_point()
 
 
 # -- nothing to do -------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from densifiers import SMALL
+from densifiers import SMALL, seen
 from densifiers import densifier as make
 from factories import batch, drop_layer, footprints, pinhole, posed, random_camera, random_gaussians, random_model
 from factories import replace as with_fields
@@ -64,7 +64,7 @@ def bad_stage(name, error, features=None, **changes):
 
     def call():
         layers = footprints(torch.zeros(2, 2), torch.zeros(2, 2, 3), torch.full((2,), 0.5), (3, 4))
-        options = {key: changes.pop(key) for key in ("backend", "chunk_size") if key in changes}
+        options = {key: changes.pop(key) for key in ("options", "backend", "chunk_size") if key in changes}
         given = dataclasses.replace(layers, **changes)
         kgs.composite(given, torch.zeros(2, 3) if features is None else features, **options)
 
@@ -103,6 +103,15 @@ def drop_at(factor):
 def drawn_by_the_reference(seen=None, background=None, **changes):
     gaussians = with_fields(random_gaussians(3, 0, torch.float32), **changes)
     return kgs.reference.render(gaussians, camera() if seen is None else seen, background)
+
+
+def observe(scales, needs_one=True, **changes):
+    """A render of one Gaussian, by the densifier of some."""
+    projected = seen(make([SMALL])[0], [0], [(1, 0)])
+    for name, value in changes.items():
+        setattr(projected.means2d, name, value)
+    projected.means2d.requires_grad_(needs_one)
+    make(scales)[2].observe(projected)
 
 
 def state_of_another_size():
@@ -168,6 +177,11 @@ CASES = [
     bad_stage("features", TypeError, torch.zeros(2, 3).double()),
     bad_stage("opacities", TypeError, opacities=torch.ones(2).double()),
     bad_stage("factors", TypeError, factors=torch.zeros(2, 2, 3).double()),
+    *[bad_stage("camera_ids", ValueError, camera_ids=torch.tensor(ids)) for ids in ([0, 1], [-1, 0], [0, 2**40])],
+    bad_stage("means2d", ValueError, means2d=torch.zeros(2, 3)),
+    bad_stage("factors", ValueError, factors=torch.zeros(2, 3, 2)),
+    bad_stage("depths", ValueError, depths=torch.zeros(1)),
+    bad_stage("max_bytes", ValueError, options=kgs.RasterOptions(max_bytes=160)),
     bad_stage("chunk_size", ValueError, chunk_size=0),
     bad_stage("backend", ValueError, backend="cuda"),
     ("projected", TypeError, lambda: kgs.composite([1.0], torch.zeros(2, 3))),
@@ -250,6 +264,9 @@ CASES = [
     *bad_densifier("max_gaussians", 0, 2.5, NAN, INF),
     *[("factor", ValueError, lambda x=x: make([SMALL])[2].decay_opacity(x)) for x in (0.0, 1.0, -0.5, NAN)],
     *[("ceiling", ValueError, lambda x=x: make([SMALL])[2].reset_opacity(x)) for x in (0.0, 1.0, NAN)],
+    ("projected", ValueError, lambda: observe([SMALL] * 2)),
+    ("projected", ValueError, lambda: observe([SMALL], grad=None)),
+    ("projected", ValueError, lambda: observe([SMALL], grad=None, needs_one=False)),
     ("gradient_sums", ValueError, state_of_another_size),
     ("state", ValueError, lambda: make([SMALL])[2].load_state_dict({})),
     ("optimizer", ValueError, optimizer_of_the_means_alone),

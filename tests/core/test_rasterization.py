@@ -82,23 +82,6 @@ def test_renders_are_those_of_the_renderer(half, dtype, bound):
     assert (meta["width"], meta["height"], meta["tile_size"], meta["n_cameras"]) == (32, 24, 8, 2)
 
 
-@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
-def test_the_modes_are_what_the_weights_of_the_reference_say(mode, exactly):
-    dtype, bound = exactly
-    gaussians, cameras = scene(cameras=1, dtype=dtype)
-    exact = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
-    drawn = kgs.reference.layers(gaussians, cameras, **exact)
-    color = torch.einsum("lhw,lc->hwc", drawn.weights, drawn.colors)
-    depth = torch.einsum("lhw,l->hw", drawn.weights, drawn.depths)[..., None]
-    alpha = (1 - drawn.transmittance)[..., None]
-    parts = {"RGB": color, "D": depth, "ED": depth / alpha}
-    renders, alphas, _ = call(gaussians, cameras, render_mode=mode, **exact)
-    assert torch.allclose(
-        renders[0], torch.cat([parts[part] for part in mode.split("+")], 2).to(dtype), atol=20 * bound
-    )
-    assert torch.allclose(alphas[0], alpha.to(dtype), atol=bound)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_harmonics_up_to_a_degree(degree, exactly):
     dtype, bound = exactly

@@ -65,34 +65,19 @@ def test_values_are_not_checked():
     Gaussians(**fields() | {"opacities": torch.full((5,), 1.25), "scales": -torch.ones(5, 3)})
 
 
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("means", (5, 2)),
-        ("means", (3,)),
-        ("means", ()),
-        ("means", (1, 5, 3)),
-        ("quats", (5, 3)),
-        ("quats", (4, 4)),
-        ("scales", (5,)),
-        ("scales", (5, 1)),
-        ("opacities", (4,)),
-        ("opacities", (5, 1)),
-        ("opacities", ()),
-        ("opacities", (1, 2, 5)),
-        ("colors", (5,)),
-        ("colors", (4, 3)),
-        ("colors", (5, 3, 4)),
-        ("colors", (5, 5, 3)),
-        ("colors", (5, 25, 3)),
-        ("colors", (5, 0, 3)),
-        ("colors", (6, 4, 3)),
-    ],
-)
-def test_wrong_shapes_name_the_argument_and_what_came(name, shape):
-    with pytest.raises(ValueError, match=f"^{name}:") as error:
+WRONG = {
+    "means": [(5, 2), (3,), (), (1, 5, 3)],
+    "quats": [(5, 3), (4, 4)],
+    "scales": [(5,), (5, 1)],
+    "opacities": [(4,), (5, 1), (), (1, 2, 5)],
+    "colors": [(5,), (4, 3), (5, 3, 4), (5, 5, 3), (5, 25, 3), (5, 0, 3), (6, 4, 3)],
+}
+
+
+@pytest.mark.parametrize(("name", "shape"), [(name, shape) for name, shapes in WRONG.items() for shape in shapes])
+def test_wrong_shapes_name_the_argument(name, shape):
+    with pytest.raises(ValueError, match=f"^{name}:"):
         Gaussians(**fields() | {name: torch.zeros(shape)})
-    assert str(tuple(shape)) in str(error.value)
 
 
 @pytest.mark.parametrize("name", list(fields()))
