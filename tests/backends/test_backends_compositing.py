@@ -41,26 +41,18 @@ def test_image_sizes(run, size):
 # -- bits ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def threads():
-    """Sets the number of torch's threads and puts it back."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 def bits(run, projected, features, **options):
     images, gradients = run(projected, features, torch.ones(()), **options)
     return [*images, *gradients]
 
 
 @pytest.mark.parametrize("max_bytes", [2**30, 2**18])
-def test_the_same_bits_on_any_number_of_threads(run, threads, max_bytes):
+def test_the_same_bits_on_any_number_of_threads(run, set_threads, max_bytes):
     projected, *_ = drawn(3000, size=(80, 112))
-    threads(1)
+    set_threads(1)
     first = bits(run, projected, projected.colors, max_bytes=max_bytes)
     for count in (1, 2, 3, 4):
-        threads(count)
+        set_threads(count)
         got = bits(run, projected, projected.colors, max_bytes=max_bytes)
         assert all(torch.equal(a, b) for a, b in zip(got, first, strict=True))
 
@@ -92,14 +84,15 @@ def test_row_slices_change_nothing(kernel_backend, run, width):
 # -- differentiation -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wanted", [(0, 0, 0, 1), (0, 0, 1, 0), (1, 1, 0, 0), (1, 1, 1, 0)])
-def test_only_what_is_wanted_is_differentiated(run, wanted):
+@pytest.mark.parametrize("wanted", [(0, 0, 0, 1), (0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (1, 1, 1, 0)])
+def test_only_what_is_wanted_is_differentiated(kernel_backend, wanted):
     projected, certain = sample()
     features = random(len(projected), 11)
-    _, all_of_them = run(projected, features, certain)
-    _, some = run(projected, features, certain, wanted=tuple(map(bool, wanted)))
-    expected = [x for x, needed in zip(all_of_them, wanted, strict=True) if needed]
-    assert all(torch.equal(a, b) for a, b in zip(some, expected, strict=True))
+    for backend in (kernel_backend, "torch"):
+        run = partial(outcome, projected, features, certain, torch.float32, backend=backend)
+        expected = [x for x, needed in zip(run()[1], wanted, strict=True) if needed]
+        some = run(wanted=tuple(map(bool, wanted)))[1]
+        assert all(torch.equal(a, b) for a, b in zip(some, expected, strict=True))
 
 
 def test_backward_again_without_graph_and_in_inference_mode(kernel_backend):

@@ -169,19 +169,16 @@ def test_float64_is_refused_by_name_and_left_to_torch_by_auto(kernel_backend):
 # -- threads -------------------------------------------------------------------------------------------------------
 
 
-def test_the_same_bits_on_any_number_of_threads(kernel_backend):
+def test_the_same_bits_on_any_number_of_threads(kernel_backend, set_threads):
     gaussians, cameras = wide_scene(3, 5300, cameras=2)
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3, 4):
-            torch.set_num_threads(threads)
-            found.append(list_and_gradients(gaussians, cameras, kernel_backend))
-            pose = cameras.extrinsics.clone().requires_grad_()
-            moved = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
-            project(gaussians, moved, backend=kernel_backend).factors.square().sum().backward()
-            found[-1][1]["pose"] = pose.grad
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 2, 3, 4):
+        set_threads(threads)
+        found.append(list_and_gradients(gaussians, cameras, kernel_backend))
+        pose = cameras.extrinsics.clone().requires_grad_()
+        moved = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
+        project(gaussians, moved, backend=kernel_backend).factors.square().sum().backward()
+        found[-1][1]["pose"] = pose.grad
     (first, first_grads), *others = found
     for got, grads in others:
         assert all(

@@ -49,16 +49,12 @@ def test_own_stream_and_the_global_one_do_not_touch(seed):
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_own_stream_does_not_depend_on_the_number_of_threads():
-    threads = torch.get_num_threads()
+def test_own_stream_does_not_depend_on_the_number_of_threads(set_threads):
     results = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            torch.manual_seed(0)
-            results.append((at(1.0, p=0.5, seed=3)(draw(100_000)), at(1.0, p=0.5)(draw(100_000))))
-    finally:
-        torch.set_num_threads(threads)
+    for count in (1, 2, 3):
+        set_threads(count)
+        torch.manual_seed(0)
+        results.append((at(1.0, p=0.5, seed=3)(draw(100_000)), at(1.0, p=0.5)(draw(100_000))))
     for own, default in results[1:]:
         assert torch.equal(own, results[0][0])
         assert torch.equal(default, results[0][1])

@@ -64,8 +64,9 @@ def bad_stage(name, error, features=None, **changes):
 
     def call():
         layers = footprints(torch.zeros(2, 2), torch.zeros(2, 2, 3), torch.full((2,), 0.5), (3, 4))
-        options = {key: changes.pop(key) for key in ("options", "backend", "chunk_size") if key in changes}
-        given = dataclasses.replace(layers, **changes)
+        fields = {key: value for key, value in changes.items() if hasattr(layers, key)}
+        options = {key: value for key, value in changes.items() if key not in fields}
+        given = dataclasses.replace(layers, **fields)
         kgs.composite(given, torch.zeros(2, 3) if features is None else features, **options)
 
     return name, error, call
@@ -105,13 +106,13 @@ def drawn_by_the_reference(seen=None, background=None, **changes):
     return kgs.reference.render(gaussians, camera() if seen is None else seen, background)
 
 
-def observe(scales, needs_one=True, **changes):
+def observe(scales, grad=(1, 0), needs_one=True, **options):
     """A render of one Gaussian, by the densifier of some."""
-    projected = seen(make([SMALL])[0], [0], [(1, 0)])
-    for name, value in changes.items():
-        setattr(projected.means2d, name, value)
+    projected = seen(make([SMALL])[0], [0], [grad or (0, 0)])
+    if grad is None:
+        projected.means2d.grad = None
     projected.means2d.requires_grad_(needs_one)
-    make(scales)[2].observe(projected)
+    make(scales, **options)[2].observe(projected)
 
 
 def state_of_another_size():
@@ -144,6 +145,10 @@ CASES = [
     *bad_options("transmittance_stop", -1e-9, 1.0, "0"),
     *bad_options("frame", (0, 0, 4), (4.0, 0.0, 4.0, 8.0), (0.0, 0.0, INF, 8.0)),
     ("near_plane", ValueError, lambda: kgs.GaussianRenderer(near_plane=-1.0)),
+    ("options", TypeError, lambda: kgs.GaussianRenderer(options=kgs.RasterOptions(), eps2d=0.1)),
+    ("options", TypeError, lambda: kgs.GaussianRenderer(options={"eps2d": 0.1})),
+    ("options", TypeError, lambda: kgs.project(random_gaussians(3, 0), camera(), options={"eps2d": 0.1})),
+    bad_stage("options", TypeError, options={"eps2d": 0.1}),
     # the renderer
     *(bad_argument("outputs", ValueError, value) for value in (("imag",), (), "image")),
     *(bad_argument("background", ValueError, torch.zeros(shape)) for shape in ((4,), (2, 3), (1, 3, 12, 9))),
@@ -265,6 +270,7 @@ CASES = [
     *[("factor", ValueError, lambda x=x: make([SMALL])[2].decay_opacity(x)) for x in (0.0, 1.0, -0.5, NAN)],
     *[("ceiling", ValueError, lambda x=x: make([SMALL])[2].reset_opacity(x)) for x in (0.0, 1.0, NAN)],
     ("projected", ValueError, lambda: observe([SMALL] * 2)),
+    ("projected", ValueError, lambda: observe([SMALL], absgrad=True)),
     ("projected", ValueError, lambda: observe([SMALL], grad=None)),
     ("projected", ValueError, lambda: observe([SMALL], grad=None, needs_one=False)),
     ("gradient_sums", ValueError, state_of_another_size),

@@ -56,15 +56,6 @@ def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
     assert got.radii.tolist() == [2.0] * 4
 
 
-def test_the_list_is_ordered_by_camera_and_then_by_gaussian():
-    gaussians, cameras = scene(cameras=3)
-    got = project(gaussians, cameras)
-    key = got.camera_ids * len(gaussians) + got.gaussian_ids
-    assert (key.diff() > 0).all()
-    assert got.camera_ids.unique().tolist() == [0, 1, 2]
-    assert got.camera_ids.dtype == got.gaussian_ids.dtype == torch.int64
-
-
 def test_with_threshold_0_every_gaussian_in_front_is_listed():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     depths = sigma_route(gaussians, cameras)[2]

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import pytest
 import torch
@@ -183,18 +182,14 @@ def test_lower_precision_around_it_changes_nothing(setting, backward_inside, mat
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_inference_keeps_no_graph(mode, threads):
+def test_inference_keeps_no_graph(mode, threads, set_threads):
     # enough tiles for several pieces of work, so that a second thread has some
     camera = random_camera(200, 400, 0, torch.float32)
     gaussians, _ = leaves(random_gaussians(400, 0, torch.float32, 1, image_size=100))
     expected = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
-        with mode():
-            out = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
-    finally:
-        torch.set_num_threads(before)
+    set_threads(threads)
+    with mode():
+        out = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
     for name in OUTPUTS:
         assert torch.equal(getattr(out, name), getattr(expected, name))
         assert not getattr(out, name).requires_grad
@@ -222,23 +217,6 @@ def test_options_are_given_whole_or_field_by_field():
     assert torch.equal(image, GaussianRenderer(**vars(options))(gaussians, camera).image)
     projected = project(gaussians, camera, options=options)
     assert torch.equal(image, composite(projected, projected.colors, options=options).features)
-
-
-@pytest.mark.usefixtures("torch_alone")
-def test_options_given_twice_or_of_another_kind_are_refused():
-    gaussians, camera = random_gaussians(3, 0), random_camera(9, 12, 0)
-    projected = project(gaussians, camera)
-    for call in (
-        GaussianRenderer,
-        partial(project, gaussians, camera),
-        partial(composite, projected, projected.colors),
-    ):
-        with pytest.raises(TypeError, match="^options:"):
-            call(options={"eps2d": 0.1})
-        with pytest.raises(TypeError, match="last_plane"):
-            call(last_plane=10.0)
-    with pytest.raises(TypeError, match="^options:"):
-        GaussianRenderer(options=RasterOptions(), eps2d=0.1)
 
 
 @pytest.mark.usefixtures("torch_alone")

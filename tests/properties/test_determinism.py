@@ -15,14 +15,6 @@ LARGE = (200, 400)  # enough tiles for several pieces of work
 SMALL = (24, 32)  # one piece
 
 
-@pytest.fixture
-def threads():
-    """Sets the number of torch's threads and puts it back."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 def run(dtype=torch.float32, n=1500, options=None, seed=0, size=LARGE):
     """All outputs of one render and all gradients of a loss."""
     gaussians, inputs = leaves(random_gaussians(n, seed, dtype, 1, image_size=120))
@@ -39,8 +31,8 @@ def assert_equal_bits(first, second):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_repeated_runs_are_equal(threads, count):
-    threads(count)
+def test_repeated_runs_are_equal(set_threads, count):
+    set_threads(count)
     first = run()
     run(seed=1, n=300)
     for _ in range(2):
@@ -51,16 +43,16 @@ def test_repeated_runs_are_equal(threads, count):
 @pytest.mark.parametrize(
     ("size", "n", "options"), [(LARGE, 1500, {}), (SMALL, 100, {}), (LARGE, 300, {"max_bytes": 2**20})]
 )
-def test_one_and_two_threads_are_equal(threads, dtype, size, n, options):
-    threads(1)
+def test_one_and_two_threads_are_equal(set_threads, dtype, size, n, options):
+    set_threads(1)
     first = run(dtype, n, options, size=size)
-    threads(2)
+    set_threads(2)
     assert_equal_bits(run(dtype, n, options, size=size), first)
 
 
-def test_rendering_leaves_the_number_of_threads_alone(threads):
+def test_rendering_leaves_the_number_of_threads_alone(set_threads):
     for count in (2, 3):
-        threads(count)
+        set_threads(count)
         run(n=300)
         assert torch.get_num_threads() == count
         seen = []
@@ -70,8 +62,8 @@ def test_rendering_leaves_the_number_of_threads_alone(threads):
         assert seen == [count]
 
 
-def test_two_renders_at_the_same_time_are_equal_to_one(threads):
-    threads(2)
+def test_two_renders_at_the_same_time_are_equal_to_one(set_threads):
+    set_threads(2)
     expected = run(n=500)
     found = [None] * 3
 

@@ -261,26 +261,6 @@ def test_every_subset_of_inputs_gets_the_same_values():
                     assert x.grad is None
 
 
-def test_subsets_at_the_compositing_stage():
-    every = make_inputs(0)
-    with torch.no_grad():
-        start = project(Gaussians(*every[:5]), random_camera(*SIZE, 0))
-    names = ("means2d", "factors", "opacities")
-    features = start.colors.detach()
-    expected = {}
-    for size in (4, 3, 2, 1):
-        for chosen in itertools.combinations((*names, "features"), size):
-            leaves = {name: getattr(start, name).detach().clone().requires_grad_(name in chosen) for name in names}
-            colors = features.clone().requires_grad_("features" in chosen)
-            composite(dataclasses.replace(start, **leaves), colors).features.square().sum().backward()
-            leaves["features"] = colors
-            for name, leaf in leaves.items():
-                if name in chosen:
-                    assert torch.equal(leaf.grad, expected.setdefault(name, leaf.grad))
-                else:
-                    assert leaf.grad is None
-
-
 def test_gradients_through_alpha_alone_and_depth_alone():
     inputs = make_inputs(1, n=20, size=(16, 16))
     for outputs in (("alpha",), ("depth",)):
