@@ -38,9 +38,6 @@ def test_image_sizes(run, size):
     assert_close(run(projected, projected.colors, certain), expected, certain)
 
 
-# -- bits ----------------------------------------------------------------------------------------------------------
-
-
 def bits(run, projected, features, **options):
     images, gradients = run(projected, features, torch.ones(()), **options)
     return [*images, *gradients]
@@ -81,9 +78,6 @@ def test_row_slices_change_nothing(kernel_backend, run, width):
         composite(projected, features, options=RasterOptions(max_bytes=3000), backend=kernel_backend)
 
 
-# -- differentiation -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("wanted", [(0, 0, 0, 1), (0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (1, 1, 1, 0)])
 def test_only_what_is_wanted_is_differentiated(kernel_backend, wanted):
     projected, certain = sample()
@@ -120,9 +114,6 @@ def test_gradients_that_are_views_and_inputs_that_are_not_contiguous(kernel_back
         out = composite(p, x[-1], backend=kernel_backend)
         (out.features.mean() + out.transmittance.sum()).backward()
     assert all(torch.equal(a.grad, b.grad) for a, b in zip(inputs, plain_inputs, strict=True))
-
-
-# -- numbers at the border -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("opacity", [1e-30, 0.5, 0.99, 1.0, 2.0, 1e6, 1e38, torch.inf])

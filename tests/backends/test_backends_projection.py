@@ -23,9 +23,6 @@ def handed_over(kernel_backend, monkeypatch):
     return calls
 
 
-# -- the same values and gradients ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_harmonics_of_every_degree_and_features(kernel_backend, degree, cameras, handed_over):
@@ -117,9 +114,6 @@ def test_the_limits_of_the_tangents_belong_to_what_has_a_gradient(kernel_backend
     assert torch.allclose(values[0][1]["means"], values[1][1]["means"], rtol=1e-5, atol=1e-5)
 
 
-# -- autograd ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("wanted", FIELDS)
 def test_only_what_is_asked_for_has_a_gradient(kernel_backend, wanted):
     gaussians, cameras = wide_scene(1)
@@ -146,9 +140,6 @@ def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(ke
         torch.autograd.grad(loss, inputs[:3])
 
 
-# -- what is left to torch -----------------------------------------------------------------------------------------
-
-
 def test_cameras_of_another_form_go_to_torch(kernel_backend, handed_over):
     gaussians, cameras = wide_scene()
     flat = cameras.extrinsics.clone()
@@ -164,9 +155,6 @@ def test_float64_is_refused_by_name_and_left_to_torch_by_auto(kernel_backend):
     list_and_gradients(gaussians, cameras, "auto", torch.float64)
     with pytest.raises(ValueError, match=f"backend: {kernel_backend!r} does not cover this call of projection"):
         list_and_gradients(gaussians, cameras, kernel_backend, torch.float64)
-
-
-# -- threads -------------------------------------------------------------------------------------------------------
 
 
 def test_the_same_bits_on_any_number_of_threads(kernel_backend, set_threads):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from compositing_checks import DTYPES, STOP, TH, footprints, leaves
+from compositing_checks import DTYPES, EXACT, STOP, TH, footprints, leaves
 from factories import FIELDS, pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from oracles import near_threshold, theta_mass
@@ -14,9 +14,6 @@ import kgs.reference
 from kgs import GaussianRenderer, RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-
-# -- closed forms --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
@@ -47,9 +44,7 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
     pixels = torch.cartesian_prod(torch.arange(37), torch.arange(43)).flip(1).double()
     for factor, centre in zip(factors.to(dtype), centres.to(dtype), strict=True):
         alone = footprints([0.7], centre[None], factor[None], size=(37, 43), dtype=dtype, eps2d=0.3)
-        got = composite(
-            alone, alone.colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
-        ).transmittance
+        got = composite(alone, alone.colors, options=EXACT).transmittance
         inverse = torch.linalg.inv(factor.double() @ factor.double().T + 0.3 * torch.eye(2, dtype=torch.float64))
         d = pixels - centre.double()
         expected = 1 - 0.7 * torch.exp(-0.5 * torch.einsum("pi,ij,pj->p", d, inverse, d))
@@ -61,12 +56,7 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
 def test_mass_is_the_theta_function(variance, centre):
     sigma = math.sqrt(variance)
     alone = footprints([0.5], [centre], [[[sigma, 0, 0], [0, sigma, 0]]], size=(41, 41))
-    mass = (
-        1
-        - composite(
-            alone, alone.colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
-        ).transmittance
-    )
+    mass = 1 - composite(alone, alone.colors, options=EXACT).transmittance
     assert mass.sum().item() == pytest.approx(
         0.5 * theta_mass(variance, centre[0]) * theta_mass(variance, centre[1]), rel=1e-9
     )
@@ -126,9 +116,6 @@ def against_reference(seed, dtype, thresholds, sh_degree, opacities=(0.05, 0.95)
     return difference[~doubtful].max().item(), at_doubtful, doubtful.double().mean().item(), errors
 
 
-# -- the dense reference -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sh_degree", [None, 3])
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
@@ -154,9 +141,6 @@ def test_default_thresholds_are_the_reference_away_from_decisions(dtype, image_b
         assert max(gradient_errors) <= bound
         share.append(doubtful)
     assert sum(share) / len(share) < most
-
-
-# -- depth and features --------------------------------------------------------------------------------------------
 
 
 def test_median_depth_is_where_less_than_half_the_light_remains():

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 import torch
-from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
+from compositing_checks import DTYPES, EXACT, STOP, TH, footprints, leaves, scene_footprints
 from factories import random_camera, random_gaussians
 
 import kgs
@@ -13,8 +13,6 @@ import kgs.reference
 from kgs import GaussianRenderer, RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-# -- thresholds ----------------------------------------------------------------------------------------------------
 
 
 def test_stop_is_inclusive():
@@ -55,7 +53,7 @@ def test_light_of_exactly_the_stop_is_the_border(stop, dtype):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_error_of_the_stop_is_at_most_the_stop(seed, stop):
     projected, colors, _ = scene_footprints(300, seed, torch.float64, image_size=20, opacities=(0.3, 0.95))
-    exact = composite(projected, colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0))
+    exact = composite(projected, colors, options=EXACT)
     got = composite(projected, colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=stop))
     scale = colors.max()
     assert (got.transmittance == 0).double().mean() > 0.1  # otherwise there is nothing to test
@@ -101,9 +99,6 @@ def test_a_layer_counts_from_the_threshold_on():
         assert bool((composite(layer, layer.colors).transmittance < 1).all()) is drawn
 
 
-# -- the clamp of alpha --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("opacity", [0.98, 0.995, 1.3])
 def test_clamp_of_alpha_and_its_exact_gradient(opacity, dtype):
@@ -129,15 +124,12 @@ def test_clamp_holds_pixel_by_pixel_in_the_gradient(opacity):
 
     def image(means2d, factors, opacities, features):
         made = dataclasses.replace(start, means2d=means2d, factors=factors, opacities=opacities)
-        out = composite(made, features, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0))
+        out = composite(made, features, options=EXACT)
         return torch.cat([out.features, out.transmittance], 1)
 
     weights = torch.randn(1, 4, 9, 12, generator=generator, dtype=torch.float64)
     _, inputs = leaves(start, colors)
     assert torch.autograd.gradcheck(lambda *x: (image(*x) * weights).sum((2, 3)), inputs, eps=1e-6, atol=1e-6)
-
-
-# -- many layers ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -179,6 +171,3 @@ def test_transmittance_of_many_layers_is_accurate(n):
     else:
         assert not out.transmittance.any()
     assert (out.features - (1 - exact)).abs().max() <= STOP + 1e-5
-
-
-# -- what it takes -------------------------------------------------------------------------------------------------

@@ -38,9 +38,6 @@ def strengths(projected, tile_size):
     return everywhere.flatten(1)
 
 
-# -- which tiles ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tile_size", [1, 4, 8, 16, 64, 100])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("threshold", [THRESHOLD, 0.1, 1e-4])
@@ -158,9 +155,6 @@ def test_image_sizes_that_are_no_multiple_of_the_tile(size):
         assert not (wanted & ~got).any()
 
 
-# -- order ---------------------------------------------------------------------------------------------------------
-
-
 def test_many_ties_and_negative_depths():
     projected = scene(0, n=300)
     for depths in ((projected.depths * 2).round(), -projected.depths, torch.zeros_like(projected.depths)):
@@ -168,9 +162,6 @@ def test_many_ties_and_negative_depths():
             projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths
         )
         check_structure(tied, bin_to_tiles(tied))
-
-
-# -- nothing to do -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("projected", [dots([], (45, 67)), dots([[1e4, 1e4]] * 3, (45, 67))], ids=["none", "outside"])

@@ -6,11 +6,6 @@ from tile_checks import THRESHOLD, check_structure, scene
 
 from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
 
-# -- many tiles ----------------------------------------------------------------------------------------------------
-
-
-# -- slices --------------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("max_spans", [2**40, 100, 1])
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.1, 0.0])

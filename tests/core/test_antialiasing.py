@@ -94,9 +94,6 @@ def test_without_a_low_pass_filter_there_is_nothing_to_correct():
     assert torch.equal(plain, antialiased)
 
 
-# -- what is left out ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "options", [{"far_plane": 4.0}, {"radius_clip": 15.0}, {"far_plane": 5.0, "radius_clip": 12.0}]
 )

@@ -40,9 +40,6 @@ def kornia_pixels(cameras, at):
     return cameras.model.project(Vector3(at)).data
 
 
-# -- pixels and Jacobians inside the field of view -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cameras", all_cameras())
 def test_pixels_are_kornias_and_jacobians_their_finite_differences(cameras):
     (lens,) = lenses(cameras)
@@ -99,9 +96,6 @@ def test_float32_stays_float32_and_is_close(kind):
     at = points(spread=1.5, dtype=torch.float32)
     assert lens.jacobian(at).dtype == lens.project(at).dtype == torch.float32
     torch.testing.assert_close(lens.jacobian(at).double(), exact.jacobian(at.double()), rtol=1e-4, atol=1e-4)
-
-
-# -- the tangent clamp ---------------------------------------------------------------------------------------------
 
 
 def far_points():
@@ -165,9 +159,6 @@ def test_gradcheck_with_respect_to_the_parameters_inside_the_limits(kind, points
         return torch.cat([lens.project(at).flatten(), lens.jacobian(at).flatten()])
 
     assert torch.autograd.gradcheck(both, (params, at), eps=1e-6, atol=1e-6)
-
-
-# -- sizes ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_size_that_changes_in_place_or_is_replaced_is_read_again():

@@ -98,9 +98,6 @@ def test_default_device_default_dtype_and_autocast_do_not_reach_the_layer(seed):
     assert torch.equal(out, expected)
 
 
-# -- gradients -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("shape", [(12,), (12, 1), (2, 6)])
 def test_gradcheck(shape):
     x = draw(12, torch.float64).reshape(shape).requires_grad_()

@@ -32,9 +32,6 @@ def halved(progress):
     return progress / 2
 
 
-# -- a stream of its own -------------------------------------------------------------------------------------------
-
-
 def stream(layer, calls=3):
     return torch.stack([layer(draw()) for _ in range(calls)])
 
@@ -133,9 +130,6 @@ def test_a_stream_continues_from_cuda_to_the_cpu_and_back():
         other.set_rng_state(layer.get_rng_state())
         layer = other
         assert torch.equal(layer(draw().to(device)).cpu(), reference(draw()))
-
-
-# -- statistics ----------------------------------------------------------------------------------------------------
 
 
 def composite(opacities, weights, colors):

@@ -8,7 +8,17 @@ import pytest
 import torch
 from densifiers import SMALL, seen
 from densifiers import densifier as make
-from factories import batch, drop_layer, footprints, pinhole, posed, random_camera, random_gaussians, random_model
+from factories import (
+    FIELDS,
+    batch,
+    drop_layer,
+    footprints,
+    pinhole,
+    posed,
+    random_camera,
+    random_gaussians,
+    random_model,
+)
 from factories import replace as with_fields
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
@@ -52,11 +62,17 @@ def bad_argument(name, error, value):
     return name, error, call
 
 
-def bad_call_of_gsplat(name):
-    """None for a tensor."""
-    gaussians, seen = random_gaussians(3, 0, torch.float32, None), camera()
-    given = vars(gaussians) | {"viewmats": seen.extrinsics, "Ks": seen.intrinsics[:, :3, :3]}
-    return name, TypeError, lambda: kgs.rasterization(**given | {name: None}, width=12, height=9)
+def bad_call_of_gsplat(name, dtype):
+    """A tensor of another dtype, or None."""
+
+    def call():
+        gaussians, seen = random_gaussians(3, 0, torch.float32, None), camera()
+        given = vars(gaussians) | {"viewmats": seen.extrinsics, "Ks": seen.intrinsics[:, :3, :3]}
+        tensors = given | {"covars": torch.eye(3).expand(3, 3, 3), "extra_signals": torch.rand(3, 2)}
+        wrong = None if dtype is None else tensors[name].to(dtype)
+        kgs.rasterization(**given | {name: wrong}, width=12, height=9)
+
+    return name, TypeError, call
 
 
 def bad_stage(name, error, features=None, **changes):
@@ -175,7 +191,12 @@ CASES = [
         for shape in ((4, 4), (0, 4, 4), (2, 3, 4))
     ],
     # gsplat's call
-    *map(bad_call_of_gsplat, ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")),
+    *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
+    *[
+        bad_call_of_gsplat(name, dtype)
+        for name in (*FIELDS[1:], "viewmats", "Ks", "covars", "extra_signals")
+        for dtype in (torch.float64, torch.float16, torch.int64)
+    ],
     # compositing
     *[bad_stage("features", ValueError, torch.zeros(shape)) for shape in ((0, 3), (1, 3), (4, 3), (30, 3), (2,))],
     bad_stage("features", TypeError, [1.0]),

@@ -19,9 +19,6 @@ def symmetric(abc):
     return abc[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
 
 
-# -- values --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 2e-5)])
 @pytest.mark.parametrize("skew", [0.0, 4.0])
 @pytest.mark.parametrize("eps2d", [0.3, 0.0])
@@ -45,9 +42,6 @@ def test_values_are_those_of_the_covariance_route(dtype, tolerance, skew, eps2d)
     assert torch.equal(got.radii, got.radii.round())
     assert ((got.radii.double() >= radii - 1e-3) & (got.radii.double() < radii + 1 + 1e-3)).all()
     torch.testing.assert_close(got.opacities, gaussians.opacities.index_select(0, got.gaussian_ids), rtol=0, atol=0)
-
-
-# -- other camera models -------------------------------------------------------------------------------------------
 
 
 def test_the_pinhole_model_is_the_pinhole_camera():
@@ -105,6 +99,3 @@ def test_orthographic_footprints_are_exact_marginals_and_all_rays_share_the_colo
     basis = [float(real_harmonic(k, mpmath.acos(z), mpmath.atan2(y, x))) for k in range(4)]
     expected = (torch.tensor(basis, dtype=torch.float64) @ gaussians.colors[0] + 0.5).clamp_min(0)
     torch.testing.assert_close(got.colors[0], expected)
-
-
-# -- errors --------------------------------------------------------------------------------------------------------

@@ -9,8 +9,6 @@ from projection_checks import LENGTHS, PACKED, posed, scene, values_and_gradient
 
 from kgs import Gaussians, project
 
-# -- batches -------------------------------------------------------------------------------------------------------
-
 
 def test_opacities_of_each_camera():
     gaussians, cameras = scene(cameras=3)
@@ -50,9 +48,6 @@ def packed(gaussians, cameras):
     got = project(gaussians, cameras)
     fields = (got.means2d, got.conics, got.depths, got.opacities, got.colors)
     return torch.cat([field.flatten() for field in fields])
-
-
-# -- gradients -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("degree", [None, 0, 3])

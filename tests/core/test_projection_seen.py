@@ -23,9 +23,6 @@ def wide_scene(dtype=torch.float64):
 REACH = math.sqrt(2 * math.log(2 * 255))  # standard deviations within which a footprint of opacity 2 is drawn
 
 
-# -- what is listed ------------------------------------------------------------------------------------------------
-
-
 def test_the_list_is_everything_in_front_that_would_be_drawn_at_opacity_two():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     got = project(gaussians, cameras)
@@ -96,9 +93,6 @@ def test_near_plane_is_exclusive_and_nothing_behind_it_has_a_gradient(near, dtyp
         for leaf in leaves.values():
             assert leaf.grad.isfinite().all()
             assert len(got) or (leaf.grad == 0).all()
-
-
-# -- parameters that are not finite --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])

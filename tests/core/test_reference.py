@@ -13,8 +13,6 @@ from torch import Tensor
 from kgs import Gaussians
 from kgs.reference import layers, render
 
-# -- closed forms --------------------------------------------------------------------------------------------------
-
 
 def test_distant_camera_is_orthographic():
     gaussian = one([3.0, -2.0, 0.0], [1.0, 2.5, 4.0], quat=(0.7, 0.4, -0.3, 0.5))
@@ -59,9 +57,6 @@ def test_background_forms(form):
     background = color[None, :, None, None].expand(1, 3, 4, 5) if len(form) == 4 else color.reshape(form)
     image = render(stack([0.25], [RED], scale=1e9), SMALL, background, **EXACT)
     torch.testing.assert_close(image[0, :, 2, 3], tensor(0.4, 0.3, 0.45), rtol=0, atol=1e-12)
-
-
-# -- 50 digits -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("thresholds", [(0.0, 0.0), (1 / 255, 1e-4), (1 / 32, 0.2)])
@@ -116,9 +111,6 @@ def harmonics_at(direction: Tensor, degree: int = 3) -> Tensor:
     )
     rgb = layers(gaussians, pinhole(3, 3, 5, extrinsics=extrinsics)).colors
     return (rgb[:, 0] - 0.5) / 0.3
-
-
-# -- harmonics -----------------------------------------------------------------------------------------------------
 
 
 def test_harmonics_against_scipy():

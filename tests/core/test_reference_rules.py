@@ -11,8 +11,6 @@ from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, posed,
 from kgs import Gaussians
 from kgs.reference import layers, render
 
-# -- what is left out ----------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("z", [-5.0, -1e-30, 0.0, 0.01])
 def test_nothing_up_to_the_near_plane_is_drawn(z):
@@ -53,9 +51,6 @@ def test_a_gaussian_that_is_not_finite_is_left_out(name, value):
 def test_no_gaussians_leave_the_background():
     gaussians = Gaussians(*(value[:0] for value in fields(random_gaussians(1, 0, sh_degree=3)).values()))
     assert torch.equal(render(gaussians, SMALL), torch.zeros(1, 3, 4, 5).double())
-
-
-# -- clamp, threshold, stop ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("opacity", "slope"), [(0.98, 1.0), (0.99, 1.0), (0.995, 0.0), (1.3, 0.0)])

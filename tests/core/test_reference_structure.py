@@ -15,8 +15,6 @@ import kgs.reference
 from kgs import Gaussians
 from kgs.reference import layers, render
 
-# -- exactness of structure ----------------------------------------------------------------------------------------
-
 
 def test_dropping_is_unbiased_while_nothing_is_clamped():
     gaussians, camera = random_gaussians(7, 3, opacities=(0.2, 0.75)), random_camera(6, 7, 3)
@@ -53,9 +51,6 @@ def scene(seed: int, sh_degree: int | None = 3) -> tuple[Gaussians, PinholeCamer
     camera.intrinsics[0, 0, 1] = 0.4
     gaussians = replace(gaussians, means=gaussians.means * tensor(0.6, 0.6, 1), scales=gaussians.scales / 2)
     return gaussians, camera
-
-
-# -- gradients -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sh_degree", [None, pytest.param(3, marks=pytest.mark.slow)])
@@ -105,9 +100,6 @@ def test_the_gradient_of_the_lens_follows_the_tangent_limits():
         step[row, column] = 1e-5
         difference = response(camera.intrinsics[0] + step) - response(camera.intrinsics[0] - step)
         torch.testing.assert_close(intrinsics.grad[row, column], difference[3, 4] / 2e-5, rtol=1e-7, atol=1e-9)
-
-
-# -- what it takes -------------------------------------------------------------------------------------------------
 
 
 def test_opacities_of_one_camera_may_be_a_row():

@@ -21,9 +21,6 @@ def largest(a, b):
     return (a - b).abs().max().item()
 
 
-# -- cameras -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_sixteen_cameras_at_once_are_sixteen_single_ones(dtype):
     singles = [random_camera(24, 30, seed, dtype) for seed in range(16)]
@@ -93,9 +90,6 @@ def test_a_wide_render_shows_a_frame_as_a_render_of_the_frame_does(kind):
         single = PinholeCamera(single.intrinsics.float(), single.extrinsics.float(), single.height, single.width)
         image = GaussianRenderer(frame=frame)(Gaussians(**values), single).image[..., inside]
         assert largest(image.double(), expected) < 1e-4
-
-
-# -- degenerate sizes ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [0, 3])

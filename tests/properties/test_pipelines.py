@@ -84,9 +84,6 @@ def test_a_rate_that_rises_is_not_compiled_anew(seed, schedule):
     assert all(torch.equal(a, b) for a, b in zip(outputs, expected, strict=True))
 
 
-# -- a trainer of one's own ----------------------------------------------------------------------------------------
-
-
 class Blobs(nn.Module):
     """Somebody else's splatting: round blobs in the plane, front to back, in plain torch; one line is ours."""
 
@@ -155,9 +152,6 @@ def test_a_whole_network_survives_deepcopy_and_shared_memory():
     network = Blobs(at(0.5, p=0.2, seed=3))
     twin = copy.deepcopy(network).share_memory()
     assert torch.equal(twin(), network())
-
-
-# -- the renderer in a compiled step -------------------------------------------------------------------------------
 
 
 def rendered_fit(backend, seed):
