@@ -5,7 +5,7 @@ import torch
 from factories import footprints
 from tile_checks import THRESHOLD, check_structure, dots, listed, scene
 
-from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
+from kgs.backends.torch.binning import bin_to_tiles
 
 
 def needles(seed, ratio, size=(45, 67)):
@@ -136,25 +136,6 @@ def test_opacities_above_one_reach_farther():
     assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 5.0)).offsets.tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("huge", [1e3, 1e6, 1e12])
-def test_a_gaussian_larger_than_the_world_is_in_every_tile(huge):
-    projected = footprints(
-        torch.tensor([[1e3, -1e3]]), huge * torch.eye(2, 3)[None] * 1e3, torch.tensor([0.5]), (45, 67)
-    )
-    assert listed(projected, bin_to_tiles(projected)).all()
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (16, 16), (17, 15)])
-def test_image_sizes_that_are_no_multiple_of_the_tile(size):
-    projected = scene(0, size=size, n=40)
-    for tile_size in (8, 16):
-        bins = bin_to_tiles(projected, tile_size)
-        check_structure(projected, bins)
-        assert bins.grid == (-(-size[0] // tile_size), -(-size[1] // tile_size))
-        got, wanted = listed(projected, bins), strengths(projected, tile_size) >= THRESHOLD
-        assert not (wanted & ~got).any()
-
-
 def test_many_ties_and_negative_depths():
     projected = scene(0, n=300)
     for depths in ((projected.depths * 2).round(), -projected.depths, torch.zeros_like(projected.depths)):
@@ -162,11 +143,3 @@ def test_many_ties_and_negative_depths():
             projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths
         )
         check_structure(tied, bin_to_tiles(tied))
-
-
-@pytest.mark.parametrize("projected", [dots([], (45, 67)), dots([[1e4, 1e4]] * 3, (45, 67))], ids=["none", "outside"])
-def test_nothing_to_draw_gives_empty_lists_for_every_tile(projected):
-    bins = bin_to_tiles(projected)
-    assert bins.offsets.tolist() == [0] * (6 * 9 + 1)
-    assert len(bins.entries) == len(bins.by_gaussian) == 0
-    assert TileCoverage(projected, 8, THRESHOLD).row_slices(1, 1, 1) == [(0, 6)]

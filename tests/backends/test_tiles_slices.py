@@ -78,10 +78,3 @@ def test_spans_and_entries_per_row_are_what_the_rows_hold(max_spans):
     assert coverage.entries_per_row == whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1).tolist()
     assert coverage.num_entries == len(whole.entries)
     assert coverage.spans_per_row == [len(coverage.spans(row, row + 1).ranks) for row in range(12)]
-
-
-def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
-    coverage = TileCoverage(scene(0), 8, THRESHOLD)
-    most = max(coverage.entries_per_row)
-    with pytest.raises(ValueError, match=rf"max_bytes: one row of tiles needs {most} bytes, .* got {most - 1}"):
-        coverage.row_slices(most - 1, 0, 1)

@@ -190,6 +190,16 @@ CASES = [
         ("extrinsics", ValueError, lambda shape=shape: kgs.camera_extent(torch.zeros(shape)))
         for shape in ((4, 4), (0, 4, 4), (2, 3, 4))
     ],
+    *[
+        ("model", TypeError, lambda wrong=wrong: kgs.PosedCamera(wrong, torch.eye(4)[None]))
+        for wrong in (camera(), None)
+    ],
+    ("extrinsics", TypeError, lambda: posed(CameraModelType.PINHOLE, extrinsics=torch.eye(4)[None].tolist())),
+    *[
+        ("extrinsics", ValueError, lambda shape=shape: posed(CameraModelType.PINHOLE, extrinsics=torch.zeros(shape)))
+        for shape in ((4, 4), (1, 3, 4), (1, 1, 4, 4))
+    ],
+    ("model", ValueError, lambda: posed(CameraModelType.PINHOLE, torch.ones(2, 4).double(), cameras=3)),
     # gsplat's call
     *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
     *[
@@ -249,6 +259,10 @@ CASES = [
     bad_points("points, colors", ValueError, torch.rand(5, 2), torch.rand(5, 2)),
     bad_points("points, colors", ValueError, torch.rand(5, 3), torch.rand(4, 3)),
     bad_points("points", ValueError, torch.ones(5, 3)),
+    bad_points("points", ValueError, torch.zeros(5, 3)),
+    bad_points(
+        "points", ValueError, 1e308 * torch.tensor([[10.0], [-10.0], [1.0], [-1.0], [5.0]]).double().expand(5, 3)
+    ),
     bad_points("points", ValueError, torch.full((5, 3), NAN)),
     bad_points("colors", ValueError, torch.rand(5, 3), torch.full((5, 3), NAN)),
     bad_points("points", TypeError, torch.rand(5, 3).half()),

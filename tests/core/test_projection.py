@@ -5,10 +5,10 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from factories import replace
+from factories import posed, replace
 from kornia.sensors.camera import CameraModelType
 from oracles import real_harmonic
-from projection_checks import PACKED, covariances, posed, scene, sigma_route
+from projection_checks import PACKED, covariances, scene, sigma_route
 
 from kgs import RasterOptions, project
 
@@ -50,7 +50,7 @@ def test_the_pinhole_model_is_the_pinhole_camera():
     params = torch.stack([k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]], 1)
     first, second = (
         project(gaussians, cameras),
-        project(gaussians, posed(CameraModelType.PINHOLE, params, cameras.extrinsics)),
+        project(gaussians, posed(CameraModelType.PINHOLE, params, extrinsics=cameras.extrinsics)),
     )
     assert torch.equal(first.camera_ids, second.camera_ids)
     assert torch.equal(first.gaussian_ids, second.gaussian_ids)
@@ -65,7 +65,7 @@ def test_distorted_means_and_covariances_are_opencvs(kind):
         [0.01, 0.02, 0.01, 0.01] if kind is CameraModelType.BROWN_CONRADY else []
     )
     params = torch.tensor([60.0, 62, 31, 24, *distortion], dtype=torch.float64)
-    got = project(gaussians, posed(kind, params, cameras.extrinsics))
+    got = project(gaussians, posed(kind, params, extrinsics=cameras.extrinsics))
     pose = cameras.extrinsics[0]
     at = (gaussians.means @ pose[:3, :3].T + pose[:3, 3])[got.gaussian_ids].numpy()
     k, zero = np.array([[60.0, 0, 31], [0, 62, 24], [0, 0, 1]]), np.zeros(3)
@@ -87,7 +87,7 @@ def test_orthographic_footprints_are_exact_marginals_and_all_rays_share_the_colo
     gaussians, cameras = scene(degree=1)
     params = torch.tensor([8.0, 9, 31, 24], dtype=torch.float64)
     gaussians = replace(gaussians, colors=gaussians.colors[:1].repeat(len(gaussians), 1, 1))
-    got = project(gaussians, posed(CameraModelType.ORTHOGRAPHIC, params, cameras.extrinsics))
+    got = project(gaussians, posed(CameraModelType.ORTHOGRAPHIC, params, extrinsics=cameras.extrinsics))
     pose, zoom = cameras.extrinsics[0], torch.diag(params[:2])
     at = (gaussians.means @ pose[:3, :3].T + pose[:3, 3])[got.gaussian_ids]
     torch.testing.assert_close(got.means2d, at[:, :2] @ zoom + params[2:])

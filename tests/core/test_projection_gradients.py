@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from factories import FIELDS, replace, whole_matrices
+from factories import FIELDS, posed, replace, whole_matrices
 from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
-from projection_checks import LENGTHS, PACKED, posed, scene, values_and_gradients
+from projection_checks import PACKED, scene, values_and_gradients
 
 from kgs import Gaussians, project
 
@@ -23,8 +23,7 @@ def test_opacities_of_each_camera():
 @pytest.mark.parametrize("kind", list(CameraModelType))
 def test_other_camera_models_with_nothing_visible_or_no_gradient_asked_for(kind):
     gaussians, cameras = scene(5)
-    params = torch.tensor([60.0, 60, 31, 24, *[0.01] * LENGTHS[kind]], dtype=torch.float64)
-    camera = posed(kind, params, cameras.extrinsics)
+    camera = posed(kind, extrinsics=cameras.extrinsics)
     seen = project(gaussians, camera)
     assert len(seen) > 0
     assert not any(getattr(seen, name).requires_grad for name in PACKED)

@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
+from factories import FIELDS, pinhole, random_camera, random_gaussians, replace, with_camera
 from oracles import near_threshold
-from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, posed, stack, tensor
+from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, stack, tensor
 
 from kgs import Gaussians
 from kgs.reference import layers, render
@@ -39,7 +39,7 @@ def test_a_gaussian_that_is_not_finite_is_left_out(name, value):
     leaves[name][4].view(-1)[0] = value
     leaves = {key: leaf.requires_grad_() for key, leaf in leaves.items()}
     extrinsics = camera.extrinsics[0].clone().requires_grad_()
-    image = render(Gaussians(**leaves), posed(camera, extrinsics=extrinsics))
+    image = render(Gaussians(**leaves), with_camera(camera, extrinsics=extrinsics))
     keep = torch.arange(10) != 4
     others = Gaussians(*(getattr(gaussians, key)[keep] for key in FIELDS))
     assert torch.equal(image, render(others, camera))

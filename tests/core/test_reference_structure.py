@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians, replace, whole_matrices
+from factories import pinhole, random_camera, random_gaussians, replace, whole_matrices, with_camera
 from kornia.geometry.camera import PinholeCamera
 from oracles import enumerate_drops
-from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, one, posed, stack, tensor
+from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, one, stack, tensor
 from torch import Tensor
 
 import kgs.reference
@@ -59,7 +59,7 @@ def test_gradients_of_all_inputs(sh_degree):
     colors = gaussians.colors if sh_degree is None else gaussians.colors / 4
 
     def image(means, quats, scales, opacities, colors, extrinsics, intrinsics, background):
-        seen = posed(camera, extrinsics=extrinsics, intrinsics=whole_matrices(intrinsics)[0])
+        seen = with_camera(camera, extrinsics=extrinsics, intrinsics=whole_matrices(intrinsics)[0])
         return render(Gaussians(means, quats, scales, opacities, colors), seen, background, **EXACT)
 
     inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors]
@@ -80,7 +80,7 @@ def test_gradient_follows_the_tangent_clamp(fraction):
 
     def image(means, scales, extrinsics):
         two = Gaussians(means, quats, scales, gaussians.opacities[:2], gaussians.colors[:2])
-        return render(two, posed(camera, extrinsics=extrinsics), **EXACT)
+        return render(two, with_camera(camera, extrinsics=extrinsics), **EXACT)
 
     inputs = [value.requires_grad_() for value in (means, scales, camera.extrinsics[0].clone())]
     assert torch.autograd.gradcheck(image, inputs, eps=1e-6, atol=1e-7)
@@ -91,7 +91,7 @@ def test_the_gradient_of_the_lens_follows_the_tangent_limits():
     gaussian = one([4.0, 0.3, 2.0], [0.9, 0.6, 1.2])  # beyond the right limit
 
     def response(intrinsics: Tensor) -> Tensor:
-        return layers(gaussian, posed(camera, intrinsics=intrinsics), **EXACT).responses[0]
+        return layers(gaussian, with_camera(camera, intrinsics=intrinsics), **EXACT).responses[0]
 
     intrinsics = camera.intrinsics[0].clone().requires_grad_()
     response(intrinsics)[3, 4].backward()

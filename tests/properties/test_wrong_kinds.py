@@ -52,63 +52,42 @@ def views(images, names=("a", "b")):
 
 
 MODEL, PHOTO = random_model(5), torch.rand(1, 3, 16, 16)
-WRONG = {  # the name that the error begins with
-    "a model for Gaussians": ("gaussians", TypeError, lambda: kgs.GaussianRenderer()(MODEL, scene().train.camera(0))),
-    "and in project": ("gaussians", TypeError, lambda: kgs.project(MODEL, scene().train.camera(0))),
-    "and in the reference": ("gaussians", TypeError, lambda: reference.render(MODEL, scene().train.camera(0))),
-    "Gaussians for a model": ("model", TypeError, lambda: kgs.save_ply("x.ply", MODEL())),
-    "and in a glb": ("model", TypeError, lambda: save_glb("x.glb", MODEL(), UPRIGHT)),
-    "and in densification": ("model", TypeError, lambda: Densifier(MODEL(), None, 1.0)),
-    "one Gaussian": ("index", TypeError, lambda: MODEL()[0]),
-    "an array of points": (
-        "points",
-        TypeError,
-        lambda: kgs.GaussianModel.from_points(np.zeros((5, 3), np.float32), torch.rand(5, 3)),
-    ),
-    "an array of parameters": (
-        "means",
-        TypeError,
-        lambda: kgs.GaussianModel(*(value.detach().numpy() for value in MODEL.parameters())),
-    ),
-    "means as a list": ("means", TypeError, lambda: rasterize(means=[[0.0, 0.0, 2.0]] * 4)),
-    "backgrounds as a list": ("backgrounds", TypeError, lambda: rasterize(backgrounds=[[1, 1, 1]])),
-    "a list behind the reference": (
-        "background",
-        TypeError,
-        lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0]),
-    ),
-    "a photo for its moments": ("moments", TypeError, lambda: photometric_loss(PHOTO, PHOTO, moments=PHOTO)),
-    "bytes for colours": ("images", TypeError, lambda: views((255 * scene().train.images).byte())),
-    "an array of photos": ("images", TypeError, lambda: views(scene().train.images.numpy())),
-    "cameras for their matrices": ("extrinsics", TypeError, lambda: camera_extent(scene().train.cameras)),
-    "a scene for its views": ("views", TypeError, lambda: initial_points(scene())),
-    "views for a scene": ("scene", TypeError, lambda: Trainer(scene().train, make_plan(scene(), CONFIG), points())),
-    "settings for a plan": ("plan", TypeError, lambda: Trainer(scene(), CONFIG, points())),
-    "and in a whole fit": ("scene", TypeError, lambda: fit_scene(scene().train, CONFIG)),
-    "and in a plan": ("scene", TypeError, lambda: make_plan(scene().train, CONFIG)),
-    "a dict for settings": ("config", TypeError, lambda: make_plan(scene(), {})),
-    "a tensor for points": ("points", TypeError, lambda: Trainer(scene(), make_plan(scene(), CONFIG), points().points)),
-    "a name twice": ("names", ValueError, lambda: views(scene().train.images, ("a", "a"))),
-    "a degree that is no integer": (
-        "sh_degree",
-        ValueError,
-        lambda: rasterize(colors=torch.rand(4, 4, 3), sh_degree=1.0),
-    ),
-    "an array of no effect": ("radial_coeffs", ValueError, lambda: rasterize(radial_coeffs=np.zeros((1, 4)))),
-    "a negative seed": ("seed", ValueError, lambda: synthetic_scene(seed=-1)),
-    "an offset that is not finite": (
-        "offset",
-        ValueError,
-        lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.tensor([0.0, float("nan"), 0.0])),
-    ),
-    "an offset of two": ("offset", ValueError, lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.zeros(2))),
-    "a rotation of four": ("rotation", ValueError, lambda: save_glb("x.glb", MODEL, torch.eye(4))),
-}
+WRONG = [
+    ("gaussians", TypeError, lambda: kgs.GaussianRenderer()(MODEL, scene().train.camera(0))),
+    ("gaussians", TypeError, lambda: kgs.project(MODEL, scene().train.camera(0))),
+    ("gaussians", TypeError, lambda: reference.render(MODEL, scene().train.camera(0))),
+    ("model", TypeError, lambda: kgs.save_ply("x.ply", MODEL())),
+    ("model", TypeError, lambda: save_glb("x.glb", MODEL(), UPRIGHT)),
+    ("model", TypeError, lambda: Densifier(MODEL(), None, 1.0)),
+    ("index", TypeError, lambda: MODEL()[0]),
+    ("points", TypeError, lambda: kgs.GaussianModel.from_points(np.zeros((5, 3), np.float32), torch.rand(5, 3))),
+    ("means", TypeError, lambda: kgs.GaussianModel(*(value.detach().numpy() for value in MODEL.parameters()))),
+    ("means", TypeError, lambda: rasterize(means=[[0.0, 0.0, 2.0]] * 4)),
+    ("backgrounds", TypeError, lambda: rasterize(backgrounds=[[1, 1, 1]])),
+    ("background", TypeError, lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0])),
+    ("moments", TypeError, lambda: photometric_loss(PHOTO, PHOTO, moments=PHOTO)),
+    ("images", TypeError, lambda: views((255 * scene().train.images).byte())),
+    ("images", TypeError, lambda: views(scene().train.images.numpy())),
+    ("extrinsics", TypeError, lambda: camera_extent(scene().train.cameras)),
+    ("views", TypeError, lambda: initial_points(scene())),
+    ("scene", TypeError, lambda: Trainer(scene().train, make_plan(scene(), CONFIG), points())),
+    ("plan", TypeError, lambda: Trainer(scene(), CONFIG, points())),
+    ("scene", TypeError, lambda: fit_scene(scene().train, CONFIG)),
+    ("scene", TypeError, lambda: make_plan(scene().train, CONFIG)),
+    ("config", TypeError, lambda: make_plan(scene(), {})),
+    ("points", TypeError, lambda: Trainer(scene(), make_plan(scene(), CONFIG), points().points)),
+    ("names", ValueError, lambda: views(scene().train.images, ("a", "a"))),
+    ("sh_degree", ValueError, lambda: rasterize(colors=torch.rand(4, 4, 3), sh_degree=1.0)),
+    ("radial_coeffs", ValueError, lambda: rasterize(radial_coeffs=np.zeros((1, 4)))),
+    ("seed", ValueError, lambda: synthetic_scene(seed=-1)),
+    ("offset", ValueError, lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.tensor([0.0, float("nan"), 0.0]))),
+    ("offset", ValueError, lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.zeros(2))),
+    ("rotation", ValueError, lambda: save_glb("x.glb", MODEL, torch.eye(4))),
+]
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_something_else_is_an_error_that_names_the_argument(case):
-    name, error, call = WRONG[case]
+@pytest.mark.parametrize(("name", "error", "call"), WRONG, ids=[f"{i}-{case[0]}" for i, case in enumerate(WRONG)])
+def test_something_else_is_an_error_that_names_the_argument(name, error, call):
     with pytest.raises(error, match=f"^{name}:"):
         call()
 
