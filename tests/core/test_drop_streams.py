@@ -101,10 +101,11 @@ def test_a_numpy_seed_is_an_integer():
     assert torch.equal(stream(at(1.0, p=0.5, seed=np.int64(3))), stream(at(1.0, p=0.5, seed=3)))
 
 
-def test_a_worker_of_a_data_loader_continues_the_stream():
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_a_worker_of_a_data_loader_continues_the_stream(context):
     layer = at(1.0, p=0.5, seed=3)
     stream(layer)
-    loader = torch.utils.data.DataLoader(Masks(layer), batch_size=None, num_workers=1)
+    loader = torch.utils.data.DataLoader(Masks(layer), batch_size=None, num_workers=1, multiprocessing_context=context)
     assert torch.equal(torch.stack(list(loader)), stream(layer))
 
 
