@@ -2,9 +2,39 @@
 
 import pytest
 import torch
-from tile_checks import THRESHOLD, check_structure, scene
+from tile_checks import THRESHOLD, check_structure, dots, scene, tiles_of_entries
 
 from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
+
+
+@pytest.mark.parametrize("cameras", [1, 16])
+def test_tile_numbers_beyond_16_bits(cameras):
+    """16 cameras of 4096 px: a dot at the middle of a random tile is in that tile alone."""
+    height, width = 64, 4096
+    grid, generator = (16, 1024), torch.Generator().manual_seed(0)
+    m = 3000
+    camera, row, column = (torch.randint(0, high, (m,), generator=generator) for high in (cameras, *grid))
+    camera[:2], row[:2], column[:2] = torch.tensor([0, cameras - 1]), torch.tensor([0, 15]), torch.tensor([0, 1023])
+    camera, order = camera.sort(stable=True)
+    row, column = row[order], column[order]
+    means2d = torch.stack([column * 4 + 1.5, row * 4 + 1.5], 1)
+    depths = torch.rand(m, generator=generator)
+    projected = dots(means2d, (height, width), 0.2, camera_ids=camera, num_cameras=cameras, depths=depths)
+    bins = bin_to_tiles(projected, 4)
+    assert bins.num_tiles == cameras * 16 * 1024
+    check_structure(projected, bins)
+    tile = torch.empty(m, dtype=torch.int64)
+    tile[bins.ids[bins.entries.long()]] = tiles_of_entries(bins)
+    assert len(bins.entries) == m
+    assert torch.equal(tile, (camera * grid[0] + row) * grid[1] + column)
+
+
+@pytest.mark.parametrize("rows", [2**15 // 64 - 1, 2**15 // 64, 2**15 // 64 + 1])
+def test_tile_counts_around_the_border_of_16_bits(rows):
+    projected = dots([[2.0, 2.0], [2.0 + 63 * 4, 2.0 + 4 * (rows - 1)]], (4 * rows, 256), 0.1)
+    bins = bin_to_tiles(projected, 4)
+    assert bins.num_tiles == 64 * rows
+    assert tiles_of_entries(bins).tolist() == [0, 64 * rows - 1]
 
 
 @pytest.mark.parametrize("max_spans", [2**40, 100, 1])

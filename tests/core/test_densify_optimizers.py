@@ -36,23 +36,6 @@ def test_survivors_keep_their_moments_bit_for_bit_and_new_rows_have_none(dtype):
             assert not state[moment][3:].any()
 
 
-def test_model_and_optimizer_hold_the_same_parameters_and_can_go_on():
-    model, adam, densifier = make([SMALL, LARGE, SMALL])
-    train(model, adam)
-    densifier.observe(seen(model, [0, 1], [(1, 0), (1, 0)]))
-    densifier.step()
-    groups = {group["name"]: group["params"] for group in adam.param_groups}
-    assert set(groups) == set(NAMES)
-    assert all(groups[name][0] is parameter for name, parameter in model.named_parameters())
-    assert {id(p) for p in adam.state} == {id(p) for p in model.parameters()}
-    before = snapshot(model, adam)
-    train(model, adam)
-    for name, parameter in model.named_parameters():
-        assert bool((parameter != before[name][0]).all())
-        assert adam.state[parameter]["step"].item() == 2
-    assert model().means.shape == (5, 3)
-
-
 def test_an_old_graph_that_is_still_alive_does_no_harm():
     model, adam, densifier = make([SMALL, LARGE])
     alive = model()
