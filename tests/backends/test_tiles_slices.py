@@ -1,4 +1,4 @@
-"""Many tiles and cameras, and lists of row slices and depth slices."""
+"""Many tiles, and lists of row slices and depth slices."""
 
 import pytest
 import torch

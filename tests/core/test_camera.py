@@ -1,4 +1,4 @@
-"""Pixels and Jacobians against OpenCV, finite differences of Kornia, and the tangent clamp by its definition."""
+"""Pixels and Jacobians against finite differences of Kornia, and the tangent clamp by its definition."""
 
 import factories
 import pytest

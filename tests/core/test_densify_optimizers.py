@@ -11,8 +11,6 @@ from factories import other_defaults
 
 from kgs.densify import Densifier, DensifyReport
 
-NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
-
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_survivors_keep_their_moments_bit_for_bit_and_new_rows_have_none(dtype):

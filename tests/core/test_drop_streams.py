@@ -1,4 +1,4 @@
-"""DropGaussian's own stream of masks, and the statistics of masks against enumeration and binomial closed forms."""
+"""DropGaussian's own stream of masks, and the expectation over all masks by enumeration."""
 
 import copy
 import io

@@ -1,4 +1,4 @@
-"""What the core refuses: the type of the error, and the name of the argument that its message begins with."""
+"""What the core and its stages refuse: the type of the error, and the name that its message begins with."""
 
 import dataclasses
 import math

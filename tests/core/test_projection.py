@@ -1,4 +1,4 @@
-"""`project` against the covariance route in float64 and against OpenCV; its errors."""
+"""`project` against the covariance route in float64 and against OpenCV."""
 
 import cv2
 import mpmath

@@ -1,4 +1,4 @@
-"""Batches, memory layouts and gradients of `project`."""
+"""Opacities of each camera, nothing to project, and gradients of `project`."""
 
 import pytest
 import torch

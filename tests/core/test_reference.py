@@ -1,4 +1,4 @@
-"""The dense reference against closed forms, 50 digits, mpmath and scipy."""
+"""The dense reference against 50 digits and scipy, by hand where a limit or a sum is known."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""What must hold of any renderer: linearity, invariances, exact windows; and what the reference takes."""
+"""Gradients of the reference against finite differences, its order of equal depths, and what it takes and uses."""
 
 import ast
 from pathlib import Path
@@ -7,25 +7,12 @@ import pytest
 import torch
 from factories import pinhole, random_camera, random_gaussians, replace, whole_matrices, with_camera
 from kornia.geometry.camera import PinholeCamera
-from oracles import enumerate_drops
 from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, one, stack, tensor
 from torch import Tensor
 
 import kgs.reference
 from kgs import Gaussians
 from kgs.reference import layers, render
-
-
-def test_dropping_is_unbiased_while_nothing_is_clamped():
-    gaussians, camera = random_gaussians(7, 3, opacities=(0.2, 0.75)), random_camera(6, 7, 3)
-
-    def dropped(factors: Tensor) -> Tensor:
-        return render(
-            replace(gaussians, opacities=gaussians.opacities * factors), camera, tensor(0.1, 0.5, 0.9), **EXACT
-        )
-
-    expected = dropped(torch.ones(7).double())
-    assert float((enumerate_drops(7, 0.2, dropped) - expected).abs().max()) < 1e-14
 
 
 def test_equal_depths_keep_the_order_of_the_gaussians():

@@ -1,4 +1,4 @@
-"""The renderer as its user meets it: outputs, backgrounds, layers, errors."""
+"""The renderer as its user meets it: outputs, backgrounds, layers, modes, options."""
 
 import dataclasses
 import math
@@ -154,7 +154,7 @@ def test_rgb_is_taken_as_it_is_and_harmonics_are_shifted_by_a_half():
     assert GaussianRenderer()(bright, camera).image.min() < -1  # neither colours nor the image are clamped
 
 
-# -- dtypes, modes, errors -----------------------------------------------------------------------------------------
+# -- modes and options --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("backward_inside", [False, True])
