@@ -163,6 +163,7 @@ CASES = [
     ("near_plane", ValueError, lambda: kgs.GaussianRenderer(near_plane=-1.0)),
     ("options", TypeError, lambda: kgs.GaussianRenderer(options=kgs.RasterOptions(), eps2d=0.1)),
     ("options", TypeError, lambda: kgs.GaussianRenderer(options={"eps2d": 0.1})),
+    ("last_plane", TypeError, lambda: kgs.GaussianRenderer(last_plane=10.0)),
     ("options", TypeError, lambda: kgs.project(random_gaussians(3, 0), camera(), options={"eps2d": 0.1})),
     bad_stage("options", TypeError, options={"eps2d": 0.1}),
     # the renderer
