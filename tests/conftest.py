@@ -121,6 +121,14 @@ def _synthetic_worlds_are_made_once() -> Iterator[None]:
 
 
 @pytest.fixture
+def set_threads() -> Iterator[Callable[[int], None]]:
+    """Sets the number of torch's threads for the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def matmul_precision() -> Iterator[Callable[[str], None]]:
     """Sets the precision of torch's float32 products for the test."""
 

@@ -1,6 +1,5 @@
 """The projection of each backend against that of torch: the same list, values and gradients within float32."""
 
-import dataclasses
 import importlib
 
 import pytest
@@ -22,9 +21,6 @@ def handed_over(kernel_backend, monkeypatch):
     real = module.project_in_torch
     monkeypatch.setattr(module, "project_in_torch", lambda *a: calls.append(1) or real(*a))
     return calls
-
-
-# -- the same values and gradients ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
@@ -118,9 +114,6 @@ def test_the_limits_of_the_tangents_belong_to_what_has_a_gradient(kernel_backend
     assert torch.allclose(values[0][1]["means"], values[1][1]["means"], rtol=1e-5, atol=1e-5)
 
 
-# -- autograd ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("wanted", FIELDS)
 def test_only_what_is_asked_for_has_a_gradient(kernel_backend, wanted):
     gaussians, cameras = wide_scene(1)
@@ -147,34 +140,6 @@ def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(ke
         torch.autograd.grad(loss, inputs[:3])
 
 
-def test_gradients_of_the_centres_in_the_image_are_kept(kernel_backend):
-    gaussians, _ = leaves(wide_scene()[0])
-    out = GaussianRenderer(backend=kernel_backend)(gaussians, wide_scene()[1])
-    out.projected.means2d.retain_grad()
-    out.image.square().sum().backward()
-    assert out.projected.means2d.grad.abs().sum() > 0
-
-
-def test_without_gradients_and_in_inference_mode(kernel_backend):
-    gaussians, cameras = wide_scene()
-    expected = project(gaussians, cameras, backend=kernel_backend)
-    assert not expected.means2d.requires_grad
-    for mode in (torch.no_grad, torch.inference_mode):
-        with mode():
-            got = project(leaves(gaussians)[0], cameras, backend=kernel_backend)
-        assert not got.means2d.requires_grad
-        assert torch.equal(got.means2d, expected.means2d)
-
-
-def test_tensors_that_are_not_contiguous():
-    gaussians, cameras = wide_scene()
-    strided = dataclasses.replace(gaussians, colors=gaussians.colors.transpose(0, 1).contiguous().transpose(0, 1))
-    assert torch.equal(project(strided, cameras).colors, project(gaussians, cameras).colors)
-
-
-# -- what is left to torch -----------------------------------------------------------------------------------------
-
-
 def test_cameras_of_another_form_go_to_torch(kernel_backend, handed_over):
     gaussians, cameras = wide_scene()
     flat = cameras.extrinsics.clone()
@@ -192,22 +157,16 @@ def test_float64_is_refused_by_name_and_left_to_torch_by_auto(kernel_backend):
         list_and_gradients(gaussians, cameras, kernel_backend, torch.float64)
 
 
-# -- threads -------------------------------------------------------------------------------------------------------
-
-
-def test_the_same_bits_on_any_number_of_threads(kernel_backend):
+def test_the_same_bits_on_any_number_of_threads(kernel_backend, set_threads):
     gaussians, cameras = wide_scene(3, 5300, cameras=2)
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3, 4):
-            torch.set_num_threads(threads)
-            found.append(list_and_gradients(gaussians, cameras, kernel_backend))
-            pose = cameras.extrinsics.clone().requires_grad_()
-            moved = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
-            project(gaussians, moved, backend=kernel_backend).factors.square().sum().backward()
-            found[-1][1]["pose"] = pose.grad
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 2, 3, 4):
+        set_threads(threads)
+        found.append(list_and_gradients(gaussians, cameras, kernel_backend))
+        pose = cameras.extrinsics.clone().requires_grad_()
+        moved = type(cameras)(cameras.intrinsics, pose, cameras.height, cameras.width)
+        project(gaussians, moved, backend=kernel_backend).factors.square().sum().backward()
+        found[-1][1]["pose"] = pose.grad
     (first, first_grads), *others = found
     for got, grads in others:
         assert all(

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import pinhole, random_camera, random_gaussians, staged
+from compositing_checks import DTYPES, EXACT, STOP, TH, footprints, leaves
+from factories import FIELDS, pinhole, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 from oracles import near_threshold, theta_mass
 
@@ -14,11 +14,6 @@ import kgs.reference
 from kgs import GaussianRenderer, RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
-
-
-# -- closed forms --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
@@ -49,9 +44,7 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
     pixels = torch.cartesian_prod(torch.arange(37), torch.arange(43)).flip(1).double()
     for factor, centre in zip(factors.to(dtype), centres.to(dtype), strict=True):
         alone = footprints([0.7], centre[None], factor[None], size=(37, 43), dtype=dtype, eps2d=0.3)
-        got = composite(
-            alone, alone.colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
-        ).transmittance
+        got = composite(alone, alone.colors, options=EXACT).transmittance
         inverse = torch.linalg.inv(factor.double() @ factor.double().T + 0.3 * torch.eye(2, dtype=torch.float64))
         d = pixels - centre.double()
         expected = 1 - 0.7 * torch.exp(-0.5 * torch.einsum("pi,ij,pj->p", d, inverse, d))
@@ -63,12 +56,7 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
 def test_mass_is_the_theta_function(variance, centre):
     sigma = math.sqrt(variance)
     alone = footprints([0.5], [centre], [[[sigma, 0, 0], [0, sigma, 0]]], size=(41, 41))
-    mass = (
-        1
-        - composite(
-            alone, alone.colors, options=RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
-        ).transmittance
-    )
+    mass = 1 - composite(alone, alone.colors, options=EXACT).transmittance
     assert mass.sum().item() == pytest.approx(
         0.5 * theta_mass(variance, centre[0]) * theta_mass(variance, centre[1]), rel=1e-9
     )
@@ -97,12 +85,6 @@ def test_equal_layers_are_a_geometric_series_and_weights_partition_unity(dtype, 
     # sum of weights and transmittance is 1, to 4 eps a layer
     total = out.features + out.transmittance * color[:, None, None]
     assert (total - color[:, None, None]).abs().max() <= 4 * n * torch.finfo(dtype).eps
-
-
-def test_two_coincident_halves_are_one():
-    whole = composite(footprints([0.84]), torch.ones(1, 3, dtype=torch.float64))
-    half = composite(footprints([0.6, 0.6]), torch.ones(2, 3, dtype=torch.float64))
-    assert (whole.features - half.features).abs().max() <= 1e-12
 
 
 def against_reference(seed, dtype, thresholds, sh_degree, opacities=(0.05, 0.95)):
@@ -134,9 +116,6 @@ def against_reference(seed, dtype, thresholds, sh_degree, opacities=(0.05, 0.95)
     return difference[~doubtful].max().item(), at_doubtful, doubtful.double().mean().item(), errors
 
 
-# -- the dense reference -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sh_degree", [None, 3])
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
@@ -164,9 +143,6 @@ def test_default_thresholds_are_the_reference_away_from_decisions(dtype, image_b
     assert sum(share) / len(share) < most
 
 
-# -- depth and features --------------------------------------------------------------------------------------------
-
-
 def test_median_depth_is_where_less_than_half_the_light_remains():
     def median(opacities, depths):
         layers = footprints(opacities, depths=depths)
@@ -186,36 +162,3 @@ def test_median_depth_is_only_made_when_asked_for_and_has_no_gradient():
     found = composite(projected, inputs[-1], median_depth=True).median_depth
     assert found.shape == (1, 1, 3, 4)
     assert not found.requires_grad
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_features_of_any_width(dtype):
-    projected, _, _ = scene_footprints(40, 6, dtype)
-    features = torch.randn(len(projected), 7, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    wide, wide_inputs = leaves(projected, features)
-    full = composite(wide, wide_inputs[-1])
-    full.features.sum().backward()
-    bound = 1e-6 if dtype == torch.float32 else 1e-14
-    for width in (0, 1, 3, 7):
-        narrow, inputs = leaves(projected, features[:, :width])
-        out = composite(narrow, inputs[-1])
-        assert out.features.shape == (1, width, 40, 56)
-        assert torch.equal(out.transmittance, full.transmittance)
-        assert ((out.features - full.features[:, :width]).abs() <= bound).all()
-        (out.features.sum() + out.transmittance.sum()).backward()
-        assert inputs[-1].grad.shape == (len(projected), width)
-        assert ((inputs[-1].grad - wide_inputs[-1].grad[:, :width]).abs() <= bound * wide_inputs[-1].grad.max()).all()
-
-
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("backend", "cuda"),
-        ("chunk_size", 0),
-    ],
-)
-def test_options_out_of_range_are_named(option, value):
-    layers = footprints([0.5])
-    with pytest.raises(ValueError, match=option):
-        composite(layers, layers.colors, **staged(**{option: value}))

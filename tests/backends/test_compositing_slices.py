@@ -6,8 +6,8 @@ import pytest
 import torch
 from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
 from factories import random_camera, random_gaussians, staged
+from operators import Operators
 from oracles import near_threshold
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from kgs import GaussianRenderer, RasterOptions, backends, composite, project
 from kgs.backends.torch import compositing
@@ -218,25 +218,12 @@ def test_the_scans_of_a_gpu_give_the_same(dtype, bound, thresholds, request):
     assert_gradients_close(other_gradients, gradients, bound)
 
 
-class _Launches(TorchDispatchMode):
-    """Counts the operators that would be kernels on a GPU."""
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        result = func(*args, **(kwargs or {}))
-        self.count += not func.is_view
-        return result
-
-
 def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu):
     def launches(n, size):
         projected, colors, weights = scene_footprints(n, 1, torch.float32, size, image_size=80)
-        with _Launches() as mode:
+        with Operators() as operators:
             loss_and_gradients(projected, colors, weights)
-        return mode.count
+        return operators.launches
 
     few = launches(100, (40, 56))
     assert few <= 500
@@ -244,34 +231,20 @@ def test_launches_do_not_grow_with_gaussians_or_pixels(as_on_a_gpu):
     assert launches(800, (160, 224)) <= few + 300  # lists longer than 32 take a second and a third step
 
 
-class _Waits(TorchDispatchMode):
-    """Counts what a GPU would have to finish all its work for."""
-
-    NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "_unique2", "unique_consecutive", "bincount")
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func.overloadpacket.__name__ in self.NAMES
-        return func(*args, **(kwargs or {}))
+# what a GPU would have to finish all its work for
+WAITS = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "unique_consecutive", "bincount"}
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_a_gpu_is_asked_for_few_numbers(sh_degree, as_on_a_gpu, monkeypatch):
     gaussians, camera = random_gaussians(500, 0, torch.float32, sh_degree), random_camera(80, 120, 0, torch.float32)
     gaussians.means.requires_grad_()
-    waits, tolist = _Waits(), torch.Tensor.tolist
-
-    def counted(tensor):
-        waits.count += 1
-        return tolist(tensor)
-
-    monkeypatch.setattr(torch.Tensor, "tolist", counted)
-    with waits:
+    lists = []
+    tolist = torch.Tensor.tolist
+    monkeypatch.setattr(torch.Tensor, "tolist", lambda tensor: lists.append(tensor) or tolist(tensor))
+    with Operators() as operators:
         GaussianRenderer()(gaussians, camera).image.sum().backward()
-    assert waits.count <= 12
+    assert len(lists) + sum(name in WAITS for name in operators.names) <= 12
 
 
 @pytest.mark.parametrize("size", [(8, 8), (8, 24), (24, 8), (11, 5)])
@@ -285,37 +258,3 @@ def test_incoming_gradients_are_left_alone(size):
     assert (grads[0] == 1).all()
     assert (grads[1] == 2).all()
     assert all(torch.equal(x.grad, 2 * g) for x, g in zip(inputs, first, strict=True))
-
-
-def test_too_small_a_budget_is_an_error_with_the_numbers():
-    projected, colors, _ = scene_footprints(50, 1, torch.float32)
-    with pytest.raises(ValueError, match=r"max_bytes.*\d+ bytes"):
-        composite(projected, colors, options=RasterOptions(max_bytes=160))
-
-
-@pytest.mark.slow
-def test_many_screen_filling_gaussians_under_a_budget():
-    n, size = 2000, (256, 256)
-    generator = torch.Generator().manual_seed(0)
-    centres = 256 * torch.rand(n, 2, generator=generator)
-    factors = 150 * torch.eye(2, 3) + 10 * torch.randn(n, 2, 3, generator=generator)
-    projected = footprints(torch.full((n,), 0.01), centres, factors, size=size, dtype=torch.float32, eps2d=0.3)
-    colors = torch.rand(n, 3, generator=generator)
-    weights = torch.randn(1, 4, *size, generator=generator)
-    free, free_gradients = loss_and_gradients(projected, colors, weights)
-    tight, tight_gradients = loss_and_gradients(projected, colors, weights, max_bytes=64 * 2**20)
-    assert torch.equal(tight, free)
-    assert_gradients_close(tight_gradients, free_gradients, 1e-5)
-
-
-def test_cameras_in_one_call_do_not_mix():
-    projected, colors, weights = scene_footprints(60, 2, torch.float64)
-    n = len(projected)
-    names = ("gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
-    twice = {name: torch.cat([getattr(projected, name)] * 2) for name in names}
-    both = dataclasses.replace(projected, **twice, camera_ids=torch.arange(2).repeat_interleave(n), num_cameras=2)
-    single, single_gradients = loss_and_gradients(projected, colors, weights)
-    double, gradients = loss_and_gradients(both, torch.cat([colors, colors]), torch.cat([weights, 3 * weights]))
-    assert torch.equal(double, torch.cat([single, single]))
-    for got, expected in zip(gradients, single_gradients, strict=True):
-        assert_gradients_close([got[:n], got[n:]], [expected, 3 * expected], 1e-13)

@@ -20,8 +20,6 @@ from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
 from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
 
-# -- lists ---------------------------------------------------------------------------------------------------------
-
 
 def coverage_of(projected, threshold=TH, max_spans=2**40):
     inputs = (projected.means2d, projected.factors, projected.opacities, projected.colors)
@@ -62,8 +60,6 @@ def test_rows_hold_what_was_counted(max_spans):
     assert torch.equal(torch.from_numpy(coverage.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
     assert coverage.spans_per_row.tolist() == [len(coverage.row_slice(row, row + 1).spans) for row in range(12)]
 
-
-# -- vector code ---------------------------------------------------------------------------------------------------
 
 FLOATS = r"(?:fn?m(?:add|sub)\d*|mul|add|sub)"
 PACKED = rf"\tv?{FLOATS}ps\b.*[yz]mm|\tf(?:mla|mls|mul|add|sub)(?:\.4s|\tv\d+\.4s)"  # x86, arm
@@ -110,9 +106,6 @@ def test_loops_over_columns_are_vector_code(name, arguments, operations):
     """All that they compute stands in the assembly for whole AVX registers; single numbers are what is left over."""
     assembly = avx_assembly(getattr(loss_kernels, name), nb.int64, nb.int64, *arguments)
     assert len(re.findall(r"\bv\w*(?:add|sub|mul)\w*ps\b.*[yz]mm", assembly)) >= operations
-
-
-# -- cache ---------------------------------------------------------------------------------------------------------
 
 
 def stamp(kernel):

@@ -1,13 +1,10 @@
-"""Many tiles and cameras, and lists of row slices and depth slices."""
+"""Many tiles, and lists of row slices and depth slices."""
 
 import pytest
 import torch
-from factories import footprints
-from tile_checks import THRESHOLD, check_structure, dots, listed, scene, tiles_of_entries
+from tile_checks import THRESHOLD, check_structure, dots, scene, tiles_of_entries
 
 from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
-
-# -- many tiles ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cameras", [1, 16])
@@ -38,22 +35,6 @@ def test_tile_counts_around_the_border_of_16_bits(rows):
     bins = bin_to_tiles(projected, 4)
     assert bins.num_tiles == 64 * rows
     assert tiles_of_entries(bins).tolist() == [0, 64 * rows - 1]
-
-
-def test_a_batch_of_cameras_is_its_cameras_one_by_one():
-    cameras = 16
-    together = scene(0, cameras=cameras, n=40)
-    bins = bin_to_tiles(together)
-    check_structure(together, bins)
-    table = listed(together, bins).reshape(len(together), cameras, -1)
-    for c in range(cameras):
-        own = together.camera_ids == c
-        single = footprints(*(x[own] for x in (together.means2d, together.factors, together.opacities)), (45, 67))
-        assert torch.equal(table[own, c], listed(single, bin_to_tiles(single)))
-        assert not table[own][:, torch.arange(cameras) != c].any()
-
-
-# -- slices --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("max_spans", [2**40, 100, 1])
@@ -127,10 +108,3 @@ def test_spans_and_entries_per_row_are_what_the_rows_hold(max_spans):
     assert coverage.entries_per_row == whole.offsets.diff().reshape(-1, whole.grid[1]).sum(1).tolist()
     assert coverage.num_entries == len(whole.entries)
     assert coverage.spans_per_row == [len(coverage.spans(row, row + 1).ranks) for row in range(12)]
-
-
-def test_a_budget_below_one_row_of_tiles_is_refused_with_the_numbers():
-    coverage = TileCoverage(scene(0), 8, THRESHOLD)
-    most = max(coverage.entries_per_row)
-    with pytest.raises(ValueError, match=rf"max_bytes: one row of tiles needs {most} bytes, .* got {most - 1}"):
-        coverage.row_slices(most - 1, 0, 1)

@@ -93,12 +93,3 @@ def test_the_renderer_leaves_them_for_the_densifier():
         densifier.observe(out.projected)
     assert (absolute.mean_gradients >= usual.mean_gradients - 1e-6).all()
     assert absolute.mean_gradients.sum() > 1.1 * usual.mean_gradients.sum()
-
-
-def test_the_densifier_says_what_is_missing():
-    model = kgs.GaussianModel.from_points(torch.rand(50, 3) + torch.tensor([-0.5, -0.5, 2.0]), torch.rand(50, 3))
-    out = kgs.GaussianRenderer()(model(), random_camera(HEIGHT, WIDTH, 1, torch.float32))
-    out.image.square().sum().backward()
-    densifier = kgs.Densifier(model, torch.optim.Adam(model.parameters()), 1.0, absgrad=True)
-    with pytest.raises(ValueError, match="means2d.absgrad, got None: the render needs absgrad=True"):
-        densifier.observe(out.projected)

@@ -1,43 +1,24 @@
-"""Pixels and Jacobians against OpenCV, finite differences of Kornia, and the tangent clamp by its definition."""
+"""Pixels and Jacobians against finite differences of Kornia, and the tangent clamp by its definition."""
 
-import cv2
-import numpy as np
+import factories
 import pytest
 import torch
-from factories import whole_matrices
+from factories import LENS_PARAMS, posed
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.vector import Vector3
-from kornia.image import ImageSize
-from kornia.sensors.camera import CameraModel, CameraModelType
+from kornia.sensors.camera import CameraModelType
 
-from kgs import PosedCamera
 from kgs.camera import image_size, lenses, pinhole_cameras
 
 HEIGHT, WIDTH = 48, 64
-INTRINSICS = [50.0, 55.0, 30.0, 25.0]  # fx fy cx cy, off centre
-PARAMS = {
-    CameraModelType.PINHOLE: INTRINSICS,
-    CameraModelType.BROWN_CONRADY: [*INTRINSICS, 0.1, -0.05, 0.003, -0.002, 0.01, 0.02, 0.03, 0.01],
-    CameraModelType.KANNALA_BRANDT_K3: [*INTRINSICS, 0.1, -0.05, 0.003, -0.002],
-    CameraModelType.ORTHOGRAPHIC: [10.0, 11.0, 30.0, 25.0],
-}
-KINDS = list(PARAMS)
+INTRINSICS = LENS_PARAMS[CameraModelType.PINHOLE]  # fx fy cx cy, off centre
+KINDS = list(LENS_PARAMS)
 PERSPECTIVE = KINDS[:3]
 CLAMPED = KINDS[:2]
 
 
-def posed(kind, params=None, cameras=1, dtype=torch.float64):
-    params = torch.tensor(PARAMS[kind], dtype=dtype) if params is None else params
-    return PosedCamera(
-        CameraModel(ImageSize(HEIGHT, WIDTH), kind, params), torch.eye(4, dtype=dtype).repeat(cameras, 1, 1)
-    )
-
-
-def pinhole(intrinsics=INTRINSICS, skew=0.0, cameras=1, size=(HEIGHT, WIDTH), dtype=torch.float64):
-    fx, fy, cx, cy = intrinsics
-    k = torch.tensor([[fx, skew, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=dtype)
-    sizes = (torch.full((cameras,), value) for value in size)
-    return PinholeCamera(k.repeat(cameras, 1, 1), torch.eye(4, dtype=dtype).repeat(cameras, 1, 1), *sizes)
+def pinhole(skew=0.0):
+    return factories.pinhole(HEIGHT, WIDTH, INTRINSICS[:2], INTRINSICS[2:], skew)
 
 
 def points(n=20, spread=0.45, seed=0, dtype=torch.float64):
@@ -59,9 +40,6 @@ def kornia_pixels(cameras, at):
     return cameras.model.project(Vector3(at)).data
 
 
-# -- pixels and Jacobians inside the field of view -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cameras", all_cameras())
 def test_pixels_are_kornias_and_jacobians_their_finite_differences(cameras):
     (lens,) = lenses(cameras)
@@ -74,36 +52,9 @@ def test_pixels_are_kornias_and_jacobians_their_finite_differences(cameras):
     torch.testing.assert_close(lens.jacobian(at), torch.stack(columns, 2), rtol=1e-7, atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", PERSPECTIVE)
-def test_pixels_and_jacobians_are_opencvs(kind):
-    """OpenCV differentiates with respect to the translation, which is the point itself while nothing is turned."""
-    (lens,) = lenses(posed(kind))
-    at, zero = points(), np.zeros(3)
-    k = np.array([[50.0, 0, 30], [0, 55, 25], [0, 0, 1]])
-    distortion = np.array(PARAMS[kind][4:])
-    if kind is CameraModelType.KANNALA_BRANDT_K3:
-        pixels, jacobian = cv2.fisheye.projectPoints(at.numpy()[None], zero, zero, k, distortion)
-        columns = jacobian[:, 11:14]
-    else:
-        pixels, jacobian = cv2.projectPoints(at.numpy(), zero, zero, k, distortion if len(distortion) else None)
-        columns = jacobian[:, 3:6]
-    expected = torch.from_numpy(pixels.reshape(-1, 2))
-    torch.testing.assert_close(lens.project(at), expected, rtol=0, atol=1e-10)
-    torch.testing.assert_close(lens.jacobian(at), torch.from_numpy(columns).reshape(-1, 2, 3), rtol=1e-8, atol=1e-8)
-
-
-def test_skew_by_hand():
-    (lens,) = lenses(pinhole(skew=3.0))
-    at = torch.tensor([[0.2, 0.4, 2.0]], dtype=torch.float64)
-    pixel = torch.tensor([[50 * 0.1 + 3 * 0.2 + 30, 55 * 0.2 + 25]], dtype=torch.float64)
-    jacobian = torch.tensor([[[25, 1.5, -(50 * 0.1 + 3 * 0.2) / 2], [0, 27.5, -55 * 0.2 / 2]]], dtype=torch.float64)
-    torch.testing.assert_close(lens.project(at), pixel)
-    torch.testing.assert_close(lens.jacobian(at), jacobian)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_of_one_camera_or_of_each(kind):
-    base = torch.tensor(PARAMS[kind], dtype=torch.float64)
+    base = torch.tensor(LENS_PARAMS[kind], dtype=torch.float64)
     rows = torch.stack([base, base * 1.1, base * 0.9])
     at = points()
     for shared in (base, base[None]):
@@ -113,11 +64,6 @@ def test_parameters_of_one_camera_or_of_each(kind):
         (single,) = lenses(posed(kind, row))
         torch.testing.assert_close(lens.project(at), kornia_pixels(posed(kind, row), at), rtol=0, atol=0)
         assert torch.equal(lens.jacobian(at), single.jacobian(at))
-
-
-def test_only_orthographic_rays_are_parallel():
-    assert [lenses(posed(kind))[0].parallel for kind in KINDS] == [False, False, False, True]
-    assert not lenses(pinhole())[0].parallel
 
 
 @pytest.mark.parametrize("kind", PERSPECTIVE)
@@ -150,9 +96,6 @@ def test_float32_stays_float32_and_is_close(kind):
     at = points(spread=1.5, dtype=torch.float32)
     assert lens.jacobian(at).dtype == lens.project(at).dtype == torch.float32
     torch.testing.assert_close(lens.jacobian(at).double(), exact.jacobian(at.double()), rtol=1e-4, atol=1e-4)
-
-
-# -- the tangent clamp ---------------------------------------------------------------------------------------------
 
 
 def far_points():
@@ -197,16 +140,6 @@ def test_fisheye_and_orthographic_have_no_limits(kind):
     torch.testing.assert_close(lens.jacobian(at), unclamped(posed(kind), at), rtol=1e-10, atol=1e-10)
 
 
-def test_without_distortion_brown_conrady_is_pinhole():
-    (plain,), (model,) = lenses(pinhole()), lenses(posed(CameraModelType.PINHOLE))
-    params = torch.tensor([*INTRINSICS, *[0.0] * 8], dtype=torch.float64)
-    (distorted,) = lenses(posed(CameraModelType.BROWN_CONRADY, params))
-    at = far_points()
-    for lens in (model, distorted):
-        torch.testing.assert_close(lens.project(at), plain.project(at), rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(lens.jacobian(at), plain.jacobian(at), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("cameras", all_cameras()[:-1])  # the last one's Jacobian, orthographic, is constant
 def test_gradcheck_with_respect_to_points_on_both_sides_of_the_limits(cameras):
     (lens,) = lenses(cameras)
@@ -219,50 +152,13 @@ def test_gradcheck_with_respect_to_points_on_both_sides_of_the_limits(cameras):
 @pytest.mark.parametrize("points_too", [True, False])
 def test_gradcheck_with_respect_to_the_parameters_inside_the_limits(kind, points_too):
     at = points(3).requires_grad_(points_too)
-    params = torch.tensor(PARAMS[kind], dtype=torch.float64, requires_grad=True)
+    params = torch.tensor(LENS_PARAMS[kind], dtype=torch.float64, requires_grad=True)
 
     def both(params, at):  # in one vector: gradcheck would skip an output that lost its graph
         (lens,) = lenses(posed(kind, params))
         return torch.cat([lens.project(at).flatten(), lens.jacobian(at).flatten()])
 
     assert torch.autograd.gradcheck(both, (params, at), eps=1e-6, atol=1e-6)
-
-
-def test_gradcheck_with_respect_to_the_pinhole_intrinsics_inside_the_limits():
-    camera, at = pinhole(skew=3.0), points(3)
-
-    def both(k):
-        (lens,) = lenses(PinholeCamera(whole_matrices(k), camera.extrinsics, camera.height, camera.width))
-        return torch.cat([lens.project(at).flatten(), lens.jacobian(at).flatten()])
-
-    k = camera.intrinsics[:, :2, :3].clone().requires_grad_()
-    assert torch.autograd.gradcheck(both, k, eps=1e-6, atol=1e-6)
-
-
-def test_the_limits_follow_the_lens():
-    """Beyond them fx x / z is the border's distance from the principal point, for any fx."""
-    params = torch.tensor(INTRINSICS, dtype=torch.float64, requires_grad=True)
-    (lens,) = lenses(posed(CameraModelType.PINHOLE, params))
-    lens.jacobian(torch.tensor([[6.0, 0.2, 2.0]], dtype=torch.float64))[0, 0, 2].backward()
-    torch.testing.assert_close(params.grad, torch.tensor([0, 0, 1 / 2.0, 0], dtype=torch.float64))
-
-
-# -- sizes ---------------------------------------------------------------------------------------------------------
-
-
-def test_image_size_is_height_and_width():
-    assert image_size(pinhole(cameras=3)) == (HEIGHT, WIDTH)
-    assert image_size(posed(CameraModelType.PINHOLE, cameras=3)) == (HEIGHT, WIDTH)
-
-
-def test_size_errors():
-    two = pinhole(cameras=2)
-    for height, width in (([4, 5], [6, 6]), ([4, 4], [6, 7])):
-        cameras = PinholeCamera(two.intrinsics, two.extrinsics, torch.tensor(height), torch.tensor(width))
-        with pytest.raises(ValueError, match="one image size"):
-            image_size(cameras)
-    with pytest.raises(ValueError, match="positive image size, got 0x64"):
-        image_size(pinhole(size=(0, WIDTH)))
 
 
 def test_a_size_that_changes_in_place_or_is_replaced_is_read_again():

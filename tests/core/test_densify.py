@@ -68,10 +68,38 @@ def test_the_size_limit_itself_is_cloned_and_the_largest_axis_decides():
     assert (report.cloned, report.split) == (1, 1)
 
 
-def test_the_gradient_threshold_itself_densifies():
-    model, _, densifier = make([SMALL] * 2, grad_threshold=0.5)
-    densifier.observe(seen(model, [0, 1], [(0.5, 0), (math.nextafter(0.5, 0) - 1e-7, 0)]))
-    assert densifier.step().cloned == 1
+X = (1, 0)
+BELOW = (math.nextafter(0.5, 0) - 1e-7, 0)
+RULES = {  # scales, opacities, options, who was seen, with which gradients; cloned, split, pruned, total, capped
+    "the threshold itself": ([SMALL] * 2, None, {"grad_threshold": 0.5}, [0, 1], [(0.5, 0), BELOW], (1, 0, 0, 3, 0)),
+    "norms, not vectors": ([SMALL], None, {"grad_threshold": 0.9}, [0, 0], [X, (-1, 0)], (1, 0, 0, 2, 0)),
+    "all at once": (
+        [SMALL, SMALL, LARGE, LARGE, SMALL],
+        [0.5, 0.5, 0.5, 0.5, 0.001],
+        {},
+        [0, 1, 2, 3],
+        [X, (0, 0), X, (0, 0)],
+        (1, 1, 1, 6, 0),
+    ),
+    "room made by pruning counts towards the cap, and a split adds one": (
+        [LARGE, LARGE, LARGE, SMALL],
+        [0.5, 0.5, 0.5, 0.001],
+        {"max_gaussians": 5},
+        [0, 1, 2],
+        [X, (3, 0), (2, 0)],
+        (0, 2, 1, 5, 1),
+    ),
+    "a model over the cap is not cut": ([SMALL] * 4, None, {"max_gaussians": 2}, [0], [X], (0, 0, 0, 4, 1)),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_rules(name):
+    scales, opacities, options, ids, gradients, expected = RULES[name]
+    model, _, densifier = make(scales, opacities, **options)
+    densifier.observe(seen(model, ids, gradients))
+    assert densifier.step() == DensifyReport(*expected)
+    assert {len(parameter) for parameter in model.parameters()} == {expected[3]}
 
 
 def test_transparent_gaussians_are_pruned_even_when_their_gradient_is_large():
@@ -80,13 +108,6 @@ def test_transparent_gaussians_are_pruned_even_when_their_gradient_is_large():
     densifier.observe(seen(model, [0, 1], [(1, 0), (1, 0)]))
     assert densifier.step() == DensifyReport(cloned=0, split=0, pruned=3, total=1, capped=0)
     assert torch.equal(model.means[0], keep)
-
-
-def test_all_rules_at_once_count_right():
-    model, _, densifier = make([SMALL, SMALL, LARGE, LARGE, SMALL], [0.5, 0.5, 0.5, 0.5, 0.001])
-    densifier.observe(seen(model, [0, 1, 2, 3], [(1, 0), (0, 0), (1, 0), (0, 0)]))
-    assert densifier.step() == DensifyReport(cloned=1, split=1, pruned=1, total=6, capped=0)
-    assert {len(parameter) for parameter in model.parameters()} == {6}
 
 
 def test_gradients_are_in_normalised_device_coordinates():
@@ -119,12 +140,6 @@ def test_the_mean_over_cameras_is_undone():
     assert densifier.step().cloned == 1
 
 
-def test_norms_are_averaged_not_vectors():
-    model, _, densifier = make([SMALL], grad_threshold=0.9)
-    densifier.observe(seen(model, [0, 0], [(1, 0), (-1, 0)]))
-    assert densifier.step().cloned == 1
-
-
 def test_statistics_begin_anew_after_a_step_and_fresh_clones_wait():
     model, _, densifier = make([SMALL])
     densifier.observe(seen(model, [0], [(1, 0)]))
@@ -138,18 +153,6 @@ def test_the_cap_takes_the_largest_gradients_and_ties_by_position():
     densifier.observe(seen(model, [0, 1, 2, 3, 4], [(1, 0), (3, 0), (1, 0), (2, 0), (1, 0)]))
     assert densifier.step() == DensifyReport(cloned=3, split=0, pruned=0, total=9, capped=2)
     assert torch.equal(model.means[6:], means[[0, 1, 3]])
-
-
-def test_room_made_by_pruning_counts_towards_the_cap_and_a_split_adds_one():
-    model, _, densifier = make([LARGE, LARGE, LARGE, SMALL], [0.5, 0.5, 0.5, 0.001], max_gaussians=5)
-    densifier.observe(seen(model, [0, 1, 2], [(1, 0), (3, 0), (2, 0)]))
-    assert densifier.step() == DensifyReport(cloned=0, split=2, pruned=1, total=5, capped=1)
-
-
-def test_a_model_over_the_cap_is_not_cut_but_does_not_grow():
-    model, _, densifier = make([SMALL] * 4, max_gaussians=2)
-    densifier.observe(seen(model, [0], [(1, 0)]))
-    assert densifier.step() == DensifyReport(cloned=0, split=0, pruned=0, total=4, capped=1)
 
 
 def test_all_may_go():
@@ -168,20 +171,6 @@ def test_extreme_scales_and_opacities_stay_finite(log_scale):
     densifier.observe(seen(model, [0, 1, 2], [(1, 0)] * 3))
     assert densifier.step().total == 6
     assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
-
-
-def test_observe_says_what_is_missing():
-    model, _, densifier = make([SMALL] * 3)
-    projected = seen(model, [0], [(1, 0)])
-    projected.means2d.grad = None
-    with pytest.raises(ValueError, match=r"means2d\.grad, got None"):
-        densifier.observe(projected)
-    projected.means2d.requires_grad_(False)
-    with pytest.raises(ValueError, match="requires_grad=True"):
-        densifier.observe(projected)
-    other, _, _ = make([SMALL] * 2)
-    with pytest.raises(ValueError, match="3 Gaussians, got one of 2"):
-        densifier.observe(seen(other, [0], [(1, 0)]))
 
 
 def test_a_render_that_saw_nothing_is_no_error():

@@ -1,4 +1,4 @@
-"""What the core refuses: the type of the error, and the name of the argument that its message begins with."""
+"""What the core and its stages refuse: the type of the error, and the name that its message begins with."""
 
 import dataclasses
 import math
@@ -6,14 +6,29 @@ import re
 
 import pytest
 import torch
-from densifiers import SMALL
+from densifiers import SMALL, seen
 from densifiers import densifier as make
-from factories import batch, drop_layer, posed, random_camera, random_gaussians, random_model
+from factories import (
+    FIELDS,
+    batch,
+    drop_layer,
+    footprints,
+    pinhole,
+    posed,
+    random_camera,
+    random_gaussians,
+    random_model,
+)
+from factories import replace as with_fields
+from kornia.geometry.camera import PinholeCamera
 from kornia.sensors.camera import CameraModelType
 
 import kgs
+import kgs.reference
 from kgs.camera import image_size
 from kgs.densify import Densifier
+from kgs.losses import photometric_loss, target_moments
+from kgs.ply import load_ply, save_ply
 
 
 def bad_options(name, *values):
@@ -47,8 +62,47 @@ def bad_argument(name, error, value):
     return name, error, call
 
 
+def bad_call_of_gsplat(name, dtype):
+    """A tensor of another dtype, or None."""
+
+    def call():
+        gaussians, seen = random_gaussians(3, 0, torch.float32, None), camera()
+        given = vars(gaussians) | {"viewmats": seen.extrinsics, "Ks": seen.intrinsics[:, :3, :3]}
+        tensors = given | {"covars": torch.eye(3).expand(3, 3, 3), "extra_signals": torch.rand(3, 2)}
+        wrong = None if dtype is None else tensors[name].to(dtype)
+        kgs.rasterization(**given | {name: wrong}, width=12, height=9)
+
+    return name, TypeError, call
+
+
+def bad_stage(name, error, features=None, **changes):
+    """Of compositing."""
+
+    def call():
+        layers = footprints(torch.zeros(2, 2), torch.zeros(2, 2, 3), torch.full((2,), 0.5), (3, 4))
+        fields = {key: value for key, value in changes.items() if hasattr(layers, key)}
+        options = {key: value for key, value in changes.items() if key not in fields}
+        given = dataclasses.replace(layers, **fields)
+        kgs.composite(given, torch.zeros(2, 3) if features is None else features, **options)
+
+    return name, error, call
+
+
+def bad_loss(name, error, image=None, target=None, **options):
+    def call():
+        right = torch.full((2, 3, 16, 19), 0.5)
+        photometric_loss(right if image is None else image, right if target is None else target, **options)
+
+    return name, error, call
+
+
 def camera(width=12, dtype=torch.float32):
     return random_camera(9, width, 0, dtype)
+
+
+def camera_with_intrinsics_of_another_dtype():
+    seen = camera()
+    return PinholeCamera(seen.intrinsics.double(), seen.extrinsics, seen.height, seen.width)
 
 
 def camera_of_another_dtype():
@@ -63,12 +117,36 @@ def drop_at(factor):
     drop_layer(0.5, p=0.2, schedule=lambda progress: factor)(torch.ones(5))
 
 
+def drawn_by_the_reference(seen=None, background=None, **changes):
+    gaussians = with_fields(random_gaussians(3, 0, torch.float32), **changes)
+    return kgs.reference.render(gaussians, camera() if seen is None else seen, background)
+
+
+def observe(scales, grad=(1, 0), needs_one=True, **options):
+    """A render of one Gaussian, by the densifier of some."""
+    projected = seen(make([SMALL])[0], [0], [grad or (0, 0)])
+    if grad is None:
+        projected.means2d.grad = None
+    projected.means2d.requires_grad_(needs_one)
+    make(scales, **options)[2].observe(projected)
+
+
+def state_of_another_size():
+    make([SMALL] * 2)[2].load_state_dict(make([SMALL] * 3)[2].state_dict())
+
+
+def optimizer_of_the_means_alone():
+    model = random_model(1)
+    Densifier(model, torch.optim.Adam([model.means]), 1.0)
+
+
 def densifier_with(optimizer):
     model = random_model(1)
     Densifier(model, getattr(torch.optim, optimizer)(model.parameters()), 1.0)
 
 
-NAN, INF = math.nan, math.inf
+NAN = math.nan
+INF = math.inf
 CASES = [
     # options
     *bad_options("tile_size", 0, 8.0, 8.5, True),
@@ -83,6 +161,11 @@ CASES = [
     *bad_options("transmittance_stop", -1e-9, 1.0, "0"),
     *bad_options("frame", (0, 0, 4), (4.0, 0.0, 4.0, 8.0), (0.0, 0.0, INF, 8.0)),
     ("near_plane", ValueError, lambda: kgs.GaussianRenderer(near_plane=-1.0)),
+    ("options", TypeError, lambda: kgs.GaussianRenderer(options=kgs.RasterOptions(), eps2d=0.1)),
+    ("options", TypeError, lambda: kgs.GaussianRenderer(options={"eps2d": 0.1})),
+    ("last_plane", TypeError, lambda: kgs.GaussianRenderer(last_plane=10.0)),
+    ("options", TypeError, lambda: kgs.project(random_gaussians(3, 0), camera(), options={"eps2d": 0.1})),
+    bad_stage("options", TypeError, options={"eps2d": 0.1}),
     # the renderer
     *(bad_argument("outputs", ValueError, value) for value in (("imag",), (), "image")),
     *(bad_argument("background", ValueError, torch.zeros(shape)) for shape in ((4,), (2, 3), (1, 3, 12, 9))),
@@ -93,16 +176,82 @@ CASES = [
     bad_argument("cameras", TypeError, lambda: camera(dtype=torch.float16)),
     bad_argument("cameras", TypeError, camera_of_another_dtype),
     bad_argument("cameras", ValueError, lambda: batch(camera(12), camera(13))),
+    bad_argument("cameras", TypeError, camera_with_intrinsics_of_another_dtype),
+    bad_argument("cameras", TypeError, lambda: camera().extrinsics),
+    ("cameras", TypeError, lambda: kgs.project(random_gaussians(3, 0, torch.float32).to("meta"), camera())),
     bad_argument("gaussians", TypeError, None),
+    ("gaussians", TypeError, lambda: kgs.project([random_gaussians(3, 0)], camera())),
     ("opacities", ValueError, lambda: kgs.GaussianRenderer()(with_two_rows_of_opacities(), camera())),
     # cameras
     *[("cameras", TypeError, lambda wrong=wrong: image_size(wrong)) for wrong in (None, torch.eye(4))],
     ("cameras", TypeError, lambda: image_size(camera_of_another_dtype().model)),
+    ("cameras", ValueError, lambda: image_size(batch(pinhole(4, 6, 9.0), pinhole(5, 6, 9.0)))),
+    ("cameras", ValueError, lambda: image_size(pinhole(0, 64, 9.0))),
     *[
         ("extrinsics", ValueError, lambda shape=shape: kgs.camera_extent(torch.zeros(shape)))
         for shape in ((4, 4), (0, 4, 4), (2, 3, 4))
     ],
+    *[
+        ("model", TypeError, lambda wrong=wrong: kgs.PosedCamera(wrong, torch.eye(4)[None]))
+        for wrong in (camera(), None)
+    ],
+    ("extrinsics", TypeError, lambda: posed(CameraModelType.PINHOLE, extrinsics=torch.eye(4)[None].tolist())),
+    *[
+        ("extrinsics", ValueError, lambda shape=shape: posed(CameraModelType.PINHOLE, extrinsics=torch.zeros(shape)))
+        for shape in ((4, 4), (1, 3, 4), (1, 1, 4, 4))
+    ],
+    ("model", ValueError, lambda: posed(CameraModelType.PINHOLE, torch.ones(2, 4).double(), cameras=3)),
+    # gsplat's call
+    *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
+    *[
+        bad_call_of_gsplat(name, dtype)
+        for name in (*FIELDS[1:], "viewmats", "Ks", "covars", "extra_signals")
+        for dtype in (torch.float64, torch.float16, torch.int64)
+    ],
+    # compositing
+    *[bad_stage("features", ValueError, torch.zeros(shape)) for shape in ((0, 3), (1, 3), (4, 3), (30, 3), (2,))],
+    bad_stage("features", TypeError, [1.0]),
+    bad_stage("features", TypeError, torch.zeros(2, 3).double()),
+    bad_stage("opacities", TypeError, opacities=torch.ones(2).double()),
+    bad_stage("factors", TypeError, factors=torch.zeros(2, 2, 3).double()),
+    *[bad_stage("camera_ids", ValueError, camera_ids=torch.tensor(ids)) for ids in ([0, 1], [-1, 0], [0, 2**40])],
+    bad_stage("means2d", ValueError, means2d=torch.zeros(2, 3)),
+    bad_stage("factors", ValueError, factors=torch.zeros(2, 3, 2)),
+    bad_stage("depths", ValueError, depths=torch.zeros(1)),
+    bad_stage("max_bytes", ValueError, options=kgs.RasterOptions(max_bytes=160)),
+    bad_stage("chunk_size", ValueError, chunk_size=0),
+    bad_stage("backend", ValueError, backend="cuda"),
+    ("projected", TypeError, lambda: kgs.composite([1.0], torch.zeros(2, 3))),
+    # the reference
+    ("camera", TypeError, lambda: drawn_by_the_reference("camera")),
+    ("camera", ValueError, lambda: drawn_by_the_reference(batch(camera(), camera()))),
+    ("camera", ValueError, lambda: drawn_by_the_reference(opacities=torch.ones(2, 3))),
+    ("background", ValueError, lambda: drawn_by_the_reference(background=torch.zeros(2, 3))),
+    # the loss
+    bad_loss("image", TypeError, torch.zeros(2, 3, 16, 19).numpy()),
+    bad_loss("image", TypeError, torch.zeros(2, 3, 16, 19).half(), torch.zeros(2, 3, 16, 19).half()),
+    bad_loss("target", TypeError, target=torch.zeros(2, 3, 16, 19).double()),
+    bad_loss("target", ValueError, target=torch.zeros(2, 3, 16, 18)),
+    *[bad_loss("image", ValueError, torch.zeros(shape), torch.zeros(shape)) for shape in ((3, 16, 19), (2, 3, 16, 5))],
+    *[bad_loss("dssim_weight", ValueError, dssim_weight=weight) for weight in (-0.1, NAN, INF)],
+    bad_loss("moments", ValueError, moments=target_moments(torch.zeros(2, 3, 16, 18))),
+    *[bad_loss("mask", ValueError, mask=torch.ones(shape)) for shape in ((19, 16), (3, 1, 16, 19), (2, 3, 16, 19), ())],
+    *[bad_loss("mask", ValueError, mask=torch.full((16, 19), value)) for value in (0.0, 0.5, 2.0, NAN)],
+    bad_loss("mask", ValueError, mask=[1]),
+    ("target", ValueError, lambda: target_moments(torch.zeros(2, 3, 16, 5))),
     # the layer
+    *bad_layer("p", -0.1, 1, 1.0, 1.5, INF, -INF, NAN, "0.2", None),
+    *[
+        ("p", ValueError, lambda training=training: kgs.drop_gaussian(torch.ones(5), 1.0, training=training))
+        for training in (True, False)
+    ],
+    *[
+        ("opacities", TypeError, lambda seed=seed, wrong=wrong: drop_layer(1.0, p=0.5, seed=seed)(wrong))
+        for seed in (None, 3)
+        for wrong in (torch.ones(3, dtype=torch.int64), [0.5, 0.5])
+    ],
+    ("seed", ValueError, lambda: kgs.DropGaussian().get_rng_state()),
+    ("seed", ValueError, lambda: kgs.DropGaussian().set_rng_state(torch.get_rng_state())),
     *bad_layer("schedule", "cosine", "", 3, None),
     *bad_layer("seed", 1.5, "a", True, 2**64, -(2**63) - 1, torch.tensor(1)),
     *[("p * schedule(progress)", ValueError, lambda factor=factor: drop_at(factor)) for factor in (-1.0, 5.0, NAN)],
@@ -111,6 +260,10 @@ CASES = [
     bad_points("points, colors", ValueError, torch.rand(5, 2), torch.rand(5, 2)),
     bad_points("points, colors", ValueError, torch.rand(5, 3), torch.rand(4, 3)),
     bad_points("points", ValueError, torch.ones(5, 3)),
+    bad_points("points", ValueError, torch.zeros(5, 3)),
+    bad_points(
+        "points", ValueError, 1e308 * torch.tensor([[10.0], [-10.0], [1.0], [-1.0], [5.0]]).double().expand(5, 3)
+    ),
     bad_points("points", ValueError, torch.full((5, 3), NAN)),
     bad_points("colors", ValueError, torch.rand(5, 3), torch.full((5, 3), NAN)),
     bad_points("points", TypeError, torch.rand(5, 3).half()),
@@ -126,6 +279,24 @@ CASES = [
     bad_parameter("means", TypeError, torch.zeros(7, 3).half()),
     bad_parameter("means", TypeError, [[0.0, 0.0, 0.0]]),
     bad_parameter("quats", TypeError, None),
+    *[
+        ("sh_degree", ValueError, lambda degree=degree: setattr(random_model(), "sh_degree", degree))
+        for degree in (-1, 4, 1.0, "2")
+    ],
+    ("sh_degree", ValueError, lambda: kgs.GaussianModel.from_points(torch.rand(5, 3), torch.rand(5, 3), sh_degree=4)),
+    # its file
+    *[
+        ("sh_degree", ValueError, lambda degree=degree: save_ply("no.ply", random_model(sh_degree=1), sh_degree=degree))
+        for degree in (0, 4, -1, 3.0)
+    ],
+    *[
+        ("offset", ValueError, lambda wrong=wrong: save_ply("no.ply", random_model(), wrong))
+        for wrong in (torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0]))
+    ],
+    *[
+        ("origin", ValueError, lambda wrong=wrong: load_ply("no.ply", wrong))
+        for wrong in (torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0]))
+    ],
     # densification
     *bad_densifier("extent", 0.0, -1.0, NAN, INF),
     *bad_densifier("percent_dense", 0.0, NAN),
@@ -134,6 +305,13 @@ CASES = [
     *bad_densifier("max_gaussians", 0, 2.5, NAN, INF),
     *[("factor", ValueError, lambda x=x: make([SMALL])[2].decay_opacity(x)) for x in (0.0, 1.0, -0.5, NAN)],
     *[("ceiling", ValueError, lambda x=x: make([SMALL])[2].reset_opacity(x)) for x in (0.0, 1.0, NAN)],
+    ("projected", ValueError, lambda: observe([SMALL] * 2)),
+    ("projected", ValueError, lambda: observe([SMALL], absgrad=True)),
+    ("projected", ValueError, lambda: observe([SMALL], grad=None)),
+    ("projected", ValueError, lambda: observe([SMALL], grad=None, needs_one=False)),
+    ("gradient_sums", ValueError, state_of_another_size),
+    ("state", ValueError, lambda: make([SMALL])[2].load_state_dict({})),
+    ("optimizer", ValueError, optimizer_of_the_means_alone),
     *[("optimizer", ValueError, lambda name=name: densifier_with(name)) for name in ("LBFGS", "Adafactor", "Rprop")],
 ]
 

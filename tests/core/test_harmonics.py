@@ -3,7 +3,6 @@
 import math
 
 import mpmath
-import numpy as np
 import pytest
 import torch
 from oracles import real_harmonic
@@ -42,30 +41,6 @@ def test_the_signs_are_those_of_the_ply_files():
     expected = torch.tensor([[0, 0, -c1], [-c1, 0, 0], [0, c1, 0]], dtype=torch.float64)
     torch.testing.assert_close(basis[:, 1:], expected, rtol=1e-14, atol=1e-16)
     assert math.isclose(SH_C0, 1 / math.sqrt(4 * math.pi), rel_tol=1e-15)
-
-
-def test_addition_theorem():
-    """Sum over m of Y_lm(d) Y_lm(e) = (2l + 1) / 4 pi P_l(d . e): no rotation changes a band's energy."""
-    first, second = directions(seed=2), directions(seed=3)
-    product = harmonics_basis(first, 3) * harmonics_basis(second, 3)
-    cosine = (first * second).sum(1)
-    legendre = [torch.ones_like(cosine), cosine, (3 * cosine**2 - 1) / 2, (5 * cosine**3 - 3 * cosine) / 2]
-    for degree, expected in enumerate(legendre):
-        got = product[:, degree**2 : (degree + 1) ** 2].sum(1)
-        torch.testing.assert_close(got, (2 * degree + 1) / (4 * math.pi) * expected, rtol=1e-13, atol=1e-14)
-
-
-def test_the_basis_is_orthonormal():
-    """Exact quadrature: Gauss-Legendre in z times a uniform grid in azimuth integrates all products."""
-    nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(8))
-    azimuth = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
-    z, phi = (value.flatten() for value in torch.meshgrid(nodes, azimuth, indexing="ij"))
-    radius = (1 - z * z).sqrt()
-    basis = harmonics_basis(torch.stack([radius * phi.cos(), radius * phi.sin(), z], 1), 3)
-    weight = weights.repeat_interleave(16) * (2 * math.pi / 16)
-    torch.testing.assert_close(
-        (basis * weight[:, None]).T @ basis, torch.eye(16, dtype=torch.float64), rtol=0, atol=1e-13
-    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_model
+from factories import other_defaults, pinhole, random_model
 from factories import random_cloud as cloud
 from torch import nn
 
@@ -66,16 +66,6 @@ def test_first_values_follow_the_recipe():
     assert torch.allclose(gaussians.opacities, torch.full((200,), 0.1))
 
 
-def test_the_same_points_give_the_same_bits():
-    first, second = (GaussianModel.from_points(*cloud()) for _ in range(2))
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
-
-
-def test_double_converts_everything():
-    gaussians = model().double()()
-    assert gaussians.means.dtype == gaussians.colors.dtype == gaussians.scales.dtype == torch.float64
-
-
 def test_a_state_dict_rebuilds_a_model_of_any_size():
     made = model(n=9, degree=2)
     made.sh_degree = 1
@@ -108,23 +98,6 @@ def test_load_state_dict_takes_over_size_and_degrees(n, assign):
     other().colors.sum().backward()
 
 
-def test_a_fit_goes_on_in_a_model_of_another_size():
-    def step(made, adam):
-        adam.zero_grad()
-        sum(p.square().sum() for p in made.parameters()).backward()
-        adam.step()
-
-    made, other = model(n=9), model(n=5)
-    adams = [torch.optim.Adam(m.parameters()) for m in (made, other)]
-    step(made, adams[0])
-    step(other, adams[1])
-    other.load_state_dict(made.state_dict())
-    adams[1].load_state_dict(copy.deepcopy(adams[0].state_dict()))
-    for m, adam in zip((made, other), adams, strict=True):
-        step(m, adam)
-    assert all(torch.equal(a, b) for a, b in zip(made.parameters(), other.parameters(), strict=True))
-
-
 def test_the_six_parameters_alone_are_a_state_of_the_full_degree():
     state = model(n=9, degree=2).state_dict()
     del state["_extra_state"]
@@ -136,13 +109,11 @@ def test_the_six_parameters_alone_are_a_state_of_the_full_degree():
 def test_a_state_that_does_not_fit_together_is_refused_and_changes_nothing():
     made, other = model(n=9), model(n=5)
     before = {name: value.clone() for name, value in other.state_dict().items()}
-    for change, message in (
-        ({"quats": torch.zeros(8, 4)}, r"quats: expected shape \(9, 4\), got \(8, 4\)"),
-        ({"sh_rest": torch.zeros(9, 5, 3)}, "sh_rest: expected shape"),
-        ({"_extra_state": torch.tensor(4)}, "sh_degree: expected an integer from 0 to 3, got 4"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            other.load_state_dict({**made.state_dict(), **change})
+    changes = {"quats": torch.zeros(8, 4), "sh_rest": torch.zeros(9, 5, 3), "_extra_state": torch.tensor(4)}
+    for name, change in changes.items():
+        named = "sh_degree" if name == "_extra_state" else name
+        with pytest.raises(ValueError, match=f"^{named}:"):
+            other.load_state_dict(made.state_dict() | {name: change})
         assert all(torch.equal(value, before[name]) for name, value in other.state_dict().items())
     with pytest.raises(RuntimeError, match="Missing key"):
         other.load_state_dict({"means": other.means})
@@ -175,15 +146,10 @@ def test_a_scale_beyond_the_dtype_has_gradient_zero_and_the_others_theirs(dtype,
 def test_default_device_and_default_dtype_do_not_reach_a_model():
     points, colors = cloud()
     expected = GaussianModel.from_points(points, colors).state_dict()
-    try:
-        torch.set_default_device("meta")  # stands for an accelerator
-        torch.set_default_dtype(torch.float64)
+    with other_defaults():
         made = GaussianModel.from_points(points, colors)
         made.load_state_dict(made.state_dict())
         assert made().colors.dtype == torch.float32
-    finally:
-        torch.set_default_device(None)
-        torch.set_default_dtype(torch.float32)
     assert all(torch.equal(value, expected[name]) for name, value in made.state_dict().items())
 
 
@@ -201,12 +167,3 @@ def test_antialiased_is_kept_by_what_makes_another_model():
     for again in (made.select(torch.arange(3)), made.to(torch.float64), copy.deepcopy(made)):
         assert again.antialiased
     assert repr(made).endswith("torch.float64, antialiased)")
-
-
-@pytest.mark.parametrize("degree", [-1, 4, 1.0, "2"])
-def test_a_degree_out_of_range_is_refused(degree):
-    made = model()
-    with pytest.raises(ValueError, match="^sh_degree:"):
-        made.sh_degree = degree
-    with pytest.raises(ValueError, match="sh_degree"):
-        GaussianModel.from_points(*cloud(), sh_degree=degree)

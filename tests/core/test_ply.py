@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from factories import pinhole, random_model, splat_columns
+from factories import other_defaults, pinhole, random_model, splat_columns
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -112,13 +112,6 @@ def test_harmonics_of_a_higher_degree_are_zeros_in_the_file(tmp_path, degree):
     np.testing.assert_array_equal(rows[:, 58:], model.quats.detach())
 
 
-@pytest.mark.parametrize("degree", [0, 4, -1, 3.0])
-def test_a_degree_below_that_of_the_model_or_above_3_is_refused(tmp_path, degree):
-    with pytest.raises(ValueError, match="^sh_degree:"):
-        save_ply(tmp_path / "a.ply", random_model(sh_degree=1), sh_degree=degree)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_an_antialiased_model_is_tagged_as_other_programs_do(tmp_path, antialiased):
     model = random_model()
@@ -164,12 +157,6 @@ def test_others_read_the_doubles(tmp_path):
         assert raw[name].dtype == np.float64
         assert np.array_equal(np.asarray(raw[name]).reshape(-1), expected[:, i].numpy())
     assert np.array_equal(np.asarray(raw["rot_3"]).reshape(-1), model.quats[:, 3].detach().numpy())
-    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
-    assert [line for line in head.decode().splitlines() if line.startswith("property double")] == [
-        f"property double {name}" for name in "xyz"
-    ]
-    rows = np.frombuffer(body, [(name, "<f8" if name in "xyz" else "<f4") for name in splat_columns(3)])
-    assert np.array_equal(rows["y"], expected[:, 1].numpy())
 
 
 def test_a_float64_model_that_is_at_map_coordinates_itself_keeps_them(tmp_path):
@@ -197,18 +184,6 @@ def test_a_usual_offset_keeps_the_layout_that_viewers_expect(tmp_path, offset):
     again = load_ply(tmp_path / "a.ply")
     assert torch.equal(again.means, (model.means.detach().double() + offset).float())
     assert torch.equal(again.quats, model.quats)
-
-
-def test_other_than_three_finite_numbers_are_no_offset_and_no_origin(tmp_path):
-    save_ply(tmp_path / "a.ply", random_model())
-    for call, name in (
-        (lambda x: save_ply(tmp_path / "a.ply", random_model(), x), "offset"),
-        (lambda x: load_ply(tmp_path / "a.ply", x), "origin"),
-    ):
-        with pytest.raises(ValueError, match=f"^{name}:"):
-            call(torch.zeros(1, 3))
-        with pytest.raises(ValueError, match=f"^{name}:"):
-            call(torch.tensor([0.0, math.nan, 0.0]))
 
 
 def test_a_float64_model_is_rounded_once(tmp_path):
@@ -282,28 +257,19 @@ def test_what_takes_a_splat_takes_flat_discs(tmp_path):
     assert all(not bool(parameter.isnan().any()) for parameter in model.parameters())
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
-    path = tmp_path / "a.ply"
-    save_ply(path, random_model(seed=1))
-    before = path.read_bytes()
+def test_a_failed_write_leaves_the_file_behind_a_link_and_no_other(tmp_path, monkeypatch):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "link.ply").symlink_to(tmp_path / "far" / "a.ply")
+    save_ply(tmp_path / "link.ply", random_model())
 
     def fail(*_):
         raise OSError(28, "disk full")
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        save_ply(path, random_model(seed=2))
-    assert path.read_bytes() == before
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
-
-
-def test_the_file_behind_a_link_is_written_and_the_link_stays(tmp_path):
-    (tmp_path / "far").mkdir()
-    (tmp_path / "link.ply").symlink_to(tmp_path / "far" / "a.ply")
-    for seed in (1, 2):
-        save_ply(tmp_path / "link.ply", random_model(seed=seed))
-        assert (tmp_path / "link.ply").is_symlink()
-        assert same(load_ply(tmp_path / "far" / "a.ply"), random_model(seed=seed))
+        save_ply(tmp_path / "link.ply", random_model(seed=2))
+    assert (tmp_path / "link.ply").is_symlink()
+    assert same(load_ply(tmp_path / "far" / "a.ply"), random_model())
     assert [entry.name for entry in (tmp_path / "far").iterdir()] == ["a.ply"]
 
 
@@ -316,14 +282,9 @@ def test_a_name_as_long_as_the_file_system_allows(tmp_path):
 def test_default_device_and_default_dtype_do_not_reach_the_file(tmp_path):
     model = random_model()
     save_ply(tmp_path / "a.ply", model, torch.ones(3))
-    try:
-        torch.set_default_device("meta")  # stands for an accelerator
-        torch.set_default_dtype(torch.float64)
+    with other_defaults():
         save_ply(tmp_path / "b.ply", model, torch.ones(3, device="cpu"))
         again = load_ply(tmp_path / "b.ply", origin=torch.ones(3, device="cpu"))
-    finally:
-        torch.set_default_device(None)
-        torch.set_default_dtype(torch.float32)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert again.means.device.type == "cpu"
     assert again.means.dtype == torch.float32

@@ -230,28 +230,3 @@ def test_a_file_that_cannot_be_opened_is_a_data_error(tmp_path):
     for path in (tmp_path / "missing.ply", tmp_path):
         with pytest.raises(DataError, match="cannot be read"):
             load_ply(path)
-
-
-@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
-def test_mutated_and_truncated_files_load_or_raise_data_errors(tmp_path, order):
-    path = tmp_path / "a.ply"
-    data = handmade([(name, "float") for name in splat_columns(1)], [[0.5 * i for i in range(26)]] * 3, order)
-    mutator = random.Random(1)
-    refused = 0
-    for trial in range(400):
-        damaged = bytearray(data)
-        if trial % 2:
-            del damaged[mutator.randrange(len(data)) :]
-        else:
-            for _ in range(mutator.randint(1, 4)):
-                damaged[mutator.randrange(len(data))] = mutator.randrange(256)
-        path.write_bytes(damaged)
-        try:
-            model = load_ply(path)
-        except DataError:
-            refused += 1
-        else:
-            finite = {name: value.isfinite() for name, value in model.named_parameters()}
-            finite["log_scales"] |= model.log_scales == -math.inf
-            assert all(bool(values.all()) for values in finite.values())
-    assert refused > 200

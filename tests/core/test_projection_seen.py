@@ -4,25 +4,12 @@ import math
 
 import pytest
 import torch
-from factories import FIELDS, pinhole, random_camera, random_gaussians, replace
-from projection_checks import HEIGHT, PACKED, WIDTH, assert_same, scene, sigma_route, values_and_gradients
+from factories import FIELDS, pinhole, random_camera, random_gaussians, replace, select
+from projection_checks import HEIGHT, PACKED, WIDTH, scene, sigma_route, values_and_gradients
 
-from kgs import DropGaussian, Gaussians, RasterOptions, project
+from kgs import Gaussians, RasterOptions, project
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-
-def select(gaussians, ids):
-    return Gaussians(
-        *(
-            getattr(gaussians, name)[..., ids] if name == "opacities" else getattr(gaussians, name)[ids]
-            for name in FIELDS
-        )
-    )
-
-
-def join(*parts):
-    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in FIELDS))
 
 
 def wide_scene(dtype=torch.float64):
@@ -34,9 +21,6 @@ def wide_scene(dtype=torch.float64):
 
 
 REACH = math.sqrt(2 * math.log(2 * 255))  # standard deviations within which a footprint of opacity 2 is drawn
-
-
-# -- what is listed ------------------------------------------------------------------------------------------------
 
 
 def test_the_list_is_everything_in_front_that_would_be_drawn_at_opacity_two():
@@ -69,42 +53,6 @@ def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
     assert got.radii.tolist() == [2.0] * 4
 
 
-def test_nothing_that_could_be_drawn_is_left_out():
-    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
-    listed = torch.zeros(len(gaussians), dtype=torch.bool)
-    listed[project(gaussians, cameras).gaussian_ids] = True
-    pixels, sigma, depths = sigma_route(gaussians, cameras)
-    y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
-    d = torch.stack([x.flatten(), y.flatten()], 1)[None] - pixels[:, None]
-    alphas = gaussians.opacities[:, None] * torch.exp(-0.5 * ((d @ torch.linalg.inv(sigma)) * d).sum(2))
-    drawn = (alphas.amax(1) >= 1 / 255) & (depths > 0.01)
-    assert drawn.sum() > 40
-    assert listed[drawn].all()
-
-
-def test_the_list_is_ordered_by_camera_and_then_by_gaussian():
-    gaussians, cameras = scene(cameras=3)
-    got = project(gaussians, cameras)
-    key = got.camera_ids * len(gaussians) + got.gaussian_ids
-    assert (key.diff() > 0).all()
-    assert got.camera_ids.unique().tolist() == [0, 1, 2]
-    assert got.camera_ids.dtype == got.gaussian_ids.dtype == torch.int64
-
-
-@pytest.mark.parametrize("threshold", [1 / 255, 0.0])
-def test_dropped_gaussians_stay_listed_and_only_the_opacities_tell_them(threshold):
-    gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
-    opacities = DropGaussian(p=0.45, schedule="constant", seed=0)(gaussians.opacities)
-    assert opacities.max() > 1
-    full = project(gaussians, cameras, options=RasterOptions(alpha_threshold=threshold))
-    dropped = project(
-        replace(gaussians, opacities=opacities), cameras, options=RasterOptions(alpha_threshold=threshold)
-    )
-    assert (dropped.opacities == 0).sum() > 20
-    for name in ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "colors"):
-        assert torch.equal(getattr(full, name), getattr(dropped, name))
-
-
 def test_with_threshold_0_every_gaussian_in_front_is_listed():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     depths = sigma_route(gaussians, cameras)[2]
@@ -124,60 +72,6 @@ def test_visibility_is_free_of_opacity(beyond, listed):
         for opacity in (0.0, 0.2, 1.0, 1.25, 4.0)
     ]
     assert seen == listed
-
-
-@pytest.mark.parametrize("near", [0.01, 0.2, 1.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_near_plane_is_exclusive_and_nothing_behind_it_has_a_gradient(near, dtype):
-    plane = torch.tensor(near, dtype=dtype).item()
-    above = torch.nextafter(torch.tensor(near, dtype=dtype), torch.tensor(torch.inf, dtype=dtype)).item()
-    base = random_gaussians(1, 0, dtype, 1)
-    for z in (-5.0, -1e-30, 0.0, plane, above):
-        mean = torch.tensor([[0.0, 0.0, z]], dtype=dtype)
-        leaves = {name: getattr(base, name).clone().requires_grad_() for name in FIELDS} | {
-            "means": mean.requires_grad_()
-        }
-        got = project(
-            Gaussians(**leaves), pinhole(HEIGHT, WIDTH, 50.0, dtype=dtype), options=RasterOptions(near_plane=plane)
-        )
-        assert len(got) == int(z == above)
-        sum(getattr(got, name).sum() for name in PACKED).backward()
-        for leaf in leaves.values():
-            assert leaf.grad.isfinite().all()
-            assert len(got) or (leaf.grad == 0).all()
-
-
-def test_a_thousand_gaussians_behind_the_camera_change_nothing():
-    gaussians, cameras = scene(dtype=torch.float32)
-    behind = random_gaussians(1000, 9, torch.float32, 1)
-    behind = replace(behind, means=-behind.means)
-    first = project(gaussians, cameras)
-    for joined, shift in ((join(gaussians, behind), 0), (join(behind, gaussians), 1000)):
-        second = project(joined, cameras)
-        assert_same(first, second)
-        assert torch.equal(second.gaussian_ids, first.gaussian_ids + shift)
-
-
-# -- parameters that are not finite --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("name", FIELDS)
-def test_a_gaussian_that_is_not_finite_is_left_out_counted_and_harms_no_other(name, poison):
-    gaussians, cameras = scene(40, dtype=torch.float32)
-    victim = 7
-    others = torch.arange(40) != victim
-    expected, expected_grads = values_and_gradients(select(gaussians, others), cameras)
-    values = getattr(gaussians, name).clone()
-    values[victim].view(-1)[-1] = poison
-    got, grads = values_and_gradients(replace(gaussians, **{name: values}), cameras)
-    assert got.num_nonfinite.item() == 1
-    assert expected.num_nonfinite.item() == 0
-    assert victim not in got.gaussian_ids.tolist()
-    assert_same(got, expected)
-    for field in FIELDS:
-        assert torch.equal(grads[field][others], expected_grads[field])
-        assert (grads[field][victim] == 0).all()
 
 
 def test_infinities_of_both_signs_do_not_cancel_and_large_finite_values_do_not_count():

@@ -1,9 +1,8 @@
-"""The renderer as its user meets it: outputs, backgrounds, layers, errors."""
+"""The renderer as its user meets it: outputs, backgrounds, layers, modes, options."""
 
 import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import pytest
 import torch
@@ -33,6 +32,7 @@ def test_each_output_alone_is_the_joint_one_and_the_others_are_none(dtype):
         assert torch.equal(getattr(alone, name), getattr(joint, name)), name
         assert all(getattr(alone, other) is None for other in OUTPUTS if other != name)
         assert getattr(alone, name).shape == (1, 3 if name == "image" else 1, 24, 33)
+        assert getattr(alone, name).dtype == dtype
     assert renderer(gaussians, camera).alpha is None
     assert renderer(gaussians, camera, outputs=["depth"]).projected.colors.shape[1] == 0
 
@@ -70,16 +70,6 @@ def test_depth_is_zero_without_gradient_where_there_is_nothing():
     assert all(x.grad.isfinite().all() for x in inputs[:4])
 
 
-def test_depth_of_a_single_plane_is_its_depth():
-    plane = dataclasses.replace(random_gaussians(40, 2), means=random_gaussians(40, 2).means * torch.tensor([1, 1, 0]))
-    plane = dataclasses.replace(plane, means=plane.means + torch.tensor([0.0, 0.0, 4.0]))
-    out = GaussianRenderer()(plane, pinhole(24, 32, (32.0, 32.0)), outputs=("depth", "median_depth"))
-    covered = out.depth > 0
-    assert covered.any()
-    assert largest(out.depth[covered], torch.tensor(4.0)) <= 1e-12
-    assert set(out.median_depth.unique().tolist()) <= {0.0, 4.0}
-
-
 # -- background ----------------------------------------------------------------------------------------------------
 
 
@@ -90,7 +80,8 @@ def test_every_form_of_background(exactly):
     out = renderer(gaussians, cameras, outputs=("image", "alpha"))
     light = 1 - out.alpha
     one, two, full = (torch.rand(shape, dtype=dtype) for shape in ((3,), (2, 3), (2, 3, 24, 33)))
-    for background, behind in ((one, one[None, :, None, None]), (two, two[:, :, None, None]), (full, full)):
+    forms = ((one, one[None, :, None, None]), (two, two[:, :, None, None]), (full, full), (full[1], full[1]))
+    for background, behind in forms:
         assert largest(renderer(gaussians, cameras, background).image, out.image + light * behind) <= 0.1 * bound
     black = renderer(gaussians, cameras, torch.zeros(3, dtype=dtype)).image
     assert torch.equal(black, out.image)
@@ -163,13 +154,7 @@ def test_rgb_is_taken_as_it_is_and_harmonics_are_shifted_by_a_half():
     assert GaussianRenderer()(bright, camera).image.min() < -1  # neither colours nor the image are clamped
 
 
-# -- dtypes, modes, errors -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_results_have_the_dtype_of_the_gaussians(dtype):
-    out = GaussianRenderer()(random_gaussians(9, 0, dtype), random_camera(9, 9, 0, dtype), outputs=OUTPUTS)
-    assert all(getattr(out, name).dtype == dtype for name in OUTPUTS)
+# -- modes and options --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("backward_inside", [False, True])
@@ -197,18 +182,14 @@ def test_lower_precision_around_it_changes_nothing(setting, backward_inside, mat
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_inference_keeps_no_graph(mode, threads):
+def test_inference_keeps_no_graph(mode, threads, set_threads):
     # enough tiles for several pieces of work, so that a second thread has some
     camera = random_camera(200, 400, 0, torch.float32)
     gaussians, _ = leaves(random_gaussians(400, 0, torch.float32, 1, image_size=100))
     expected = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
-        with mode():
-            out = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
-    finally:
-        torch.set_num_threads(before)
+    set_threads(threads)
+    with mode():
+        out = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
     for name in OUTPUTS:
         assert torch.equal(getattr(out, name), getattr(expected, name))
         assert not getattr(out, name).requires_grad
@@ -225,25 +206,6 @@ def test_threads_may_differentiate_one_graph():
     assert all(torch.equal(a, b) for one in found for a, b in zip(one, found[0], strict=True))
 
 
-def test_gradient_of_means2d_is_kept_where_it_is_asked_for():
-    gaussians, inputs = leaves(random_gaussians(40, 0))
-    out = GaussianRenderer()(gaussians, random_camera(24, 32, 0))
-    out.projected.means2d.retain_grad()
-    out.image.square().sum().backward()
-    assert out.projected.means2d.grad.shape == (len(out.projected), 2)
-    assert out.projected.means2d.grad.any()
-    assert inputs[0].grad.any()
-
-
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize("name", FIELDS)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
-def test_other_dtypes_are_a_type_error_that_names_the_argument(name, dtype):
-    gaussians = random_gaussians(3, 0, torch.float32)
-    with pytest.raises(TypeError, match=rf"{name}.*float32 or float64.*{dtype}"):
-        dataclasses.replace(gaussians, **{name: getattr(gaussians, name).to(dtype)})
-
-
 @pytest.mark.usefixtures("torch_alone")
 def test_options_are_given_whole_or_field_by_field():
     options = RasterOptions(near_plane=0.5, alpha_threshold=0.0, max_bytes=2**20)
@@ -255,23 +217,6 @@ def test_options_are_given_whole_or_field_by_field():
     assert torch.equal(image, GaussianRenderer(**vars(options))(gaussians, camera).image)
     projected = project(gaussians, camera, options=options)
     assert torch.equal(image, composite(projected, projected.colors, options=options).features)
-
-
-@pytest.mark.usefixtures("torch_alone")
-def test_options_given_twice_or_of_another_kind_are_refused():
-    gaussians, camera = random_gaussians(3, 0), random_camera(9, 12, 0)
-    projected = project(gaussians, camera)
-    for call in (
-        GaussianRenderer,
-        partial(project, gaussians, camera),
-        partial(composite, projected, projected.colors),
-    ):
-        with pytest.raises(TypeError, match="^options:"):
-            call(options={"eps2d": 0.1})
-        with pytest.raises(TypeError, match="last_plane"):
-            call(last_plane=10.0)
-    with pytest.raises(TypeError, match="^options:"):
-        GaussianRenderer(options=RasterOptions(), eps2d=0.1)
 
 
 @pytest.mark.usefixtures("torch_alone")

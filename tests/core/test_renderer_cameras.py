@@ -21,9 +21,6 @@ def largest(a, b):
     return (a - b).abs().max().item()
 
 
-# -- cameras -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_sixteen_cameras_at_once_are_sixteen_single_ones(dtype):
     singles = [random_camera(24, 30, seed, dtype) for seed in range(16)]
@@ -93,109 +90,6 @@ def test_a_wide_render_shows_a_frame_as_a_render_of_the_frame_does(kind):
         single = PinholeCamera(single.intrinsics.float(), single.extrinsics.float(), single.height, single.width)
         image = GaussianRenderer(frame=frame)(Gaussians(**values), single).image[..., inside]
         assert largest(image.double(), expected) < 1e-4
-
-
-def test_orthographic_camera_is_the_marginal_of_each_gaussian():
-    # B2: parallel rays integrate along z, so the footprint is the upper left block of R Sigma R^T, scaled
-    gaussians = dataclasses.replace(
-        random_gaussians(1, 3, sh_degree=None), means=torch.tensor([[0.3, -0.2, 5.0]]).double()
-    )
-    fx, fy, cx, cy = 9.0, 7.0, 15.0, 11.5
-    turn = random_camera(24, 32, 8).extrinsics
-    camera = posed(CameraModelType.ORTHOGRAPHIC, [fx, fy, cx, cy], (24, 32), extrinsics=turn)
-    alpha = GaussianRenderer(alpha_threshold=0)(gaussians, camera, outputs=("alpha",)).alpha[0, 0]
-    w, x, y, z = (gaussians.quats[0] / gaussians.quats[0].norm()).tolist()
-    local = torch.linalg.matrix_exp(  # of the rotation vector of the quaternion
-        2
-        * math.atan2(math.hypot(x, y, z), w)
-        / math.hypot(x, y, z)
-        * torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    )
-    covariance = local @ torch.diag(gaussians.scales[0] ** 2) @ local.T
-    rotation, translation = turn[0, :3, :3], turn[0, :3, 3]
-    view = torch.diag(torch.tensor([fx, fy])).double() @ (rotation @ covariance @ rotation.T)[:2, :2]
-    marginal = view @ torch.diag(torch.tensor([fx, fy])).double() + 0.3 * torch.eye(2, dtype=torch.float64)
-    centre = (rotation @ gaussians.means[0] + translation)[:2] * torch.tensor([fx, fy]) + torch.tensor([cx, cy])
-    d = torch.cartesian_prod(torch.arange(24), torch.arange(32)).flip(1) - centre
-    expected = gaussians.opacities[0] * torch.exp(-0.5 * (d * torch.linalg.solve(marginal, d.T).T).sum(1))
-    assert largest(alpha.reshape(-1), expected) <= 1e-12
-
-
-def test_pinhole_of_both_kinds_is_one_image():
-    gaussians, camera = random_gaussians(40, 0, sh_degree=3), random_camera(24, 32, 0)
-    k = camera.intrinsics[0]
-    params = [k[0, 0].item(), k[1, 1].item(), k[0, 2].item(), k[1, 2].item()]
-    other = posed(CameraModelType.PINHOLE, params, (24, 32), extrinsics=camera.extrinsics)
-    assert largest(GaussianRenderer()(gaussians, camera).image, GaussianRenderer()(gaussians, other).image) <= 1e-12
-
-
-def test_brown_conrady_without_distortion_is_the_pinhole():
-    gaussians, camera = random_gaussians(40, 0, sh_degree=3), random_camera(24, 32, 0)
-    k = camera.intrinsics[0]
-    params = [k[0, 0].item(), k[1, 1].item(), k[0, 2].item(), k[1, 2].item()]
-    lens = posed(CameraModelType.BROWN_CONRADY, params + [0.0] * 8, (24, 32), extrinsics=camera.extrinsics)
-    expected = GaussianRenderer()(gaussians, camera, outputs=("image", "depth"))
-    out = GaussianRenderer()(gaussians, lens, outputs=("image", "depth"))
-    assert largest(out.image, expected.image) <= 1e-10
-    assert largest(out.depth, expected.depth) <= 1e-10
-    bent = posed(CameraModelType.BROWN_CONRADY, [*params, 0.2, *[0.0] * 7], (24, 32), extrinsics=camera.extrinsics)
-    assert largest(GaussianRenderer()(gaussians, bent).image, expected.image) > 1e-3
-
-
-def test_fisheye_puts_a_dot_where_the_angle_says():
-    # Kannala-Brandt without higher terms is the equidistant projection: radius = f times the angle off the axis
-    f, angle = 20.0, 0.6
-    camera = posed(CameraModelType.KANNALA_BRANDT_K3, [f, f, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0], (25, 33))
-    dot = Gaussians(
-        means=torch.tensor([[math.sin(angle), 0.0, math.cos(angle)]]).double() * 3,
-        quats=torch.tensor([[1.0, 0, 0, 0]]).double(),
-        scales=torch.full((1, 3), 1e-6).double(),
-        opacities=torch.tensor([0.9]).double(),
-        colors=torch.ones(1, 3).double(),
-    )
-    mass = GaussianRenderer(alpha_threshold=0)(dot, camera, outputs=("alpha",)).alpha[0, 0]
-    x = (mass.sum(0) * torch.arange(33)).sum() / mass.sum()
-    y = (mass.sum(1) * torch.arange(25)).sum() / mass.sum()
-    assert x.item() == pytest.approx(16 + f * angle, abs=0.02)
-    assert y.item() == pytest.approx(12, abs=1e-6)
-    gaussians, inputs = leaves(random_gaussians(30, 0, sh_degree=1))
-    image = GaussianRenderer()(gaussians, camera).image
-    assert image.isfinite().all()
-    assert (image > 0).any()
-    image.sum().backward()
-    assert all(x.grad.isfinite().all() and x.grad.any() for x in inputs)
-
-
-def test_one_lens_for_several_poses_and_one_lens_each():
-    kind = CameraModelType.BROWN_CONRADY
-    params = [30.0, 31.0, 15.5, 11.5, 0.05, -0.02, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0]
-    poses = torch.cat([random_camera(24, 32, seed).extrinsics for seed in (0, 1)])
-    gaussians, renderer = random_gaussians(30, 1), GaussianRenderer()
-    shared = renderer(gaussians, posed(kind, params, (24, 32), extrinsics=poses)).image
-    apart = [renderer(gaussians, posed(kind, params, (24, 32), extrinsics=poses[i : i + 1])).image for i in (0, 1)]
-    assert torch.equal(shared, torch.cat(apart))
-    wide = [20.0, *params[1:]]
-    each = renderer(gaussians, posed(kind, [params, wide], (24, 32), extrinsics=poses)).image
-    assert torch.equal(each[:1], apart[0])
-    assert torch.equal(each[1:], renderer(gaussians, posed(kind, wide, (24, 32), extrinsics=poses[1:])).image)
-
-
-def test_opacities_a_camera(exactly):
-    dtype, bound = exactly
-    cameras = batch(*[random_camera(24, 32, seed, dtype) for seed in (0, 1)])
-    gaussians = random_gaussians(30, 0, dtype)
-    mine = torch.stack([gaussians.opacities, gaussians.opacities.flip(0)]).requires_grad_()
-    out = GaussianRenderer()(dataclasses.replace(gaussians, opacities=mine), cameras).image
-    for c in (0, 1):
-        one = dataclasses.replace(gaussians, opacities=mine[c].detach())
-        single = random_camera(24, 32, c, dtype)
-        assert largest(out[c : c + 1], GaussianRenderer()(one, single).image) <= bound
-    out[0].sum().backward()
-    assert mine.grad[0].any()
-    assert not mine.grad[1].any()
-
-
-# -- degenerate sizes ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [0, 3])

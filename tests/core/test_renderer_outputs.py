@@ -16,8 +16,6 @@ pytestmark = pytest.mark.usefixtures("each_backend")
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 SIZE = (24, 32)
 
-# --- normals ----------------------------------------------------------------------------------------------------
-
 
 def shortest_axes(gaussians, centre):
     """Towards `centre`, one by one."""
@@ -82,9 +80,6 @@ def test_normals_beside_other_outputs_change_none_of_them_and_have_gradients():
     assert torch.autograd.gradcheck(normal, small.quats.clone().requires_grad_(), fast_mode=True)
 
 
-# --- features ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("width", [1, 2, 5])
 def test_features_of_any_width_are_drawn_as_colours_are(width):
     gaussians, camera = random_scene(0, torch.float64, 60, SIZE, None)
@@ -96,16 +91,6 @@ def test_features_of_any_width_are_drawn_as_colours_are(width):
     for i in range(width):
         one = replace(gaussians, colors=features[:, i : i + 1].expand(60, 3))
         assert torch.allclose(out.image[:, i], GaussianRenderer()(one, camera, background[i].expand(3)).image[:, 0])
-
-
-# --- background -------------------------------------------------------------------------------------------------
-
-
-def test_one_picture_behind_all_cameras():
-    gaussians, cameras = random_scene(0, torch.float32, 60, SIZE, cameras=2)
-    picture = torch.rand(3, *SIZE)
-    expected = GaussianRenderer()(gaussians, cameras, picture.expand(2, 3, *SIZE)).image
-    assert torch.equal(GaussianRenderer()(gaussians, cameras, picture).image, expected)
 
 
 @pytest.mark.parametrize("shape", [(3,), (1, 3), (3, *SIZE), (1, 3, *SIZE)])

@@ -152,6 +152,19 @@ def relocated(opacities, scales, ratios, binoms):
     return new, (opacities / total)[:, None] * scales
 
 
+def train_with_mcmc():
+    options = {"refine_start_iter": 10, "refine_every": 10, "min_opacity": 0.15, "noise_lr": 1.0}
+    strategy = strategies.MCMCStrategy(cap_max=60, **options)
+
+    def step(*given):
+        strategy.step_post_backward(*given, lr=3e-3)
+
+    counts, losses, _ = train(strategy, kgs_render(), 150, step, torch.float32)
+    assert counts[0] == 40
+    assert counts[-1] == 60
+    assert losses[-1] < 0.8 * losses[0]
+
+
 def test_mcmc_strategy_trains(monkeypatch):
     """On a CPU, with torch in place of its two functions in CUDA."""
     monkeypatch.setattr(ops, "compute_relocation", relocated)
@@ -160,31 +173,12 @@ def test_mcmc_strategy_trains(monkeypatch):
         "quat_scale_to_covar_preci",
         lambda quats, scales, **options: _torch_impl._quat_scale_to_covar_preci(quats, scales, **options),
     )
-    strategy = strategies.MCMCStrategy(
-        cap_max=60, refine_start_iter=10, refine_every=10, min_opacity=0.15, noise_lr=1.0
-    )
-
-    def step(params, optimizers, state, step, info):
-        strategy.step_post_backward(params, optimizers, state, step, info, lr=3e-3)
-
-    counts, losses, _ = train(strategy, kgs_render(), 150, step, torch.float32)
-    assert counts[0] == 40
-    assert counts[-1] == 60
-    assert losses[-1] < 0.8 * losses[0]
+    train_with_mcmc()
 
 
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_mcmc_strategy_trains_with_gsplats_own_functions():
     pytest.importorskip("gsplat.csrc", reason="gsplat was built without its extension")
-    strategy = strategies.MCMCStrategy(
-        cap_max=60, refine_start_iter=10, refine_every=10, min_opacity=0.15, noise_lr=1.0
-    )
-
-    def step(params, optimizers, state, step, info):
-        strategy.step_post_backward(params, optimizers, state, step, info, lr=3e-3)
-
     with torch.device("cuda"):
-        counts, losses, _ = train(strategy, kgs_render(), 150, step, torch.float32)
-    assert counts[-1] == 60
-    assert losses[-1] < 0.8 * losses[0]
+        train_with_mcmc()

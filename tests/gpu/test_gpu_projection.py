@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from factories import leaves, random_camera, replace, with_camera
+from factories import leaves, posed, random_camera, replace, with_camera
 from kornia.sensors.camera import CameraModelType
-from projection_checks import assert_alike, assert_camera_gradients, posed, wide_scene
+from projection_checks import assert_alike, assert_camera_gradients, wide_scene
 
 import kgs
 from kgs import project
@@ -134,7 +134,7 @@ def test_what_the_kernels_cannot_draw_goes_to_torch(handed_over):
     gaussians, cameras = wide_scene()
     flat = cameras.extrinsics[0].clone()
     flat[2, :3] = 0.0
-    lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), cameras.extrinsics)
+    lens = posed(CameraModelType.PINHOLE, torch.tensor([50.0, 55.0, 30.0, 25.0]), extrinsics=cameras.extrinsics)
     got, expected = (project(gaussians, lens, backend=backend) for backend in ("triton", "torch"))
     assert torch.equal(got.means2d, expected.means2d)
     with pytest.raises(ValueError, match="^extrinsics:"):

@@ -11,6 +11,7 @@ from oracles import near_threshold
 from kgs import RasterOptions, composite, project
 
 TH, STOP = 1 / 255, 1e-4
+EXACT = RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
 
 
 DTYPES = [torch.float32, torch.float64]

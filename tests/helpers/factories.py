@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -16,7 +17,16 @@ from kgs import DropGaussian, GaussianModel, Gaussians, PosedCamera, ProjectedGa
 from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
-__all__ += ["pinhole", "posed", "random_camera", "random_cloud", "random_gaussians", "random_model", "random_opacities"]
+__all__ += [
+    "other_defaults",
+    "pinhole",
+    "posed",
+    "random_camera",
+    "random_cloud",
+    "random_gaussians",
+    "random_model",
+    "random_opacities",
+]
 __all__ += [
     "random_scene",
     "random_views",
@@ -261,6 +271,21 @@ def drop_layer(progress: float, **options: Any) -> DropGaussian:
     layer = DropGaussian(**options)
     layer.progress = progress
     return layer
+
+
+# -- other people's programs ---------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def other_defaults(dtype: torch.dtype = torch.float64) -> Iterator[None]:
+    """Torch's default device is "meta", which stands for an accelerator, and its default dtype another."""
+    torch.set_default_device("meta")
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_device(None)  # "cpu" would leave a mode behind, which changes how graphs are traced
+        torch.set_default_dtype(torch.float32)
 
 
 # -- models and views ----------------------------------------------------------------------------------------------

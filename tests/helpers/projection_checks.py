@@ -2,18 +2,10 @@
 
 import torch
 from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace, staged
-from kornia.image import ImageSize
-from kornia.sensors.camera import CameraModel, CameraModelType
 
-from kgs import Gaussians, PosedCamera, project
+from kgs import Gaussians, project
 
 HEIGHT, WIDTH = 48, 64
-
-
-LENGTHS = {kind: 0 for kind in CameraModelType} | {  # of the distortion
-    CameraModelType.BROWN_CONRADY: 8,
-    CameraModelType.KANNALA_BRANDT_K3: 4,
-}
 
 
 PACKED = ("means2d", "factors", "depths", "radii", "opacities", "colors")
@@ -22,10 +14,6 @@ PACKED = ("means2d", "factors", "depths", "radii", "opacities", "colors")
 def scene(n=60, degree=1, dtype=torch.float64, cameras=1):
     views = [random_camera(HEIGHT, WIDTH, seed, dtype) for seed in range(cameras)]
     return random_gaussians(n, 0, dtype, degree, WIDTH), batch(*views)
-
-
-def posed(kind, params, extrinsics):
-    return PosedCamera(CameraModel(ImageSize(HEIGHT, WIDTH), kind, params), extrinsics)
 
 
 def assert_same(first, second):

@@ -2,7 +2,6 @@
 
 import torch
 from factories import FIELDS, pinhole
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs import Gaussians
@@ -16,11 +15,6 @@ def tensor(*values: object) -> Tensor:
 
 def fields(gaussians: Gaussians) -> dict[str, Tensor]:
     return {name: getattr(gaussians, name) for name in FIELDS}
-
-
-def posed(camera: PinholeCamera, **changes: Tensor) -> PinholeCamera:
-    values = {"intrinsics": camera.intrinsics[0], "extrinsics": camera.extrinsics[0], **changes}
-    return PinholeCamera(values["intrinsics"][None], values["extrinsics"][None], camera.height, camera.width)
 
 
 def stack(opacities: list[float], colors: list[list[float]], scale: float = 1e6) -> Gaussians:

@@ -1,38 +1,27 @@
-"""The same input gives the same bits, whatever ran before and on however many threads."""
+"""The same input gives the same bits, on however many threads and beside other renders."""
 
 import threading
 
 import pytest
 import torch
-from factories import random_camera, random_gaussians
+from factories import OUTPUTS, leaves, random_camera, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 
-from kgs import DropGaussian, GaussianRenderer, Gaussians
+from kgs import GaussianRenderer
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
-OUTPUTS = ("image", "alpha", "depth", "median_depth")
 LARGE = (200, 400)  # enough tiles for several pieces of work
 SMALL = (24, 32)  # one piece
 
 
-@pytest.fixture
-def threads():
-    """Sets the number of torch's threads and puts it back."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 def run(dtype=torch.float32, n=1500, options=None, seed=0, size=LARGE):
     """All outputs of one render and all gradients of a loss."""
-    gaussians = random_gaussians(n, seed, dtype, 1, image_size=120)
+    gaussians, inputs = leaves(random_gaussians(n, seed, dtype, 1, image_size=120))
     camera = random_camera(*size, seed, dtype)
-    inputs = [getattr(gaussians, name).clone().requires_grad_() for name in FIELDS]
     inputs += [camera.extrinsics.clone().requires_grad_(), camera.intrinsics.clone().requires_grad_()]
     posed = PinholeCamera(inputs[6], inputs[5], camera.height, camera.width)
-    out = GaussianRenderer(**(options or {}))(Gaussians(*inputs[:5]), posed, outputs=OUTPUTS)
+    out = GaussianRenderer(**(options or {}))(gaussians, posed, outputs=OUTPUTS)
     gradients = torch.autograd.grad(out.image.square().sum() + out.depth.mean(), inputs)
     return [getattr(out, name).detach() for name in OUTPUTS] + list(gradients)
 
@@ -41,35 +30,20 @@ def assert_equal_bits(first, second):
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_repeated_runs_are_equal(threads, count):
-    threads(count)
-    first = run()
-    run(seed=1, n=300)
-    for _ in range(2):
-        assert_equal_bits(run(), first)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("size", "n"), [(LARGE, 1500), (SMALL, 100)])
-def test_one_and_two_threads_are_equal(threads, dtype, size, n):
-    threads(1)
-    first = run(dtype, n, size=size)
-    threads(2)
-    assert_equal_bits(run(dtype, n, size=size), first)
+@pytest.mark.parametrize(
+    ("size", "n", "options"), [(LARGE, 1500, {}), (SMALL, 100, {}), (LARGE, 300, {"max_bytes": 2**20})]
+)
+def test_one_and_two_threads_are_equal(set_threads, dtype, size, n, options):
+    set_threads(1)
+    first = run(dtype, n, options, size=size)
+    set_threads(2)
+    assert_equal_bits(run(dtype, n, options, size=size), first)
 
 
-def test_one_and_two_threads_are_equal_under_a_byte_budget(threads):
-    options = {"max_bytes": 2**20}
-    threads(1)
-    first = run(n=300, options=options)
-    threads(2)
-    assert_equal_bits(run(n=300, options=options), first)
-
-
-def test_rendering_leaves_the_number_of_threads_alone(threads):
+def test_rendering_leaves_the_number_of_threads_alone(set_threads):
     for count in (2, 3):
-        threads(count)
+        set_threads(count)
         run(n=300)
         assert torch.get_num_threads() == count
         seen = []
@@ -79,8 +53,8 @@ def test_rendering_leaves_the_number_of_threads_alone(threads):
         assert seen == [count]
 
 
-def test_two_renders_at_the_same_time_are_equal_to_one(threads):
-    threads(2)
+def test_two_renders_at_the_same_time_are_equal_to_one(set_threads):
+    set_threads(2)
     expected = run(n=500)
     found = [None] * 3
 
@@ -100,33 +74,3 @@ def test_rendering_draws_no_random_numbers():
     state = torch.get_rng_state()
     run(n=50)
     assert torch.equal(torch.get_rng_state(), state)
-
-
-def dropped_runs(seed, steps=3):
-    gaussians, camera = random_gaussians(200, 0, torch.float32), random_camera(24, 32, 0, torch.float32)
-    drop = DropGaussian(p=0.4, seed=seed)
-    renderer = GaussianRenderer(opacity_layer=drop)
-    images = []
-    for step in range(steps):
-        drop.progress = (step + 1) / steps
-        images.append(renderer(gaussians, camera).image)
-    return images
-
-
-def test_equal_seeds_drop_the_same_gaussians(threads):
-    threads(1)
-    first = dropped_runs(5)
-    torch.rand(17)  # the layer's stream is its own
-    threads(2)
-    assert_equal_bits(dropped_runs(5), first)
-    assert not torch.equal(dropped_runs(6)[-1], first[-1])
-    assert not torch.equal(first[0], first[1])
-
-
-def test_the_default_generator_decides_without_a_seed():
-    torch.manual_seed(3)
-    first = dropped_runs(None)
-    second = dropped_runs(None)
-    torch.manual_seed(3)
-    assert_equal_bits(dropped_runs(None), first)
-    assert not torch.equal(first[-1], second[-1])

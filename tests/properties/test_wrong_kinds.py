@@ -4,7 +4,6 @@ What is meant is taken, and what is wrong is an error that names the argument, n
 """
 
 import functools
-import re
 import sys
 
 import numpy as np
@@ -24,7 +23,7 @@ from kgs.densify import Densifier
 from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
 from kgs.fit.plan import make_plan
 from kgs.geometry import camera_extent
-from kgs.losses import photometric_loss, target_moments
+from kgs.losses import photometric_loss
 
 UPRIGHT = torch.eye(3)
 CONFIG = FitConfig(steps=2, evaluations=1, init="random", init_points=50, backend="torch")
@@ -53,87 +52,43 @@ def views(images, names=("a", "b")):
 
 
 MODEL, PHOTO = random_model(5), torch.rand(1, 3, 16, 16)
-WRONG = {
-    "a model for Gaussians": (
-        lambda: kgs.GaussianRenderer()(MODEL, scene().train.camera(0)),
-        "gaussians: expected Gauss",
-    ),
-    "and in project": (
-        lambda: kgs.project(MODEL, scene().train.camera(0)),
-        "gaussians: expected Gaussians, got",
-    ),
-    "and in the reference": (lambda: reference.render(MODEL, scene().train.camera(0)), "gaussians: expected Gaussians"),
-    "Gaussians for a model": (lambda: kgs.save_ply("x.ply", MODEL()), "model: expected GaussianModel, got Gaussians"),
-    "and in a glb": (lambda: save_glb("x.glb", MODEL(), UPRIGHT), "model: expected GaussianModel, got Gaussians"),
-    "and in densification": (lambda: Densifier(MODEL(), None, 1.0), "model: expected GaussianModel, got Gaussians"),
-    "one Gaussian": (lambda: MODEL()[0], "index: expected a mask, indices or a slice, got 0"),
-    "an array of points": (
-        lambda: kgs.GaussianModel.from_points(np.zeros((5, 3), np.float32), torch.rand(5, 3)),
-        "points: expected a torch.Tensor, got ndarray",
-    ),
-    "an array of parameters": (
-        lambda: kgs.GaussianModel(*(value.detach().numpy() for value in MODEL.parameters())),
-        "means: expected a torch.Tensor, got ndarray",
-    ),
-    "means as a list": (lambda: rasterize(means=[[0.0, 0.0, 2.0]] * 4), "means: expected a torch.Tensor, got list"),
-    "backgrounds as a list": (lambda: rasterize(backgrounds=[[1, 1, 1]]), "backgrounds: expected a torch.Tensor, got"),
-    "a list behind the reference": (
-        lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0]),
-        "background: expected a torch.Tensor, got list",
-    ),
-    "a photo for its moments": (
-        lambda: photometric_loss(PHOTO, PHOTO, moments=PHOTO),
-        "moments: expected TargetMoments, got Tensor",
-    ),
-    "bytes for colours": (
-        lambda: views((255 * scene().train.images).byte()),
-        "images: expected a tensor of floating point RGB in [0, 1], got torch.uint8",
-    ),
-    "an array of photos": (
-        lambda: views(scene().train.images.numpy()),
-        "images: expected a tensor of floating point RGB",
-    ),
-    "cameras for their matrices": (
-        lambda: camera_extent(scene().train.cameras),
-        "extrinsics: expected a torch.Tensor, got PinholeCamera",
-    ),
-    "a scene for its views": (lambda: initial_points(scene()), "views: expected Views, got Scene"),
-    "views for a scene": (
-        lambda: Trainer(scene().train, make_plan(scene(), CONFIG), points()),
-        "scene: expected Scene, got Views",
-    ),
-    "settings for a plan": (lambda: Trainer(scene(), CONFIG, points()), "plan: expected Plan, got FitConfig"),
-    "and in a whole fit": (lambda: fit_scene(scene().train, CONFIG), "scene: expected Scene, got Views"),
-    "and in a plan": (lambda: make_plan(scene().train, CONFIG), "scene: expected Scene, got Views"),
-    "a dict for settings": (lambda: make_plan(scene(), {}), "config: expected FitConfig, got dict"),
-    "a tensor for points": (
-        lambda: Trainer(scene(), make_plan(scene(), CONFIG), points().points),
-        "points: expected InitialPoints, got Tensor",
-    ),
-}
+WRONG = [
+    ("gaussians", TypeError, lambda: kgs.GaussianRenderer()(MODEL, scene().train.camera(0))),
+    ("gaussians", TypeError, lambda: kgs.project(MODEL, scene().train.camera(0))),
+    ("gaussians", TypeError, lambda: reference.render(MODEL, scene().train.camera(0))),
+    ("model", TypeError, lambda: kgs.save_ply("x.ply", MODEL())),
+    ("model", TypeError, lambda: save_glb("x.glb", MODEL(), UPRIGHT)),
+    ("model", TypeError, lambda: Densifier(MODEL(), None, 1.0)),
+    ("index", TypeError, lambda: MODEL()[0]),
+    ("points", TypeError, lambda: kgs.GaussianModel.from_points(np.zeros((5, 3), np.float32), torch.rand(5, 3))),
+    ("means", TypeError, lambda: kgs.GaussianModel(*(value.detach().numpy() for value in MODEL.parameters()))),
+    ("means", TypeError, lambda: rasterize(means=[[0.0, 0.0, 2.0]] * 4)),
+    ("backgrounds", TypeError, lambda: rasterize(backgrounds=[[1, 1, 1]])),
+    ("background", TypeError, lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0])),
+    ("moments", TypeError, lambda: photometric_loss(PHOTO, PHOTO, moments=PHOTO)),
+    ("images", TypeError, lambda: views((255 * scene().train.images).byte())),
+    ("images", TypeError, lambda: views(scene().train.images.numpy())),
+    ("extrinsics", TypeError, lambda: camera_extent(scene().train.cameras)),
+    ("views", TypeError, lambda: initial_points(scene())),
+    ("scene", TypeError, lambda: Trainer(scene().train, make_plan(scene(), CONFIG), points())),
+    ("plan", TypeError, lambda: Trainer(scene(), CONFIG, points())),
+    ("scene", TypeError, lambda: fit_scene(scene().train, CONFIG)),
+    ("scene", TypeError, lambda: make_plan(scene().train, CONFIG)),
+    ("config", TypeError, lambda: make_plan(scene(), {})),
+    ("points", TypeError, lambda: Trainer(scene(), make_plan(scene(), CONFIG), points().points)),
+    ("names", ValueError, lambda: views(scene().train.images, ("a", "a"))),
+    ("sh_degree", ValueError, lambda: rasterize(colors=torch.rand(4, 4, 3), sh_degree=1.0)),
+    ("radial_coeffs", ValueError, lambda: rasterize(radial_coeffs=np.zeros((1, 4)))),
+    ("seed", ValueError, lambda: synthetic_scene(seed=-1)),
+    ("offset", ValueError, lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.tensor([0.0, float("nan"), 0.0]))),
+    ("offset", ValueError, lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.zeros(2))),
+    ("rotation", ValueError, lambda: save_glb("x.glb", MODEL, torch.eye(4))),
+]
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_another_kind_is_a_type_error_that_names_the_argument(name):
-    call, message = WRONG[name]
-    with pytest.raises(TypeError, match="^" + re.escape(message)):
-        call()
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: views(scene().train.images, ("a", "a")), "names: expected each once"),
-        (lambda: rasterize(colors=torch.rand(4, 4, 3), sh_degree=1.0), "sh_degree: expected 0 to 3 or None, got 1.0"),
-        (lambda: rasterize(radial_coeffs=np.zeros((1, 4))), "radial_coeffs: expected None .*, got an array"),
-        (lambda: synthetic_scene(seed=-1), "seed: expected at least 0, got -1"),
-        (lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.tensor([0.0, float("nan"), 0.0])), "offset: expected finite"),
-        (lambda: save_glb("x.glb", MODEL, UPRIGHT, torch.zeros(2)), r"offset: expected shape \(3,\)"),
-        (lambda: save_glb("x.glb", MODEL, torch.eye(4)), r"rotation: expected finite numbers of shape \(3, 3\)"),
-    ],
-)
-def test_another_value_is_a_value_error_that_names_the_argument(call, message):
-    with pytest.raises(ValueError, match="^" + message):
+@pytest.mark.parametrize(("name", "error", "call"), WRONG, ids=[f"{i}-{case[0]}" for i, case in enumerate(WRONG)])
+def test_something_else_is_an_error_that_names_the_argument(name, error, call):
+    with pytest.raises(error, match=f"^{name}:"):
         call()
 
 
@@ -157,11 +112,6 @@ def test_paths_may_be_text(tmp_path):
     published = fit_folder(scene(), CONFIG, str(tmp_path / "out"), SceneRequest("."))
     assert published.folder == tmp_path / "out"
     assert (tmp_path / "out" / "index.html").exists()
-
-
-def test_moments_of_the_target_are_taken():
-    target = torch.rand(1, 3, 16, 16)
-    assert torch.equal(photometric_loss(PHOTO, target, moments=target_moments(target)), photometric_loss(PHOTO, target))
 
 
 @pytest.mark.parametrize("package", ["jinja2", "matplotlib"])
