@@ -16,7 +16,7 @@ from kgs.datasets.folders import nearest_scene
 from kgs.json_files import write_json
 
 SIZE = (72, 96)
-FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
+FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")
 
 
 def run(*arguments):
