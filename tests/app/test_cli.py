@@ -303,6 +303,7 @@ def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, cap
     assert "\r" not in said.err
     assert f"kgs render {tmp_path}/splat.ply --cameras {folder}" in said.out
     assert f"kgs eval {tmp_path}" in said.out
+    assert f"open {tmp_path / 'index.html'} in a browser" in said.out
 
 
 def test_a_command_line_without_tyro_is_one_line(folder, tmp_path, capsys, monkeypatch):

@@ -75,8 +75,11 @@ PATHS = {
 
 
 @pytest.mark.parametrize("poses", PATHS.values(), ids=PATHS)
-def test_the_path_passes_each_camera_and_is_smooth(poses: Tensor) -> None:
+def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) -> None:
     path = tour(poses, evenly(2000), 1.0)
+    if "6 facing" in request.node.name:  # cameras side by side are never left
+        assert (centers(path) >= centers(poses).amin(0) - 1e-9).all()
+        assert (centers(path) <= centers(poses).amax(0) + 1e-9).all()
     for pose in poses:
         nearest = int((path - pose).abs().amax((1, 2)).argmin())
         assert (centers(path)[nearest] - centers(pose[None])[0]).norm() < 0.02
@@ -99,13 +102,6 @@ def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
     assert (-(path[:, 2, :3] * places).sum(1) / radii > 0.999).all()
     turned = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
     assert min(turned.sum(), (2 * math.pi - turned).sum()) < 2 * math.pi  # once around
-
-
-def test_cameras_side_by_side_are_never_left() -> None:
-    poses = facing(6)
-    places = centers(tour(poses, evenly(300), 1.0))
-    assert (places >= centers(poses).amin(0) - 1e-9).all()
-    assert (places <= centers(poses).amax(0) + 1e-9).all()
 
 
 @pytest.mark.parametrize("poses", [*PATHS.values(), ring(12), ring(7)[:1]], ids=[*PATHS, "ring of 12", "1"])
@@ -339,10 +335,8 @@ def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.delenv(encoders.ASKED, raising=False)
     assert encoders.film_suffix() == (".webm", "")
     monkeypatch.setenv(encoders.ASKED, "libx264")
-    assert encoders.film_suffix() == (".webm", "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)")
-    assert (
-        write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0) == "no a.mp4: there is no encoder of H.264 here"
-    )
+    assert encoders.film_suffix()[0] == ".webm"
+    assert write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0).startswith("no a.mp4: ")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -351,25 +345,26 @@ def test_an_encoder_of_something_else_is_none(monkeypatch: Any, name: str) -> No
     pytest.importorskip("av")
     monkeypatch.setenv(encoders.ASKED, name)
     suffix, note = encoders.film_suffix()
-    assert suffix == ".webm"
-    assert f"has no encoder KGS_H264={name} that works" in note
+    assert (suffix, name in note) == (".webm", True)
 
 
-def test_an_encoder_that_fails_leaves_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
+@pytest.mark.parametrize(
+    ("name", "broken", "reason"),
+    [("a.mp4", "av.open", "no a.mp4: libx264: "), ("a.webm", "cv2.VideoWriter.fourcc", "this OpenCV writes no WebM")],
+)
+def test_an_encoder_that_fails_leaves_a_reason_and_no_file(
+    tmp_path: Path, monkeypatch: Any, name: str, broken: str, reason: str
+) -> None:
     av = pytest.importorskip("av")
     monkeypatch.setenv(encoders.ASKED, "libx264")
 
-    def failing(*_: Any, **__: Any) -> None:
-        raise av.error.ExternalError(1, "no session left")
+    def failing(*_: Any, **__: Any) -> int:
+        if broken == "av.open":
+            raise av.error.ExternalError(1, "no session left")
+        return 0
 
-    monkeypatch.setattr(av, "open", failing)
-    assert "no a.mp4: libx264: " in write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_without_a_codec_there_is_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(encoders.cv2.VideoWriter, "fourcc", lambda *_: 0)
-    assert "this OpenCV writes no WebM" in write_film(tmp_path / "film.webm", render, views_of((12, 16)), 1.0)
+    monkeypatch.setattr(broken, failing)
+    assert reason in write_film(tmp_path / name, render, views_of((12, 16)), 1.0)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -17,50 +17,23 @@ import kgs
 ROOT = Path(__file__).parents[2]
 # to remove or rename a name, edit this list and the changelog in the same change
 INVENTORY = {
-    "kgs": [
-        "DataError",
-        "Densifier",
-        "DensifyReport",
-        "DropGaussian",
-        "GaussianModel",
-        "GaussianRenderer",
-        "Gaussians",
-        "PosedCamera",
-        "ProjectedGaussians",
-        "Rendering",
-        "RasterOptions",
-        "TrainingDiverged",
-        "camera_extent",
-        "pinhole_cameras",
-        "composite",
-        "drop_gaussian",
-        "load_ply",
-        "project",
-        "rasterization",
-        "save_ply",
-    ],
-    "kgs.losses": ["TargetMoments", "photometric_loss", "target_moments"],
-    "kgs.datasets": ["Scene", "Views", "load_scene", "synthetic_scene"],
-    "kgs.fit": [
-        "Fit",
-        "FitConfig",
-        "InitialPoints",
-        "Plan",
-        "Trainer",
-        "choose_points",
-        "fit_scene",
-        "initial_points",
-        "make_plan",
-        "measure",
-    ],
-    "kgs.reference": ["Layers", "layers", "render"],
+    "kgs": """
+        DataError Densifier DensifyReport DropGaussian GaussianModel GaussianRenderer Gaussians PosedCamera
+        ProjectedGaussians Rendering RasterOptions TrainingDiverged camera_extent pinhole_cameras composite
+        drop_gaussian load_ply project rasterization save_ply
+    """,
+    "kgs.losses": "TargetMoments photometric_loss target_moments",
+    "kgs.datasets": "Scene Views load_scene synthetic_scene",
+    "kgs.fit": """
+        Fit FitConfig InitialPoints Plan Trainer choose_points fit_scene initial_points make_plan measure
+    """,
+    "kgs.reference": "Layers layers render",
 }
-PUBLIC = [(module, name) for module, names in INVENTORY.items() for name in names]
 
 
 @pytest.mark.parametrize("module", INVENTORY)
 def test_inventory(module):
-    assert sorted(importlib.import_module(module).__all__) == sorted(INVENTORY[module])
+    assert sorted(importlib.import_module(module).__all__) == sorted(INVENTORY[module].split())
 
 
 @pytest.mark.parametrize("package", ["kgs", "kgs.losses", "kgs.datasets", "kgs.fit"])
@@ -93,18 +66,6 @@ assert pickle.loads(pickle.dumps(kgs.GaussianRenderer)) is kgs.GaussianRenderer
 
 def test_names_are_loaded_when_they_are_asked_for():
     subprocess.run([sys.executable, "-c", LAZY], cwd=ROOT, check=True)
-
-
-@pytest.mark.parametrize(("module", "name"), PUBLIC)
-def test_public_names_exist_and_are_described(module, name):
-    value = getattr(importlib.import_module(module), name)
-    assert value.__module__.startswith("kgs")
-    assert (value.__doc__ or "").strip(), f"{module}.{name} has no docstring"
-    assert not value.__doc__.startswith(f"{name}("), f"{module}.{name} has only what dataclass writes"
-    if inspect.isclass(value):
-        for method_name, method in vars(value).items():
-            public = not method_name.startswith("_") and inspect.isfunction(method)
-            assert not public or (method.__doc__ or "").strip(), f"{module}.{name}.{method_name} has no docstring"
 
 
 def test_the_version_is_the_one_that_is_installed():
@@ -193,13 +154,3 @@ def test_the_values_that_flow_are_frozen():
         assert made.__dataclass_params__.frozen
     assert {"image", "alpha", "depth", "projected"} <= {field.name for field in dataclasses.fields(kgs.Rendering)}
     assert math.isclose(kgs.GaussianRenderer().options.alpha_threshold, 1 / 255)
-
-
-def test_progress_is_one_until_it_is_set():
-    drop = kgs.DropGaussian()
-    assert drop.progress == 1.0
-    assert "progress=1.0 (never set)" in repr(drop)
-    drop.progress = 0.25
-    assert drop.progress == 0.25
-    assert drop.rate == 0.05
-    assert not drop.state_dict()
