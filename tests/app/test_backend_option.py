@@ -51,7 +51,7 @@ def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
         backends.resolve("numba", cpu)
 
 
-@pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch"), ("numba", "numba")])
+@pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch")])
 def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, monkeypatch, asked, made):
     monkeypatch.setattr(SceneRequest, "load", lambda *_: scene)
     published = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, SceneRequest("somewhere"))

@@ -201,15 +201,3 @@ def test_photos_become_a_page(app, tmp_path):
     assert text.endswith("Done."), text
     assert len(files) == len(app.RESULTS) - 1  # one film
     assert "01-IMG-1" in frame
-
-
-@pytest.mark.slow
-def test_one_photo_three_times_is_refused_with_advice(app, tmp_path):
-    pytest.importorskip("pycolmap")
-    first, *others = sorted(write_planes(tmp_path / "uploads").iterdir())
-    for other in others:
-        other.write_bytes(first.read_bytes())
-    text, *_ = list(app.make(list(map(str, [first, *others]))))[-1]
-    assert "kgs: photos" in text
-    assert "No page was made" in text
-    assert str(tmp_path) not in text

@@ -64,11 +64,6 @@ def test_plain_is_paper_without_dropping():
     assert PRESETS["plain"].drop == 0
 
 
-def test_config_survives_json():
-    config = FitConfig(steps=300, drop=0.1, seed=4, recipe=Recipe(dssim_weight=0.3))
-    assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-
-
 WRONG = {
     "steps": (0, True, 2.0, "3", 10**8, 10**400, np.bool_(True)),
     "drop": (1.0, -0.1, math.nan, None, "0.2", True),
@@ -104,15 +99,11 @@ def test_a_reset_may_not_remove_everything():
 
 
 def test_numpys_numbers_and_paths_as_text_become_pythons():
-    config = FitConfig(steps=np.int64(7), drop=np.float32(0.5), max_gaussians=np.int32(9), init="file", init_file="a")
+    numbers = {"steps": np.int64(7), "drop": np.float32(0.5), "max_gaussians": np.int32(9)}
+    config = FitConfig(**numbers, init="file", init_file="a", recipe=Recipe(dssim_weight=0.3))
     assert [type(x) for x in (config.steps, config.drop, config.max_gaussians)] == [int, float, int]
     assert config.init_file == Path("a")
     assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-
-
-def test_unknown_entry_is_refused():
-    with pytest.raises(ValueError, match="FitConfig"):
-        FitConfig.from_dict({"stepz": 3})
 
 
 def test_the_coarse_share_is_counted_in_steps():
@@ -141,12 +132,6 @@ def test_a_degree_changes_the_timetable_and_says_why():
     assert (plan.config.sh_degree, len(plan.times.sh)) == (2, 2)
     assert plan.needs == {"sh_degree": {"by": "rule"}}
     assert (first.config.sh_degree, first.times.sh, first.needs) == (None, (), {})
-
-
-@pytest.mark.parametrize("device", ["foo", "meta", "cuda:99"])
-def test_a_device_that_is_not_there_is_refused_by_the_plan(device):
-    with pytest.raises(ValueError, match="^device: expected"):
-        make_plan(SCENE, FitConfig(device=device))
 
 
 def test_more_gaussians_or_pixels_take_more_memory():

@@ -60,7 +60,7 @@ def test_a_pixel_without_depth_is_not_shown():
 @pytest.fixture(scope="module")
 def fit():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
-    config = FitConfig(steps=30, sh_degree=0, init="sift", evaluations=1)
+    config = FitConfig(steps=5, sh_degree=0, init="random", init_points=2000, evaluations=1)
     return Trainer(scene, make_plan(scene, config), choose_points(scene, config)).fit()
 
 
