@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_cli import run
+from command import run
 
 from kgs import DataError, backends
 from kgs.app.files.results_folder import CHECKPOINT

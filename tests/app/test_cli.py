@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tyro
+from command import one_line, run
 from tiny_scenes import write_colmap
 
 import kgs
@@ -24,12 +25,6 @@ from kgs.fit.config import DETAILS, PAPER, FitConfig
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
-
-
-def run(*arguments):
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(argument) for argument in arguments])
-    return stop.value.code
 
 
 @pytest.fixture(scope="module")
@@ -109,13 +104,6 @@ def test_resume_of_a_finished_fit_changes_nothing_and_with_other_numbers_is_refu
     assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--seed", 1, *FIT, "--resume") == 2
     assert "--seed: expected 0" in one_line(capsys)
     assert (fitted / "splat.ply").read_bytes() == before
-
-
-def one_line(capsys):
-    captured = capsys.readouterr().err.strip().splitlines()
-    assert len(captured) == 1, captured
-    assert captured[0].startswith("kgs: ")
-    return captured[0]
 
 
 @pytest.fixture(scope="module")

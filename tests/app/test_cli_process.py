@@ -11,8 +11,9 @@ import time
 from importlib.machinery import PathFinder
 
 import pytest
+from command import run
 
-from kgs.app.cli import checks, main
+from kgs.app.cli import checks
 
 MAIN = "import kgs.app.cli; kgs.app.cli.main()"
 
@@ -38,10 +39,9 @@ def fit_here(folder, out, monkeypatch, *streams):
     """A fit in this process that writes to these streams: its exit code."""
     for name, stream in zip(("stdout", "stderr"), streams, strict=True):
         monkeypatch.setattr(sys, name, stream)
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(folder), "-o", str(out), *map(str, FIT)])
+    code = run("fit", folder, "-o", out, *FIT)
     monkeypatch.undo()
-    return stop.value.code
+    return code
 
 
 @pytest.mark.parametrize("listener", ["gone", "full"])
@@ -218,6 +218,5 @@ def test_ctrl_c_while_torch_is_imported_is_quiet(tmp_path):
 
 def test_ctrl_c_raises_as_usual_after_a_command():
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(SystemExit):
-        main(["nonsense"])
+    assert run("nonsense") == 2
     assert signal.getsignal(signal.SIGINT) is before

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser
+from factories import pinhole, with_camera
 from torch import Tensor
 
 from kgs import GaussianRenderer, Gaussians
 from kgs.app.files import encoders, film
 from kgs.app.files.film import tour, write_film
-from kgs.datasets.scene import Views, pinholes
+from kgs.datasets.scene import Views
 
 
 def looking_at(target: Tensor, places: Tensor) -> Tensor:
@@ -160,12 +161,11 @@ def test_cameras_at_one_place_are_no_trouble() -> None:
     assert film.paced(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
 
 
-def views_of(size: tuple[int, int]) -> Views:
-    lens = torch.eye(4).repeat(3, 1, 1)
-    lens[:, 0, 0] = lens[:, 1, 1] = 0.9 * size[1]
-    lens[:, 0, 2], lens[:, 1, 2] = (size[1] - 1) / 2, (size[0] - 1) / 2
-    names = ("a", "b", "c")
-    return Views(pinholes(lens, facing(3).float(), size), torch.zeros(3, 3, *size), names)
+def views_of(size: tuple[int, int], focal: float | None = None, poses: Tensor | None = None) -> Views:
+    focal = 0.9 * size[1] if focal is None else focal
+    poses = facing(3) if poses is None else poses
+    cameras = pinhole(*size, focal, dtype=torch.float32, cameras=3)
+    return Views(with_camera(cameras, poses.float()), torch.zeros(3, 3, *size), ("a", "b", "c"))
 
 
 def render(camera: Any) -> Tensor:
@@ -216,7 +216,7 @@ def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path,
     """Three cameras side by side before a wall; between them black Gaussians, outside of their pictures."""
     monkeypatch.setattr(film, "FRAMES", 48)
     generator = torch.Generator().manual_seed(0)
-    count, size = 3000, (36, 48)
+    count = 3000
     spread = torch.rand(count, 3, generator=generator) * 2 - 1
     wall = spread * torch.tensor([8.0, 5.0, 0.1]) + torch.tensor([0.0, 0.0, 4.0])
     between = torch.tensor([[-0.75, 0.0, 0.1], [0.75, 0.0, 0.1]])
@@ -227,13 +227,9 @@ def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path,
     colors = torch.cat([0.4 + 0.2 * torch.rand(count, 3, generator=generator), torch.zeros(2, 3)])
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
     gaussians = Gaussians(means, quats, scales, torch.full((n,), 0.9), colors)
-    lens = torch.eye(4).repeat(3, 1, 1)
-    lens[:, 0, 0] = lens[:, 1, 1] = 48.0
-    lens[:, 0, 2] = 23.5
-    lens[:, 1, 2] = 17.5
     poses = torch.eye(4).repeat(3, 1, 1)
     poses[:, 0, 3] = torch.tensor([1.5, 0.0, -1.5])
-    views = Views(pinholes(lens, poses, size), torch.zeros(3, 3, *size), ("a", "b", "c"))
+    views = views_of((36, 48), 48.0, poses)
 
     def levels(near_plane: float) -> list[float]:
         renderer = GaussianRenderer(near_plane=near_plane).eval()

@@ -35,11 +35,6 @@ CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recip
 OTHER = replace(CONFIG, seed=1)
 
 
-@pytest.fixture(scope="module")
-def scene() -> Any:
-    return synthetic_scene(train_views=3, test_views=2, size=(24, 32), seed=0)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _few_points(scene: Any, points: Any) -> Any:
     """The same initial points; and every folder's scene is the one of these tests."""
@@ -120,23 +115,22 @@ def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkey
     assert "unfinished" not in os.listdir(done)
 
 
-@pytest.mark.parametrize("failing", ["save_ply", "write_curve", "write_png", "measure", "write_json"])
-def test_results_that_cannot_be_written_leave_the_old_ones(
-    scene: Any, done: Path, monkeypatch: Any, failing: str
-) -> None:
-    plain = getattr(app, failing)
+def test_results_that_cannot_be_written_leave_the_old_ones(scene: Any, done: Path, monkeypatch: Any) -> None:
+    """And the training is not lost: each fit goes on with the results that the one before could not write."""
+    for failing in ("save_ply", "write_curve", "write_png", "measure", "write_json"):
+        plain = getattr(app, failing)
 
-    def full(path: Any, *arguments: Any, **options: Any) -> Any:
-        if failing == "write_json" and path.name != "metrics.json":
-            return plain(path, *arguments, **options)
-        raise OSError(28, "No space left on device")
+        def full(path: Any, *arguments: Any, failing: str = failing, plain: Any = plain, **options: Any) -> Any:
+            if failing == "write_json" and path.name != "metrics.json":
+                return plain(path, *arguments, **options)
+            raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(app, failing, full)
-    with pytest.raises(OSError, match="space"):
-        fit(scene, OTHER, done)
-    assert seed_of(done) == 0
-    monkeypatch.undo()
-    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 3"  # the training is not lost
+        with monkeypatch.context() as patch:
+            patch.setattr(app, failing, full)
+            with pytest.raises(OSError, match="space"):
+                fit(scene, OTHER, done, resume=failing != "save_ply")
+        assert seed_of(done) == 0, failing
+    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 3"
     assert seed_of(done) == 1
 
 

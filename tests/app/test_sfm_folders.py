@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
-from kgs.app.cli import main
 from kgs.app.cli.unposed import settle
 from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import record
@@ -34,9 +34,7 @@ def refused(capsys):
 
     def run(folder, *parts, out=None, code=2, kept=False, options=()):
         place = out or folder.parent / "out"
-        with pytest.raises(SystemExit) as stop:
-            main(["fit", str(folder), "-o", str(place), *options])
-        assert stop.value.code == code
+        assert command("fit", folder, "-o", place, *options) == code
         assert kept or not [path.name for path in place.glob("*photos*")]
         text = capsys.readouterr().err
         assert "Traceback" not in text
@@ -360,8 +358,8 @@ def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
 @pytest.mark.slow
 def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
     save(folder, [cv2.resize(image, (1600, 1200)) for image in planes()])
-    command = [sys.executable, "-c", "import kgs.app.cli; kgs.app.cli.main()", "fit", folder, "-o", tmp_path / "out"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    words = [sys.executable, "-c", "import kgs.app.cli; kgs.app.cli.main()", "fit", folder, "-o", tmp_path / "out"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         lines = iter(process.stderr.readline, "")
         assert any(line.startswith("keypoints: ") for line in lines)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does

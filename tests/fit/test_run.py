@@ -15,7 +15,6 @@ from kgs.app import fit_folder as app
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import Published, train
 from kgs.app.scene_request import SceneRequest
-from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
@@ -23,11 +22,6 @@ from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 
 CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
-
-
-@pytest.fixture(scope="module")
-def scene() -> Any:
-    return synthetic_scene(train_views=3, test_views=1, size=(24, 32), seed=0)
 
 
 @pytest.fixture(scope="module", autouse=True)
