@@ -68,6 +68,7 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert "3 training and 8 test photos of 32 × 24 pixels" in text
     assert "6 of 8 test photos." in text
     assert text.count('class="render"') == 6
+    assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
     assert f"{json.loads((out / 'metrics.json').read_text(encoding='utf-8'))['test']['psnr']:.2f}" in text
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
     assert facts["points in a photo"] == "70 to 90"
@@ -177,11 +178,6 @@ def test_eval_adds_lpips_to_measures_and_page(done: Path, monkeypatch: Any, caps
             assert row["psnr"] == old["psnr"]
     assert f"LPIPS {after['test']['lpips_vgg']:.4g}" in capsys.readouterr().out
     assert ">LPIPS</th>" in (done / "index.html").read_text(encoding="utf-8")
-
-
-def test_pictures_are_spread_over_the_views() -> None:
-    assert spread(3, 6) == [0, 1, 2]
-    assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
 
 
 def flat_views(masks: Any = None, light: Any = None) -> Views:

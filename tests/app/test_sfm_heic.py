@@ -67,9 +67,8 @@ def test_a_damaged_one_is_named(folder, end):
 
 
 def test_a_bomb_is_not_decoded(folder, monkeypatch):
-    monkeypatch.setattr(pi_heif.HeifImageFile, "size", (2**15, 2**15))
-    monkeypatch.setattr(pi_heif.HeifImageFile, "width", 2**15)
-    monkeypatch.setattr(pi_heif.HeifImageFile, "height", 2**15)
+    for name, value in (("size", (2**15, 2**15)), ("width", 2**15), ("height", 2**15)):
+        monkeypatch.setattr(pi_heif.HeifImageFile, name, value)
     with pytest.raises(DataError, match="32768x32768 pixels in 71[456] bytes: a decompression bomb"):
         read_photos(open_photos(find_photos(folder)), silent)
 
