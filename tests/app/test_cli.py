@@ -123,20 +123,24 @@ def small(tmp_path_factory):
         ("fit {scene} -o {out} --device cuda:99", "--device: expected"),
         ("fit {scene} -o {scene}", "holds files of a scene"),
         ("fit {scene} -o {scene}/transforms_train.json", "expected a folder for results"),
+        ("fit {scene} -o {out} --size 48 --downscale 2", "--size: expected either"),
         ("fit {scene} -o {out} --size 31", "--size: expected at least 32 pixels"),
         ("fit {scene} -o {out} --roll 400", "--roll: expected"),
         ("fit {scene} -o {out} --downscale 2", "--downscale: expected at least 32 pixels, got photos"),
         ("fit {scene} --views 3", "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o "),
         ("fit {small} -o {out}", "{small}: images: expected at least 32 pixels"),
         ("demo -o {out} --device foo", "--device: expected"),
+        ("demo -o {out} --size 11 40", "--size: expected"),
         ("demo -o {scene}", "holds files of a scene"),
         ("eval {scene} --lpips-weights {missing}", "missing"),
+        ("eval {scene}", "config.json"),
         ("eval {scene} --device foo", "--device: expected"),
         ("render {file} --cameras {scene} -o {out} --downscale 0.5", "--downscale: expected"),
         ("render {file} --cameras {scene} -o {scene}/train", "holds files of a scene"),
         ("render {file} --cameras {scene} -o {out} --device foo", "--device: expected"),
         ("render {file} --cameras {scene}", " -o transforms_train-render"),
         ("page {missing} --cameras {scene} -o {scene}.html", "missing"),
+        ("page {file} --cameras {scene} -o {out}", "--out: expected a file that ends in .html"),
         ("nonsense", "one of demo, fit, render, eval, page, check, bench, study, got 'nonsense'"),
         ("bench nonsense", "one of speed, precision, extremes, got"),
         ("bench sped", "did you mean speed?"),
@@ -283,10 +287,11 @@ def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, cap
     assert f"open {tmp_path / 'index.html'} in a browser" in said.out
 
 
-def test_a_command_line_without_tyro_is_one_line(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tyro", None)
+@pytest.mark.parametrize("package", ["tyro", "matplotlib"])
+def test_a_missing_extra_is_one_line_before_any_work(folder, tmp_path, package, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
     assert run("fit", folder, "-o", tmp_path / "out") == 2
-    assert 'tyro is missing: run pip install -e ".[app]"' in one_line(capsys)
+    assert f'{package} is missing: run pip install -e ".[app]"' in one_line(capsys)
     assert not (tmp_path / "out").exists()
 
 

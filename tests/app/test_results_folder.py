@@ -316,6 +316,14 @@ def test_a_damaged_checkpoint_of_a_fit_does_not_stand_in_the_way(scene: Any, don
     assert seed_of(done) == 1
 
 
+@pytest.mark.parametrize("place", ["file/out", "/proc/kgs"])
+def test_a_folder_that_cannot_be_written_to_is_refused_first(scene: Any, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DataError, match="expected a folder"):
+        fit(scene, CONFIG, tmp_path / place)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected at least 6x6 pixels, got 5x5"):
         fit(synthetic_scene(train_views=2, size=(5, 5)), CONFIG, tmp_path / "out")

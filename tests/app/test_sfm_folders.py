@@ -73,7 +73,7 @@ FOLDERS = {  # what is in them, and what is said of it
     "two": (lambda at: save(at, planes()[:2]), ("at least 3 photos, found 2", "Take 3 to 12")),
     "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it do: DCIM",)),
     "too deep, with cameras": (
-        lambda at: (save(at / "images", planes()), save(at, [], transform_train_json=b"{}")),
+        lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
         ("these folders in it do: images", "transform_train.json is not used"),
     ),
     "raw": (

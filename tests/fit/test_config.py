@@ -16,20 +16,17 @@ from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
 from kgs.fit.plan import expected_memory, make_plan, most_gaussians, timetable, with_pace
 
 
-def test_full_length_is_the_release():
-    times = timetable(replace(PAPER, steps=10_000))
-    assert times.sh == (1000, 2000, 3000)
-    assert times.densify == tuple(range(600, 10_000, 100))
-    assert len(times.densify) == 94
-    assert times.reset == (3000, 6000, 9000)
-
-
-def test_short_fit_scales_counts():
-    times = timetable(replace(PAPER, steps=2000))
-    assert times.sh == (200, 400, 600)
-    assert times.densify == tuple(range(200, 2000, 100))  # on as much evidence as the recipe, see timetable
-    assert times.reset == (600, 1200)
-    assert times.evaluate[-1] == 2000
+@pytest.mark.parametrize(
+    ("steps", "sh", "densify", "reset"),
+    [
+        (10_000, (1000, 2000, 3000), range(600, 10_000, 100), (3000, 6000, 9000)),  # the release
+        (2000, (200, 400, 600), range(200, 2000, 100), (600, 1200)),  # on as much evidence, see timetable
+    ],
+)
+def test_a_short_fit_scales_the_counts_of_the_release(steps, sh, densify, reset):
+    times = timetable(replace(PAPER, steps=steps))
+    assert (times.sh, times.densify, times.reset) == (sh, tuple(densify), reset)
+    assert times.evaluate[-1] == steps
 
 
 @pytest.mark.parametrize("steps", [1, 7, 100, 999])

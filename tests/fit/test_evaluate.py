@@ -66,10 +66,17 @@ def test_flat_difference_has_its_closed_form():
     assert result["ssim"] == pytest.approx((2 * 0.5 * 0.6 + 1e-4) / (0.25 + 0.36 + 1e-4), abs=2e-4)
 
 
-def test_renders_are_clamped_before_they_are_measured():
+def test_renders_are_clamped_before_they_are_measured_and_record_no_gradient():
     views = random_views(count=1)
-    render = distort(views.images, amount=0.5)
-    assert evaluate(renderer_of(render), views) == evaluate(renderer_of(render.clamp(0, 1)), views)
+    rendered = distort(views.images, amount=0.5)
+    recorded = []
+
+    def render(camera):
+        recorded.append(torch.is_grad_enabled())
+        return rendered
+
+    assert evaluate(render, views) == evaluate(renderer_of(rendered.clamp(0, 1)), views)
+    assert recorded == [False]
 
 
 def test_result_can_go_to_json_and_an_infinite_psnr_is_none():
@@ -98,18 +105,6 @@ def test_lpips_is_measured_in_both_scalings():
     assert result["lpips_vgg"] == pytest.approx(lpips(render, views.images).item())
     assert result["lpips_vgg_unscaled"] == pytest.approx(lpips(render, views.images, rescale=False).item())
     assert result["lpips_vgg"] != pytest.approx(result["lpips_vgg_unscaled"])
-
-
-def test_no_gradient_is_recorded():
-    views = random_views(count=1)
-    recorded = []
-
-    def render(camera):
-        recorded.append(torch.is_grad_enabled())
-        return views.images
-
-    evaluate(render, views)
-    assert recorded == [False]
 
 
 def test_float64_renders_are_measured():

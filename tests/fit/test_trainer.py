@@ -86,10 +86,6 @@ def test_harmonics_come_one_degree_after_the_other(scene, points):
     assert [degrees.index(degree) + 1 for degree in (1, 2, 3)] == list(trainer.plan.times.sh)
 
 
-def test_gaussians_were_added_on_the_way(whole, points):
-    assert len(whole.model) > len(points.points)
-
-
 def test_another_seed_other_bits(each_backend, scene, points):
     means = []
     for seed in (5, 6):
@@ -103,6 +99,7 @@ def test_with_and_without_drop_see_the_same_views(scene, points):
     orders = []
     for drop in (0.0, 0.5):
         trainer = begun(scene, points, drop=drop)
+        assert (trainer.state.drop is None) == (drop == 0.0)
         orders.append([trainer._next_view() for _ in range(20)])
     assert orders[0] == orders[1]
 
@@ -159,7 +156,7 @@ def test_a_limit_that_leaves_no_room_holds_and_is_said_once(scene, points):
 
 
 def test_the_usual_limit_is_reached_without_a_word(whole, points):
-    assert len(whole.model) == 10 * CONFIG.steps
+    assert len(whole.model) == 10 * CONFIG.steps > len(points.points)
     assert whole.state.notes == []
 
 
@@ -239,11 +236,6 @@ def test_the_memory_budget_reaches_the_renderer(scene, points):
     small = begun(scene, points, max_bytes=1000)
     with pytest.raises(ValueError, match="max_bytes"):
         small.fit()
-
-
-def test_a_dropped_layer_is_absent_at_rate_zero(scene, points):
-    trainer = begun(scene, points, drop=0.0)
-    assert trainer.state.drop is None
 
 
 def test_the_rate_follows_the_papers_schedule(scene, points):
