@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_cli import one_line, run
+from command import run
 
 from kgs import DataError, backends
 from kgs.app.files.results_folder import CHECKPOINT
@@ -51,7 +51,7 @@ def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
         backends.resolve("numba", cpu)
 
 
-@pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch"), ("numba", "numba")])
+@pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch")])
 def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, monkeypatch, asked, made):
     monkeypatch.setattr(SceneRequest, "load", lambda *_: scene)
     published = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, SceneRequest("somewhere"))
@@ -74,17 +74,6 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
         assert (resumed.plan.backend, resumed.renderer.backend) == (begun, begun)
     with pytest.raises(DataError, match=f"backend: expected '{begun}', as the fit was begun with, got '{other}'"):
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
-
-
-@pytest.mark.parametrize(
-    "words", [["fit", "{scene}"], ["demo"], ["render", "{scene}/transforms_train.json", "--cameras", "{scene}"]]
-)
-def test_numba_that_is_not_installed_is_one_line_before_any_work(installed, folder, tmp_path, capsys, words):
-    installed(False)
-    words = [word.format(scene=folder) for word in words]
-    assert run(*words, "-o", tmp_path / "out", "--backend", "numba") == 2
-    assert 'numba is missing: run pip install -e ".[fast]"' in one_line(capsys)
-    assert not (tmp_path / "out").exists()
 
 
 def test_versions_say_where_numba_is_missing(monkeypatch, capsys):

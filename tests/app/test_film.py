@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser
+from factories import pinhole, with_camera
 from torch import Tensor
 
 from kgs import GaussianRenderer, Gaussians
 from kgs.app.files import encoders, film
 from kgs.app.files.film import tour, write_film
-from kgs.datasets.scene import Views, pinholes
+from kgs.datasets.scene import Views
 
 
 def looking_at(target: Tensor, places: Tensor) -> Tensor:
@@ -75,8 +76,11 @@ PATHS = {
 
 
 @pytest.mark.parametrize("poses", PATHS.values(), ids=PATHS)
-def test_the_path_passes_each_camera_and_is_smooth(poses: Tensor) -> None:
+def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) -> None:
     path = tour(poses, evenly(2000), 1.0)
+    if "6 facing" in request.node.name:  # cameras side by side are never left
+        assert (centers(path) >= centers(poses).amin(0) - 1e-9).all()
+        assert (centers(path) <= centers(poses).amax(0) + 1e-9).all()
     for pose in poses:
         nearest = int((path - pose).abs().amax((1, 2)).argmin())
         assert (centers(path)[nearest] - centers(pose[None])[0]).norm() < 0.02
@@ -99,13 +103,6 @@ def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
     assert (-(path[:, 2, :3] * places).sum(1) / radii > 0.999).all()
     turned = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
     assert min(turned.sum(), (2 * math.pi - turned).sum()) < 2 * math.pi  # once around
-
-
-def test_cameras_side_by_side_are_never_left() -> None:
-    poses = facing(6)
-    places = centers(tour(poses, evenly(300), 1.0))
-    assert (places >= centers(poses).amin(0) - 1e-9).all()
-    assert (places <= centers(poses).amax(0) + 1e-9).all()
 
 
 @pytest.mark.parametrize("poses", [*PATHS.values(), ring(12), ring(7)[:1]], ids=[*PATHS, "ring of 12", "1"])
@@ -164,12 +161,11 @@ def test_cameras_at_one_place_are_no_trouble() -> None:
     assert film.paced(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
 
 
-def views_of(size: tuple[int, int]) -> Views:
-    lens = torch.eye(4).repeat(3, 1, 1)
-    lens[:, 0, 0] = lens[:, 1, 1] = 0.9 * size[1]
-    lens[:, 0, 2], lens[:, 1, 2] = (size[1] - 1) / 2, (size[0] - 1) / 2
-    names = ("a", "b", "c")
-    return Views(pinholes(lens, facing(3).float(), size), torch.zeros(3, 3, *size), names)
+def views_of(size: tuple[int, int], focal: float | None = None, poses: Tensor | None = None) -> Views:
+    focal = 0.9 * size[1] if focal is None else focal
+    poses = facing(3) if poses is None else poses
+    cameras = pinhole(*size, focal, dtype=torch.float32, cameras=3)
+    return Views(with_camera(cameras, poses.float()), torch.zeros(3, 3, *size), ("a", "b", "c"))
 
 
 def render(camera: Any) -> Tensor:
@@ -220,7 +216,7 @@ def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path,
     """Three cameras side by side before a wall; between them black Gaussians, outside of their pictures."""
     monkeypatch.setattr(film, "FRAMES", 48)
     generator = torch.Generator().manual_seed(0)
-    count, size = 3000, (36, 48)
+    count = 3000
     spread = torch.rand(count, 3, generator=generator) * 2 - 1
     wall = spread * torch.tensor([8.0, 5.0, 0.1]) + torch.tensor([0.0, 0.0, 4.0])
     between = torch.tensor([[-0.75, 0.0, 0.1], [0.75, 0.0, 0.1]])
@@ -231,13 +227,9 @@ def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path,
     colors = torch.cat([0.4 + 0.2 * torch.rand(count, 3, generator=generator), torch.zeros(2, 3)])
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
     gaussians = Gaussians(means, quats, scales, torch.full((n,), 0.9), colors)
-    lens = torch.eye(4).repeat(3, 1, 1)
-    lens[:, 0, 0] = lens[:, 1, 1] = 48.0
-    lens[:, 0, 2] = 23.5
-    lens[:, 1, 2] = 17.5
     poses = torch.eye(4).repeat(3, 1, 1)
     poses[:, 0, 3] = torch.tensor([1.5, 0.0, -1.5])
-    views = Views(pinholes(lens, poses, size), torch.zeros(3, 3, *size), ("a", "b", "c"))
+    views = views_of((36, 48), 48.0, poses)
 
     def levels(near_plane: float) -> list[float]:
         renderer = GaussianRenderer(near_plane=near_plane).eval()
@@ -339,10 +331,8 @@ def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.delenv(encoders.ASKED, raising=False)
     assert encoders.film_suffix() == (".webm", "")
     monkeypatch.setenv(encoders.ASKED, "libx264")
-    assert encoders.film_suffix() == (".webm", "no film as MP4: KGS_H264=libx264 needs PyAV (pip install av)")
-    assert (
-        write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0) == "no a.mp4: there is no encoder of H.264 here"
-    )
+    assert encoders.film_suffix()[0] == ".webm"
+    assert write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0).startswith("no a.mp4: ")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -352,24 +342,26 @@ def test_an_encoder_of_something_else_is_none(monkeypatch: Any, name: str) -> No
     monkeypatch.setenv(encoders.ASKED, name)
     suffix, note = encoders.film_suffix()
     assert suffix == ".webm"
-    assert f"has no encoder KGS_H264={name} that works" in note
+    assert name in note
 
 
-def test_an_encoder_that_fails_leaves_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
+@pytest.mark.parametrize(
+    ("name", "broken", "reason"),
+    [("a.mp4", "av.open", "no a.mp4: libx264: "), ("a.webm", "cv2.VideoWriter.fourcc", "this OpenCV writes no WebM")],
+)
+def test_an_encoder_that_fails_leaves_a_reason_and_no_file(
+    tmp_path: Path, monkeypatch: Any, name: str, broken: str, reason: str
+) -> None:
     av = pytest.importorskip("av")
     monkeypatch.setenv(encoders.ASKED, "libx264")
 
-    def failing(*_: Any, **__: Any) -> None:
-        raise av.error.ExternalError(1, "no session left")
+    def failing(*_: Any, **__: Any) -> int:
+        if broken == "av.open":
+            raise av.error.ExternalError(1, "no session left")
+        return 0
 
-    monkeypatch.setattr(av, "open", failing)
-    assert "no a.mp4: libx264: " in write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_without_a_codec_there_is_a_reason_and_no_file(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(encoders.cv2.VideoWriter, "fourcc", lambda *_: 0)
-    assert "this OpenCV writes no WebM" in write_film(tmp_path / "film.webm", render, views_of((12, 16)), 1.0)
+    monkeypatch.setattr(broken, failing)
+    assert reason in write_film(tmp_path / name, render, views_of((12, 16)), 1.0)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -22,7 +22,6 @@ from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Views, synthetic_scene
 from kgs.fit.config import FitConfig
-from kgs.init_points import InitialPoints
 from kgs.metrics.lpips import Lpips
 
 CONFIG = FitConfig(steps=3, evaluations=2, max_gaussians=300, sh_degree=0)
@@ -38,14 +37,13 @@ REPORT = {
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: Any) -> Any:
+def fitted(points: Any, tmp_path_factory: Any) -> Any:
     """A folder, and the fit in it."""
     out = tmp_path_factory.mktemp("fitted")
     scene = replace(synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0), root=out)
-    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "choose_points", lambda *_: InitialPoints(points, torch.full((150, 3), 0.5), "random"))
+        patch.setattr(app, "choose_points", lambda *_: points)
         return out, app.fit_folder(scene, CONFIG, out, REQUEST, say=lambda line: None).fit
 
 
@@ -70,6 +68,7 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert "3 training and 8 test photos of 32 × 24 pixels" in text
     assert "6 of 8 test photos." in text
     assert text.count('class="render"') == 6
+    assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
     assert f"{json.loads((out / 'metrics.json').read_text(encoding='utf-8'))['test']['psnr']:.2f}" in text
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
     assert facts["points in a photo"] == "70 to 90"
@@ -87,13 +86,6 @@ def test_the_cameras_of_another_scene_are_not_on_it(fitted: Any, rewritten: Any)
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", rewritten(scene=replace(fit.scene, root=out / "other"))))
     assert "blurred" not in facts
     assert "time" not in facts
-
-
-def test_measures_that_come_later_are_on_it(fitted: Any, rewritten: Any) -> None:
-    metrics = json.loads(json.dumps(fitted[1].metrics))
-    for view in (metrics["test"], *metrics["test"]["views"]):
-        view["lpips_vgg"] = 0.4321
-    assert ">LPIPS</th>" in rewritten(metrics=metrics)
 
 
 def test_without_a_photo_held_out_training_views_are_shown(fitted: Any, rewritten: Any) -> None:
@@ -123,33 +115,40 @@ def test_a_page_without_photos_shows_none(folder: Path, tmp_path: Path) -> None:
         assert "held out of the training" in text
 
 
-def test_eval_writes_it_again(folder: Path, tmp_path: Path, capsys: Any) -> None:
-    from kgs.app.cli import main
+@pytest.fixture(scope="module")
+def measured(folder: Path, tmp_path_factory: Any) -> Path:
+    """A folder with a fit of another scene, which is read again."""
+    out: Path = tmp_path_factory.mktemp("measured")
+    fit_of(folder, out, background="white", roll=90.0)
+    return out
 
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(folder), "-o", str(tmp_path), "--init", "random", "--init-points", "50", "--steps", "3"])
-    assert stop.value.code == 0
-    assert f"open {tmp_path / 'index.html'} in a browser" in capsys.readouterr().out
-    (tmp_path / "index.html").unlink()
-    evaluate(tmp_path)
-    assert (tmp_path / "index.html").stat().st_size > 50_000
+
+@pytest.fixture
+def done(measured: Path, tmp_path: Path) -> Path:
+    """A copy of it for this test alone."""
+    shutil.copytree(measured, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def test_eval_writes_it_again(done: Path, capsys: Any) -> None:
+    (done / "index.html").unlink()
+    evaluate(done)
+    assert (done / "index.html").stat().st_size > 50_000
     assert "LPIPS" not in capsys.readouterr().out
-    assert is_own(tmp_path / "index.html")
-    assert is_own(tmp_path / "metrics.json")
+    assert is_own(done / "index.html")
+    assert is_own(done / "metrics.json")
 
 
-def test_eval_keeps_a_page_that_the_user_changed(folder: Path, tmp_path: Path, capsys: Any) -> None:
-    fit_of(folder, tmp_path)
-    (tmp_path / "index.html").write_text("mine")
-    evaluate(tmp_path)
-    assert (tmp_path / "index.html").read_text(encoding="utf-8") == "mine"
+def test_eval_keeps_a_page_that_the_user_changed(done: Path, capsys: Any) -> None:
+    (done / "index.html").write_text("mine")
+    evaluate(done)
+    assert (done / "index.html").read_text(encoding="utf-8") == "mine"
     assert "index.html was not written by kgs" in capsys.readouterr().out
-    assert not is_own(tmp_path / "index.html")
+    assert not is_own(done / "index.html")
 
 
-def test_the_scene_and_the_fit_come_back(folder: Path, tmp_path: Path) -> None:
-    fit_of(folder, tmp_path, background="white", roll=90.0)
-    request, fit = load_fit(tmp_path)
+def test_the_scene_and_the_fit_come_back(folder: Path, measured: Path) -> None:
+    request, fit = load_fit(measured)
     assert request == SceneRequest(str(folder), 3, background="white", roll=90.0)
     assert fit.scene.background.tolist() == [1.0, 1.0, 1.0]
     assert fit.psnr(fit.scene.test) == pytest.approx(fit.metrics["test"]["psnr"], abs=1e-4)
@@ -167,24 +166,18 @@ class Half:
         return (image - target).abs().mean() * (1.0 if rescale else 0.5)
 
 
-def test_eval_adds_lpips_to_measures_and_page(folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
-    fit_of(folder, tmp_path)
-    before = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
+def test_eval_adds_lpips_to_measures_and_page(done: Path, monkeypatch: Any, capsys: Any) -> None:
+    before = json.loads((done / "metrics.json").read_text(encoding="utf-8"))
     monkeypatch.setattr(Lpips, "load", lambda weights: Half())
-    evaluate(tmp_path, lpips_weights=tmp_path)
-    after = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
+    evaluate(done, lpips_weights=done)
+    after = json.loads((done / "metrics.json").read_text(encoding="utf-8"))
     for part in ("test", "train"):
         for row, old in zip([after[part], *after[part]["views"]], [before[part], *before[part]["views"]], strict=True):
             assert row["lpips_vgg"] > 0
             assert row["lpips_vgg"] == pytest.approx(2 * row["lpips_vgg_unscaled"])
             assert row["psnr"] == old["psnr"]
     assert f"LPIPS {after['test']['lpips_vgg']:.4g}" in capsys.readouterr().out
-    assert ">LPIPS</th>" in (tmp_path / "index.html").read_text(encoding="utf-8")
-
-
-def test_pictures_are_spread_over_the_views() -> None:
-    assert spread(3, 6) == [0, 1, 2]
-    assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
+    assert ">LPIPS</th>" in (done / "index.html").read_text(encoding="utf-8")
 
 
 def flat_views(masks: Any = None, light: Any = None) -> Views:

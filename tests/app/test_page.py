@@ -81,12 +81,6 @@ def test_names_that_are_no_utf8_are_shown_with_escapes(tmp_path: Path) -> None:
     assert "\\udcff.jpg" in text
 
 
-def test_a_picture_without_a_render_has_no_slider(tmp_path: Path) -> None:
-    text = write(tmp_path / "index.html", pictures=[Picture(NAMES[0], torch.rand(3, *SIZE))])
-    assert 'class="over"' in text
-    assert 'type="range"' not in text
-
-
 def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
     path = tmp_path / "index.html"
     text = write(path)
@@ -99,10 +93,13 @@ def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
         write(path, most_bytes=10_000)
 
 
-def test_exif_is_spoken_of_where_there_are_photos(tmp_path: Path) -> None:
+def test_a_photo_without_a_render_has_words_on_exif_and_no_slider(tmp_path: Path) -> None:
     words = "its photos contain no Exif data"
     assert words not in write(tmp_path / "index.html")
-    assert words in write(tmp_path / "index.html", pictures=[Picture(NAMES[0], torch.rand(3, *SIZE))])
+    text = write(tmp_path / "index.html", pictures=[Picture(NAMES[0], torch.rand(3, *SIZE))])
+    assert words in text
+    assert 'class="over"' in text
+    assert 'type="range"' not in text  # no slider without a render
 
 
 def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
@@ -154,44 +151,29 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("runs", "expected"),
     [
-        ({"": {"test": views(20.0, 24.0)}}, "PSNR on 2 photos held out of the training: 22.0 dB, that is clearly the"),
-        (
-            {"off": {"test": views(20.0)}, "on": {"test": views(30.0)}},
-            "1 photo held out of the training: 20.0 dB off, 3",
-        ),
-        (
-            {"": {"train": views(33.0)}},
-            "was not measured (kgs fit with --hold-out 8 measures it). PSNR on the 1 photo it",
-        ),
-        ({"": {"train": views(10.0)}}, "10.0 dB, that is recognisable, with large errors."),
+        ({"": {"test": views(20.0, 24.0)}}, "PSNR on 2 photos held out of the training: 22.0 dB"),
+        ({"off": {"test": views(20.0)}, "on": {"test": views(30.0)}}, "1 photo held out of the training: 20.0 dB off"),
+        ({"": {"train": views(33.0)}}, "was not measured (kgs fit with --hold-out 8 measures it)"),
         ({"": {"train": views(4.9)}}, "4.9 dB, that is not the scene of the photos."),
         ({"": {"views": views(27.0)}}, "PSNR on 1 photo: 27.0 dB, that is close to the photos"),
-        ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "training: not measured."),
+        ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "not measured."),
     ],
 )
 def test_one_sentence_says_how_good_it_is(runs: Any, expected: str) -> None:
     assert expected in verdict(runs)
-
-
-def test_without_measures_nothing_is_said() -> None:
     assert verdict({}) == verdict({"": {"test": None}}) == ""
 
 
 def test_a_film_is_left_out_before_anything_of_the_splat(tmp_path: Path) -> None:
     path, film = tmp_path / "index.html", bytes(20_000)
-    tag = '<video controls loop muted playsinline src="data:video/webm;base64,AAAA'
     assert "<video" not in write(path)
     bare = len(path.read_bytes())
-    assert tag in write(path, film=film)
+    for start, kind in ((b"\0\0\0\x20ftypisom", "mp4"), (b"\x1aE\xdf\xa3", "webm"), (b"", "webm")):
+        assert f'src="data:video/{kind};base64,' in write(path, film=start + film)
     text = write(path, film=film, most_bytes=bare + 20_000)  # base64 makes 27 000 of them
     assert "<video" not in text
     assert "This page shows" not in text
     assert "<video" not in write(path, film=bytes(1_100_001))
-
-
-def test_the_kind_of_a_film_is_told_by_its_first_bytes(tmp_path: Path) -> None:
-    assert 'src="data:video/mp4;base64,' in write(tmp_path / "a.html", film=b"\0\0\0\x20ftypisom" + bytes(200))
-    assert 'src="data:video/webm;base64,' in write(tmp_path / "a.html", film=b"\x1aE\xdf\xa3" + bytes(200))
 
 
 def test_curves_stay_in_their_picture() -> None:

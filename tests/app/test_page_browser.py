@@ -97,17 +97,55 @@ def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
     return path
 
 
+@pytest.fixture
+def opened(browser: Browser, page: Path) -> Browser:
+    """The page, just loaded, on a screen of 1000 x 800 pixels."""
+    browser.size(1000, 800)
+    browser.open(page, READY)
+    return browser
+
+
 def bare_page(gaussians: Gaussians, cameras: Any, **options: Any) -> PageContent:
     """A page of four photos without pictures; `options` are those of the renderer."""
     splat = PageSplat(gaussians, BACKGROUND, RasterOptions(**options))
     return PageContent(splat, PagePhotos(cameras, list("abcd"), PARTS), PageText("a"))
 
 
-def test_it_loads_from_a_file_without_the_network_or_an_error(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    assert [url for url in browser.requests if not url.startswith("data:")] == [page.as_uri()]
-    assert browser.problems == []
+def test_it_and_its_film_load_from_a_file_without_the_network_or_an_error(opened: Browser, page: Path) -> None:
+    film = "document.querySelector('video')"
+    opened.wait(f"{film}.readyState >= 2")
+    assert opened.run(f"[{film}.videoWidth, {film}.videoHeight]") == [SIZE[1], SIZE[0]]
+    assert opened.run(f"{film}.duration") == pytest.approx(films.FRAMES / films.RATE, abs=0.01)
+    assert [url for url in opened.requests if not url.startswith("data:")] == [page.as_uri()]
+    assert opened.problems == []
+
+
+def box(browser: Browser, selector: str = ".viewer canvas") -> Any:
+    """Left, top, width and height of what a selector finds."""
+    rectangle = f"document.querySelector('{selector}').getBoundingClientRect()"
+    return browser.run(f"(({{ x, y, width, height }}) => [x, y, width, height])({rectangle})")
+
+
+def middle(browser: Browser) -> tuple[float, float]:
+    """Of the canvas."""
+    left, top, width, height = box(browser)
+    return left + width / 2, top + height / 2
+
+
+def stage_size(browser: Browser) -> Any:
+    """Width and height within the border of the stage."""
+    return browser.run(
+        "(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(document.querySelector('.stage'))"
+    )
+
+
+def press(browser: Browser, key: str, **more: Any) -> None:
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, **more)
+
+
+def mouse(browser: Browser, kind: str, x: float, y: float, **more: Any) -> None:
+    """An event of the mouse: "Pressed", "Moved", "Released" or "Wheel"."""
+    browser.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, button="left", **more)
 
 
 def show(browser: Browser, index: int | None, width: int = SIZE[1], height: int = SIZE[0]) -> Any:
@@ -127,11 +165,9 @@ def psnr(shown: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> float:
     return -10 * math.log10(error) if error else math.inf
 
 
-def test_the_canvas_shows_what_kgs_renders(browser: Browser, page: Path, renders: Any) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
+def test_the_canvas_shows_what_kgs_renders(opened: Browser, renders: Any) -> None:
     for index, render in enumerate(renders):
-        shown, expected = show(browser, index), array(render)
+        shown, expected = show(opened, index), array(render)
         assert psnr(shown, expected) >= 38, PARTS[index]
         assert np.abs(shown - expected).max() < 0.05
 
@@ -142,10 +178,8 @@ def test_the_first_view_is_a_whole_photo_on_every_screen(
 ) -> None:
     browser.size(width, height)
     browser.open(page, READY)
-    canvas = browser.run(
-        "(() => { const box = viewer.canvas.getBoundingClientRect(); return [box.width, box.height]; })()"
-    )
-    stage = browser.run("[document.querySelector('.stage').clientWidth, document.querySelector('.stage').clientHeight]")
+    canvas = box(browser)[2:]
+    stage = stage_size(browser)
     assert canvas == pytest.approx(stage, abs=1)
     assert canvas[0] == pytest.approx(canvas[1] * SIZE[1] / SIZE[0], abs=1)
     assert canvas[1] <= 0.8 * height
@@ -154,14 +188,6 @@ def test_the_first_view_is_a_whole_photo_on_every_screen(
     shown = browser.picture(browser.run("(viewer.draw(), viewer.canvas.toDataURL())"))
     shown = cv2.resize(shown, SIZE[::-1], interpolation=cv2.INTER_AREA)
     assert psnr(shown, array(renders[CENTRAL])) >= 30
-
-
-def test_start_goes_back_to_the_first_view(browser: Browser, page: Path) -> None:
-    browser.size(1280, 900)
-    browser.open(page, READY)
-    for button in ("viewer.flyTo(3)", "document.querySelector('.start').click()"):
-        browser.run(button)
-    assert browser.run("document.querySelector('select').value") == str(CENTRAL)
 
 
 @pytest.mark.parametrize(
@@ -234,40 +260,36 @@ def camera_of(browser: Browser, lens: Any) -> Any:
 
 def drag(browser: Browser, share: float) -> None:
     """From the middle of the stage to the right, by a share of its width, in ten moves."""
-    x, y, width = browser.run(
-        "(() => { const b = viewer.canvas.getBoundingClientRect();"
-        " return [b.x + b.width / 5, b.y + b.height / 2, b.width]; })()"
-    )
-    event: dict[str, Any] = {"y": y, "button": "left", "buttons": 1}
-    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, clickCount=1, **event)
+    left, top, width, height = box(browser)
+    x = left + width / 5
+    y = top + height / 2
+    mouse(browser, "Pressed", x, y, clickCount=1, buttons=1)
     for i in range(1, 11):
-        browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + share * width * i / 10, **event)
-    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + share * width, clickCount=1, **event)
+        mouse(browser, "Moved", x + share * width * i / 10, y, buttons=1)
+    mouse(browser, "Released", x + share * width, y, clickCount=1, buttons=1)
 
 
-def test_roaming_ends_where_the_splat_leaves_the_stage(browser: Browser, page: Path) -> None:
+def test_roaming_ends_where_the_splat_leaves_the_stage(opened: Browser) -> None:
     """A third of the stage, measured on what the canvas shows before two grounds."""
-    browser.size(1000, 800)
-    browser.open(page, READY)
 
     def covered() -> float:
         shown = []
         for ground in ("[0, 0, 0]", "[1, 1, 1]"):
-            browser.run(f"viewer.renderer.settings.background = {ground}")
-            shown.append(show(browser, None))
+            opened.run(f"viewer.renderer.settings.background = {ground}")
+            shown.append(show(opened, None))
         return float(1 - (shown[1] - shown[0]).mean())
 
     for sign in (1, -1):
-        browser.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
+        opened.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
         least = min(1 / 3, covered() / 2)
-        browser.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
+        opened.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
         assert covered() >= least - 0.01
-        at_once = browser.run("viewer.eye.position")
-        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
-        assert browser.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)
-        browser.run("viewer.place(viewer.scene.first); viewer.zoom(2.5); window.start = viewer.eye.position")
-        browser.run(f"viewer.turn({0.3 * sign}, 0)")  # from farther away it turns as well
-        assert browser.run("viewer.eye.position !== start")
+        at_once = opened.run("viewer.eye.position")
+        opened.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
+        assert opened.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)
+        opened.run("viewer.place(viewer.scene.first); viewer.zoom(2.5); window.start = viewer.eye.position")
+        opened.run(f"viewer.turn({0.3 * sign}, 0)")  # from farther away it turns as well
+        assert opened.run("viewer.eye.position !== start")
 
 
 @pytest.mark.slow
@@ -307,95 +329,84 @@ def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
             assert shares[0] <= shares[1] + 0.01, (share, colour)
 
 
-def test_dragging_keys_and_pyramids_move_the_eye(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
+def test_dragging_keys_and_pyramids_move_the_eye(opened: Browser) -> None:
     eye = "JSON.stringify([viewer.eye.position, viewer.eye.rotation])"
-    views = [browser.run(eye)]
-    middle = browser.run(
-        "(() => { const b = viewer.canvas.getBoundingClientRect(); return [b.x + 300, b.y + 200]; })()"
-    )
-
-    def mouse(kind: str, x: float, **more: Any) -> None:
-        browser.call("Input.dispatchMouseEvent", type=kind, x=middle[0] + x, y=middle[1], button="left", **more)
+    views = [opened.run(eye)]
+    left, top = box(opened)[:2]
+    at = left + 300, top + 200
 
     def drag() -> None:
-        mouse("mousePressed", 0, clickCount=1, buttons=1)
-        mouse("mouseMoved", 40, buttons=1)
-        mouse("mouseReleased", 40, clickCount=1)
-        views.append(browser.run(eye))
+        mouse(opened, "Pressed", *at, clickCount=1, buttons=1)
+        mouse(opened, "Moved", at[0] + 40, at[1], buttons=1)
+        mouse(opened, "Released", at[0] + 40, at[1], clickCount=1)
+        views.append(opened.run(eye))
 
-    browser.run("document.querySelector('.pyramids').click()")
+    shown = "getComputedStyle(viewer.overlay).display !== 'none'"
+    assert not opened.run(shown)
+    opened.run("document.querySelector('.pyramids').click()")
+    assert opened.run(shown)
     drag()
-    browser.run("viewer.canvas.focus()")
+    opened.run("viewer.canvas.focus()")
     for key in ("ArrowUp", "+"):
-        browser.call("Input.dispatchKeyEvent", type="keyDown", key=key)
-        views.append(browser.run(eye))
+        press(opened, key)
+        views.append(opened.run(eye))
     assert len(set(views)) == 4
-    browser.call("Input.dispatchKeyEvent", type="keyDown", key="+", modifiers=2)  # with Ctrl: the browser's zoom
-    assert browser.run(eye) == views[-1]
+    press(opened, "+", modifiers=2)  # with Ctrl: the browser's zoom
+    assert opened.run(eye) == views[-1]
     square = "M{0} {2}L{1} {2}L{1} {3}L{0} {3}Z".format(*(x + d for x in (300, 200) for d in (-50, 50)))
-    browser.run("viewer.drawPyramids = () => {}")  # a large one stays below the pointer
-    browser.run(f"viewer.pyramids[1].setAttribute('d', '{square}')")
+    opened.run("viewer.drawPyramids = () => {}")  # a large one stays below the pointer
+    opened.run(f"viewer.pyramids[1].setAttribute('d', '{square}')")
     drag()  # on a pyramid: no click
-    mouse("mouseWheel", 0, deltaX=0, deltaY=100)
-    views.append(browser.run(eye))
+    mouse(opened, "Wheel", *at, deltaX=0, deltaY=100)
+    views.append(opened.run(eye))
     assert len(set(views)) == 6
-    mouse("mousePressed", 0, clickCount=1, buttons=1)
-    mouse("mouseReleased", 0, clickCount=1)
+    mouse(opened, "Pressed", *at, clickCount=1, buttons=1)
+    mouse(opened, "Released", *at, clickCount=1)
     there = "JSON.stringify([viewer.scene.cameras[1].position, viewer.scene.cameras[1].rotation])"
-    browser.wait(f"{eye} === {there}")
+    opened.wait(f"{eye} === {there}")
 
 
-def test_a_key_turns_the_pictures_by_a_quarter(browser: Browser, page: Path, renders: Any) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    start = show(browser, CENTRAL)
-    browser.run("viewer.canvas.removeAttribute('style'); viewer.canvas.focus()")
-    browser.call("Input.dispatchKeyEvent", type="keyDown", key="r")
-    stage = browser.run("[document.querySelector('.stage').clientWidth, document.querySelector('.stage').clientHeight]")
+def test_a_key_turns_the_pictures_by_a_quarter(opened: Browser, renders: Any) -> None:
+    start = show(opened, CENTRAL)
+    opened.run("viewer.canvas.removeAttribute('style'); viewer.canvas.focus()")
+    press(opened, "r")
+    stage = stage_size(opened)
     assert stage[0] == pytest.approx(stage[1] * SIZE[0] / SIZE[1], abs=2)
-    turned = show(browser, None, *SIZE)
+    turned = show(opened, None, *SIZE)
     assert psnr(turned, np.rot90(array(renders[CENTRAL]), -1)) >= 38
-    assert psnr(show(browser, 0, *SIZE), np.rot90(array(renders[0]), -1)) >= 38  # other cameras, too
-    up = browser.run("viewer.scene.up")
-    down = browser.run("viewer.scene.cameras[1].rotation[1]")
+    assert psnr(show(opened, 0, *SIZE), np.rot90(array(renders[0]), -1)) >= 38  # other cameras, too
+    up = opened.run("viewer.scene.up")
+    down = opened.run("viewer.scene.cameras[1].rotation[1]")
     assert np.dot(up, down) < -0.9
     for _ in range(3):
-        browser.run("viewer.rollQuarter()")
-    assert np.array_equal(show(browser, CENTRAL), start)
+        opened.run("viewer.rollQuarter()")
+    assert np.array_equal(show(opened, CENTRAL), start)
 
 
-def test_graphics_that_the_browser_took_back_come_again(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    before = show(browser, 0)
-    browser.run("window.loss = viewer.renderer.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
-    browser.wait("document.querySelector('.viewer').dataset.state === 'lost'")
-    assert "graphics" in browser.run("document.querySelector('.failure').textContent")
-    browser.run("loss.restoreContext()")
-    browser.wait(READY)
-    assert browser.run("document.querySelector('.failure').textContent") == ""
-    assert np.array_equal(show(browser, 0), before)
+def test_graphics_that_the_browser_took_back_come_again(opened: Browser) -> None:
+    before = show(opened, 0)
+    opened.run("window.loss = viewer.renderer.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
+    opened.wait("document.querySelector('.viewer').dataset.state === 'lost'")
+    assert "graphics" in opened.run("document.querySelector('.failure').textContent")
+    opened.run("loss.restoreContext()")
+    opened.wait(READY)
+    assert opened.run("document.querySelector('.failure').textContent") == ""
+    assert np.array_equal(show(opened, 0), before)
 
 
-def test_the_slider_lays_the_render_over_the_photo(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
+def test_the_slider_lays_the_render_over_the_photo(opened: Browser) -> None:
     over = "document.querySelector('.over')"
-    assert browser.run(f"{over}.src === document.querySelector('img.render').src")
-    clips = [browser.run(f"{over}.style.clipPath")]
-    browser.run("document.querySelector('.wipe input').focus()")
+    assert opened.run(f"{over}.src === document.querySelector('img.render').src")
+    clips = [opened.run(f"{over}.style.clipPath")]
+    opened.run("document.querySelector('.wipe input').focus()")
     for _ in range(30):
-        browser.call("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", windowsVirtualKeyCode=37)
-    clips.append(browser.run(f"{over}.style.clipPath"))
+        press(opened, "ArrowLeft", windowsVirtualKeyCode=37)
+    clips.append(opened.run(f"{over}.style.clipPath"))
     assert clips == ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 20%)"]
-    browser.run("document.querySelector('.pair').scrollIntoView()")
-    left, top, width = browser.run(
-        "(() => { const b = document.querySelector('.pair').getBoundingClientRect(); return [b.x, b.y, b.width]; })()"
-    )
-    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=left + 0.75 * width, y=top + 20)
-    assert browser.run("Number(document.querySelector('.wipe input').value)") == pytest.approx(75, abs=1)
+    opened.run("document.querySelector('.pair').scrollIntoView()")
+    left, top, width, _ = box(opened, ".pair")
+    mouse(opened, "Moved", left + 0.75 * width, top + 20)
+    assert opened.run("Number(document.querySelector('.wipe input').value)") == pytest.approx(75, abs=1)
 
 
 TURNED = """(() => {
@@ -404,44 +415,35 @@ TURNED = """(() => {
 })()"""
 
 
-def test_a_drag_ends_a_quarter_beyond_the_cameras_unless_it_roams(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    arc = browser.run("viewer.scene.arc")
+def test_the_distance_has_limits_and_a_drag_ends_a_quarter_beyond_the_cameras_unless_it_roams(opened: Browser) -> None:
+    start = opened.run("viewer.eye.distance")
+    for factor, limit in ((1.3, 3), (0.7, 0.3)):
+        opened.run(f"for (let i = 0; i < 40; i++) viewer.zoom({factor})")
+        assert opened.run("viewer.eye.distance") == pytest.approx(limit * start)
+    opened.run("viewer.flyTo(3)")
+    opened.run("document.querySelector('.start').click()")
+    assert opened.run("document.querySelector('select').value") == str(CENTRAL)
+    arc = opened.run("viewer.scene.arc")
+    width = opened.run("viewer.turnPerPixel() * viewer.canvas.clientWidth")
+    assert width == pytest.approx(arc["yaw"][1] - arc["yaw"][0])  # a drag across the stage
     for sign in (1, -1):
         for axis, name in enumerate(("yaw", "pitch")):
-            browser.run("viewer.place(viewer.scene.first)")
+            opened.run("viewer.place(viewer.scene.first)")
             # a drag to the right is a turn to the left
             step = [0.0, 0.0]
             step[axis] = sign * (-0.02 if axis == 0 else 0.02)
-            browser.run(f"for (let i = 0; i < 400; i++) viewer.turn({step[0]}, {step[1]})")
+            opened.run(f"for (let i = 0; i < 400; i++) viewer.turn({step[0]}, {step[1]})")
             low, high = arc[name]
             end = high if sign > 0 else low
-            beyond = sign * (browser.run(TURNED)[axis] - end) / (high - low)
+            beyond = sign * (opened.run(TURNED)[axis] - end) / (high - low)
             assert 0.15 < beyond <= 0.25 + 1e-6, (sign, name)
-    browser.run("viewer.place(viewer.scene.first)")
-    browser.run("viewer.turn(-1e3 * viewer.turnPerPixel(), 0)")  # one long drag stops there, too
-    assert browser.run(TURNED)[0] <= arc["yaw"][1] + 0.25 * (arc["yaw"][1] - arc["yaw"][0]) + 1e-6
-    browser.run("viewer.place(viewer.scene.first); document.querySelector('.roam').click()")
-    assert browser.run("document.querySelector('.roam').getAttribute('aria-pressed')") == "true"
-    browser.run("viewer.turn(-2.5, 0)")
-    assert browser.run(TURNED)[0] == pytest.approx(2.5, abs=0.02)
-
-
-def test_a_drag_across_the_stage_is_the_arc_of_the_cameras(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    low, high = browser.run("viewer.scene.arc.yaw")
-    assert browser.run("viewer.turnPerPixel() * viewer.canvas.clientWidth") == pytest.approx(high - low)
-
-
-def test_the_distance_has_limits(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    start = browser.run("viewer.eye.distance")
-    for factor, limit in ((1.3, 3), (0.7, 0.3)):
-        browser.run(f"for (let i = 0; i < 40; i++) viewer.zoom({factor})")
-        assert browser.run("viewer.eye.distance") == pytest.approx(limit * start)
+    opened.run("viewer.place(viewer.scene.first)")
+    opened.run("viewer.turn(-1e3 * viewer.turnPerPixel(), 0)")  # one long drag stops there, too
+    assert opened.run(TURNED)[0] <= arc["yaw"][1] + 0.25 * (arc["yaw"][1] - arc["yaw"][0]) + 1e-6
+    opened.run("viewer.place(viewer.scene.first); document.querySelector('.roam').click()")
+    assert opened.run("document.querySelector('.roam').getAttribute('aria-pressed')") == "true"
+    opened.run("viewer.turn(-2.5, 0)")
+    assert opened.run(TURNED)[0] == pytest.approx(2.5, abs=0.02)
 
 
 def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, page: Path) -> None:
@@ -449,20 +451,16 @@ def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, pa
     browser.open(page, READY)
     assert browser.run("getComputedStyle(viewer.canvas).touchAction") == "pan-y"
     browser.run("document.querySelector('.stage').scrollIntoView()")
-    box = (
-        "(() => { const b = viewer.canvas.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
-    )
-    x, y = browser.run(box)
+    x, y = middle(browser)
     distance, before = browser.run("viewer.eye.distance"), browser.run("scrollY")
-    wheel: dict[str, Any] = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": 100}
-    browser.call("Input.dispatchMouseEvent", **wheel)
+    mouse(browser, "Wheel", x, y, deltaX=0, deltaY=100)
     browser.wait(f"scrollY > {before}")
     assert browser.run("viewer.eye.distance") == distance
-    x, y = browser.run(box)
-    for kind in ("mousePressed", "mouseReleased"):
-        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    x, y = middle(browser)
+    for kind in ("Pressed", "Released"):
+        mouse(browser, kind, x, y, clickCount=1)
     before = browser.run("scrollY")
-    browser.call("Input.dispatchMouseEvent", **wheel | {"y": y})
+    mouse(browser, "Wheel", x, y, deltaX=0, deltaY=100)
     browser.wait(f"viewer.eye.distance > {distance}")
     assert browser.run("scrollY") == before
 
@@ -481,24 +479,6 @@ def test_it_sways_until_it_is_touched(browser: Browser, page: Path) -> None:
     browser.size(1000, 800)
     browser.open(page, READY)
     assert not browser.run("viewer.isSwaying")  # where the system asks for less motion
-
-
-def test_the_cameras_are_hidden_until_they_are_wanted(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    shown = "getComputedStyle(viewer.overlay).display !== 'none'"
-    assert not browser.run(shown)
-    browser.run("document.querySelector('.pyramids').click()")
-    assert browser.run(shown)
-
-
-def test_the_film_plays(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800)
-    browser.open(page, READY)
-    film = "document.querySelector('video')"
-    browser.wait(f"{film}.readyState >= 2")
-    assert browser.run(f"[{film}.videoWidth, {film}.videoHeight]") == [SIZE[1], SIZE[0]]
-    assert browser.run(f"{film}.duration") == pytest.approx(films.FRAMES / films.RATE, abs=0.01)
 
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])

@@ -44,6 +44,7 @@ def test_it_opens_at_a_training_camera() -> None:
     assert first(cameras, ["test", "training", "training", "training"]) == 2
     assert first(cameras, ["test", "test", "test", "test"]) == 0
     assert first(cameras, ["photo"] * 4) == 0
+    assert first([camera(0.0)], ["training"], MEANS[:0]) == 0  # one camera and no Gaussians
 
 
 def test_it_opens_at_the_best_of_the_middle_third() -> None:
@@ -58,10 +59,6 @@ def test_it_opens_at_the_best_of_the_middle_third() -> None:
     assert opens_at(a=40.0, c=26.6, d=32.7, e=35.0) == "d"
     assert opens_at(a=40.0, c=26.6) == "c"  # that of d is not known
     assert opens_at(c=30.0, d=30.0) == "c"
-
-
-def test_one_camera_and_no_gaussians() -> None:
-    assert first([camera(0.0)], ["training"], MEANS[:0]) == 0
 
 
 def around(*degrees: float, height: float = 0.0) -> dict[str, Any]:
@@ -90,12 +87,9 @@ def test_the_arc_is_that_of_the_cameras(degrees: tuple[float, ...]) -> None:
     assert arc["pitch"] == pytest.approx([-0.15, 0.15])
 
 
-def test_cameras_all_around_set_no_limit() -> None:
+def test_the_arc_of_cameras_all_around_has_no_limit_and_reaches_up_to_them() -> None:
     assert around(0.0, 90.0, 180.0, 270.0)["arc"]["yaw"] is None
     assert around(0.0, 90.0, 180.0)["arc"]["yaw"] is not None
-
-
-def test_the_arc_reaches_up_to_where_the_cameras_are() -> None:
     low, high = around(0.0, 120.0, 240.0, height=1.0)["arc"]["pitch"]
     assert (low + high) / 2 == pytest.approx(math.pi / 4)
 

@@ -37,6 +37,7 @@ def test_a_quarter_turn_of_the_cameras_turns_the_render_clockwise(degrees: float
 
 def test_a_small_angle_tilts_the_scene_within_the_frame() -> None:
     straight = views()
+    assert rolled(straight, 0.0) is straight
     turned = rolled(straight, 10.0)
     assert turned.images.shape == straight.images.shape
     point = torch.tensor([[0.3, 0.1, 4.0]], dtype=torch.float64)
@@ -47,8 +48,3 @@ def test_a_small_angle_tilts_the_scene_within_the_frame() -> None:
 
     angles = [torch.atan2(y, x) for x, y in (place(straight), place(turned))]  # y points down: clockwise
     assert float((angles[1] - angles[0]).rad2deg()) == pytest.approx(10, abs=1e-6)
-
-
-def test_nothing_turns_without_an_angle() -> None:
-    straight = views()
-    assert rolled(straight, 0.0) is straight

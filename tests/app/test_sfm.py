@@ -28,13 +28,18 @@ def posed(tmp_path_factory):
     return root / "photos", root / "out", report, lines
 
 
+@pytest.fixture(scope="module")
+def model(posed):
+    """As pycolmap reads it."""
+    return pycolmap.Reconstruction(posed[1] / "sparse" / "0")
+
+
 def degrees(rotation):
     return np.degrees(np.linalg.norm(cv2.Rodrigues(rotation)[0]))
 
 
-def test_the_cameras_are_those_that_took_the_photos(posed):
-    _, out, report, _ = posed
-    model = pycolmap.Reconstruction(out / "sparse" / "0")
+def test_the_cameras_are_those_that_took_the_photos(posed, model):
+    report = posed[2]
     found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     found, true = np.array([found[name] for name in NAMES])[:, :3], poses()[:, :3]
     for i, j in ((0, 1), (1, 2), (0, 2)):
@@ -48,9 +53,9 @@ def test_the_cameras_are_those_that_took_the_photos(posed):
     assert report["focal_rise"] > 0.05
 
 
-def test_pycolmap_and_kgs_read_the_same_scene(posed):
+def test_pycolmap_and_kgs_read_the_same_scene(posed, model):
     _, out, report, _ = posed
-    model, scene = pycolmap.Reconstruction(out / "sparse" / "0"), load_scene(out, points="model-points")
+    scene = load_scene(out, points="model-points")
     names = [*scene.train.names, *scene.test.names]
     extrinsics = np.concatenate([views.cameras.extrinsics.numpy() for views in (scene.train, scene.test)])
     for name, pose in zip(names, extrinsics, strict=True):
@@ -67,9 +72,8 @@ def test_pycolmap_and_kgs_read_the_same_scene(posed):
     assert colors.std(axis=0).min() > 5  # of the photos, not all black
 
 
-def test_points_project_to_where_the_photos_show_them(posed):
-    _, out, report, _ = posed
-    model, errors = pycolmap.Reconstruction(out / "sparse" / "0"), []
+def test_points_project_to_where_the_photos_show_them(posed, model):
+    report, errors = posed[2], []
     for image in model.images.values():
         for point in image.get_observation_points2D():
             errors.append(np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy))
@@ -77,13 +81,12 @@ def test_points_project_to_where_the_photos_show_them(posed):
     assert np.median(errors) < 0.5
 
 
-def test_a_model_that_was_not_written_whole_is_an_error(posed, tmp_path):
+def test_a_model_that_was_not_written_whole_is_an_error(posed, model, tmp_path):
     """COLMAP's writers do not look whether the disk took what they wrote."""
-    found = pycolmap.Reconstruction(posed[1] / "sparse" / "0")
 
     class OnAFullDisk:
         def write_binary(self, folder):
-            found.write_binary(folder)
+            model.write_binary(folder)
             data = (folder / cut).read_bytes()
             (folder / cut).write_bytes(data[: len(data) // 2])
 
@@ -95,8 +98,7 @@ def test_a_model_that_was_not_written_whole_is_an_error(posed, tmp_path):
             write_model(tmp_path / cut, SimpleNamespace(reconstruction=OnAFullDisk()), posed[1] / "images")
 
 
-def test_up_is_minus_y_and_the_median_depth_is_one(posed):
-    model = pycolmap.Reconstruction(posed[1] / "sparse" / "0")
+def test_up_is_minus_y_and_the_median_depth_is_one(model):
     rotations = np.array([image.cam_from_world().matrix()[:, :3] for image in model.images.values()])
     up = -rotations[:, 1].sum(0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-9)
@@ -143,16 +145,12 @@ def test_the_same_photos_and_seed_give_the_same_files(posed, tmp_path):
     assert again | different == report | different
 
 
-def test_a_second_run_uses_what_is_there(posed, monkeypatch):
+def test_a_second_run_uses_what_is_there(posed):
     folder, out, _, _ = posed
-    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.*")}
-    lines = []
-    report = pose_photos(folder, out, say=lines.append)
-    assert report["reused"]
+    lines, before = [], {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".lock"}
+    assert pose_photos(folder, out, say=lines.append)["reused"]
     assert "used again" in lines[0]
-    assert {
-        path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".lock"
-    }.items() <= before.items()
+    assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 @pytest.mark.slow

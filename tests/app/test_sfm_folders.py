@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
 from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
-from kgs.app.cli import main
 from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import writing
 from kgs.app.files.results_folder import photo_staging
@@ -33,9 +33,7 @@ def refused(capsys):
 
     def run(folder, *parts, out=None, code=2, kept=False, options=()):
         place = out or folder.parent / "out"
-        with pytest.raises(SystemExit) as stop:
-            main(["fit", str(folder), "-o", str(place), *options])
-        assert stop.value.code == code
+        assert command("fit", folder, "-o", place, *options) == code
         assert kept or not [path.name for path in place.glob("*photos*")]
         text = capsys.readouterr().err
         assert "Traceback" not in text
@@ -50,10 +48,13 @@ def small(images):
     return [cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA) for image in images]
 
 
-def save(folder, images, names=None):
+def save(folder, images, names=None, **others):
+    """Write images, and files `stem_suffix=content` of other kinds beside them."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, image in zip(names or [f"{i}.png" for i in range(len(images))], images, strict=True):
         cv2.imwrite(str(folder / name), image)
+    for name, content in others.items():
+        (folder / ".".join(name.rsplit("_", 1))).write_bytes(content)
     return folder
 
 
@@ -64,19 +65,65 @@ def folder(tmp_path):
     return path
 
 
-def test_no_folder(tmp_path, refused):
-    refused(tmp_path / "none", "expected a file or folder that is there, found none")
+VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
+FOLDERS = {  # what is in them, and what is said of it
+    "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
+    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, found 1", "Take 3 to 12")),
+    "two": (lambda at: save(at, planes()[:2]), ("at least 3 photos, found 2", "Take 3 to 12")),
+    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it do: DCIM",)),
+    "too deep, with cameras": (
+        lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
+        ("these folders in it do: images", "transform_train.json is not used"),
+    ),
+    "raw": (
+        lambda at: save(at, planes(), raw_dng=b"II*\0"),
+        ("1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible"),
+    ),
+    "video called JPEG": (lambda at: save(at, planes(), z_jpg=VIDEO), ("z.jpg: is a HEIC photo or a video", "sips")),
+    "video": (
+        lambda at: save(at, [], clip_MOV=VIDEO),
+        ("clip.MOV is a video", 'ffmpeg -i "clip.MOV"', "3 to 12 sharp ones"),
+    ),
+    "one twice": (
+        lambda at: save(at, [*planes(), planes()[1]]),
+        ("3.png: is the same photo as 1.png: remove one of them",),
+    ),
+    "upright and lying": (
+        lambda at: save(at, [*planes(), planes()[0].transpose(1, 0, 2)]),
+        ("2 (240x180: 0.png, 1.png, 2.png; 180x240: 3.png)", "all upright or all lying"),
+    ),
+    "cropped": (
+        lambda at: save(at, [*planes(), planes()[0][:120]]),
+        ("expected photos of one shape, got 2", "240x120: 3.png", "Cropped"),
+    ),
+}
+SLOW_FOLDERS = {
+    "one twice, saved anew": (
+        lambda at: save(at, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"]),
+        ("1.png and 2.jpg match at the same pixels", "remove one of them"),
+    ),
+    "no overlap": (
+        lambda at: save(at, [texture(seed, (220.0, 220.0, 220.0), 120).astype(np.uint8) for seed in range(3)]),
+        ("no two of the 3 photos show enough of the same things", "smaller step", "Matches of each pair"),
+    ),
+    "close together": (
+        lambda at: write_photos(at, close(0.5)),
+        ("do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"),
+    ),
+}
 
 
-def test_an_empty_folder(folder, refused):
-    (folder / "notes.txt").write_text("nothing")
-    refused(folder, "expected photos", ".jpg", "found none", "Take 3 to 12 photos")
+@pytest.mark.parametrize("kind", [*FOLDERS, *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW_FOLDERS)])
+def test_what_a_folder_holds_instead_is_told(tmp_path, refused, kind):
+    fill, said = (FOLDERS | SLOW_FOLDERS)[kind]
+    fill(tmp_path / "photos")
+    text = refused(tmp_path / "photos", *said)
+    assert kind != "cropped" or "upright" not in text
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_too_few_photos(folder, count, refused):
-    save(folder, planes()[:count])
-    refused(folder, f"at least 3 photos, found {count}", "Take 3 to 12")
+def test_a_video_alone_is_told(folder, refused):
+    save(folder, [], clip_MOV=VIDEO)
+    refused(folder / "clip.MOV", "is a video", "ffmpeg")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
@@ -84,17 +131,6 @@ def test_a_link_to_a_photo_that_is_gone(folder, refused):
     save(folder, small(planes()))
     (folder / "3.png").symlink_to("gone.png")
     refused(folder, "links to files that are not there: 3.png")
-
-
-def test_a_folder_one_level_too_deep(folder, refused):
-    save(folder / "DCIM", planes())
-    refused(folder, "these folders in it do: DCIM")
-
-
-def test_photos_of_a_kind_that_is_not_read(folder, refused):
-    save(folder, planes())
-    (folder / "raw.dng").write_bytes(b"II*\0")
-    refused(folder, "1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible")
 
 
 @pytest.mark.parametrize("heic", [True, False])
@@ -109,57 +145,11 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
         assert name in said
 
 
-def test_what_names_the_cameras_of_a_folder_too_deep_is_told(folder, refused):
-    save(folder / "images", planes())
-    (folder / "transform_train.json").write_text("{}")
-    refused(folder, "these folders in it do: images", "transform_train.json is not used")
-
-
-def test_a_video_that_is_called_jpeg(folder, refused):
-    save(folder, planes())
-    (folder / "z.jpg").write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
-    refused(folder, "z.jpg: is a HEIC photo or a video", "sips")
-
-
-def test_videos(folder, refused):
-    (folder / "clip.MOV").write_bytes(b"\0\0\0\x14ftypqt  ")
-    refused(folder, "clip.MOV is a video", 'ffmpeg -i "clip.MOV"', "3 to 12 sharp ones")
-    refused(folder / "clip.MOV", "is a video", "ffmpeg")
-
-
-def test_one_photo_twice(folder, refused):
-    save(folder, [*planes(), planes()[1]])
-    refused(folder, "3.png: is the same photo as 1.png: remove one of them")
-
-
-@pytest.mark.slow
-def test_one_photo_twice_saved_anew(folder, refused):
-    save(folder, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"])
-    refused(folder, "1.png and 2.jpg match at the same pixels", "remove one of them")
-
-
-def test_upright_and_lying_photos(folder, refused):
-    save(folder, [*planes(), planes()[0].transpose(1, 0, 2)])
-    refused(folder, "2 (240x180: 0.png, 1.png, 2.png; 180x240: 3.png)", "all upright or all lying")
-
-
-def test_photos_of_several_shapes(folder, refused):
-    save(folder, [*planes(), planes()[0][:120]])
-    text = refused(folder, "expected photos of one shape, got 2", "240x120: 3.png", "Cropped")
-    assert "upright" not in text
-
-
 def test_photos_of_several_lenses(folder, refused):
     for i, (image, film) in enumerate(zip(planes(), (26, 26, 13), strict=True)):
         jpeg = cv2.imencode(".jpg", image)[1].tobytes()
         (folder / f"{i}.jpg").write_bytes(with_exif(jpeg, exif(film=film)))
     refused(folder, "one focal length, got 2", "13 mm: 2.jpg", "26 mm: 0.jpg, 1.jpg", "without zoom")
-
-
-@pytest.mark.slow
-def test_photos_without_overlap(folder, refused):
-    save(folder, [texture(seed, (220.0, 220.0, 220.0), 120).astype(np.uint8) for seed in range(3)])
-    refused(folder, "no two of the 3 photos show enough of the same things", "smaller step", "Matches of each pair")
 
 
 @pytest.mark.slow
@@ -183,12 +173,6 @@ def test_a_camera_that_only_turned(folder, refused):
     turns = [cv2.Rodrigues(np.array([0.02 * i, 0.12 * i, 0.0]))[0] for i in range(3)]
     save(folder, [cv2.warpPerspective(wall, lens @ turn @ np.linalg.inv(far), (240, 180)) for turn in turns])
     refused(folder, "a camera that only turned on the spot, explains all matches", "step to the side", "Matches of")
-
-
-@pytest.mark.slow
-def test_photos_so_close_that_any_focal_length_fits(tmp_path, refused):
-    message = "do not tell the focal length", "3 to 20 degrees apart", "Matches of each pair"
-    refused(write_photos(tmp_path / "photos", close(0.5)), *message)
 
 
 @pytest.mark.slow
@@ -268,12 +252,6 @@ def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
         refused(write_planes(folder), f"{name}: was not written by kgs", out=out)
         assert (out / name).read_bytes() == b"mine"
         (out / name).unlink()
-
-
-def test_pycolmap_that_is_not_there(folder, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(ModuleNotFoundError, match="pycolmap"):
-        pose_photos(write_planes(folder), folder.parent / "out")
 
 
 def test_a_move_that_was_stopped_is_ended(tmp_path):
@@ -381,16 +359,8 @@ def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
 @pytest.mark.slow
 def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
     save(folder, [cv2.resize(image, (1600, 1200)) for image in planes()])
-    command = [
-        sys.executable,
-        "-c",
-        "import kgs.app.cli; kgs.app.cli.main()",
-        "fit",
-        str(folder),
-        "-o",
-        str(tmp_path / "out"),
-    ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    words = [sys.executable, "-c", "import kgs.app.cli; kgs.app.cli.main()", "fit", folder, "-o", tmp_path / "out"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         lines = iter(process.stderr.readline, "")
         assert any(line.startswith("keypoints: ") for line in lines)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does

@@ -3,26 +3,21 @@
 import json
 import shutil
 
-import cv2
 import numpy as np
 import pytest
+from command import run
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
-from kgs.app import cli, sfm
+from kgs.app import sfm
 from kgs.app.cli.unposed import is_unposed
+from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import writing
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
 from kgs.json_files import write_json
 
 SIZE = (72, 96)
-FIT = ("--steps", 6, "--init", "sift", "--max-gaussians", 3000, "--preset", "plain")
-
-
-def run(*arguments):
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(argument) for argument in arguments])
-    return stop.value.code
+FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +33,7 @@ def folder(truth, tmp_path):
         place = tmp_path / f"photos{count}"
         place.mkdir()
         for i in range(count):
-            pixels = (truth.images[i] * 255).round().byte().permute(1, 2, 0).numpy()
-            cv2.imwrite(str(place / f"IMG_{i}.png"), np.ascontiguousarray(pixels[..., ::-1]))
+            write_png(place / f"IMG_{i}.png", truth.images[i])
         return place
 
     return made

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from factories import pinhole, random_camera, random_gaussians, with_camera
+from factories import FIELDS, leaves, pinhole, posed, random_camera, random_gaussians, replace, select, with_camera
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.vector import Vector3
@@ -16,7 +16,6 @@ import kgs.reference
 from kgs import GaussianRenderer, Gaussians, PosedCamera
 
 SIZE = (24, 32)
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
 K = [[30.0, 0.0, 16.0], [0.0, 28.0, 12.0], [0.0, 0.0, 1.0]]
 
 
@@ -143,13 +142,10 @@ def test_pose_and_lens_that_are_parameters_are_optimised_with_one_camera_object(
     gaussians, renderer = random_gaussians(30, 0, torch.float32, 1), GaussianRenderer()
     params, pose = torch.tensor([30.0, 28.0, 15.5, 11.5]), torch.eye(4)[None]
 
-    def camera(params, pose):
-        return PosedCamera(CameraModel(ImageSize(*SIZE), CameraModelType.PINHOLE, params), pose)
-
-    target = renderer(gaussians, camera(params, pose)).image
+    target = renderer(gaussians, posed(CameraModelType.PINHOLE, params, SIZE, extrinsics=pose)).image
     params, pose = torch.nn.Parameter(params + 0.3), torch.nn.Parameter(pose.clone())
     pose.data[0, :3] += 0.02 * torch.randn(3, 4)
-    one = camera(params, pose)
+    one = posed(CameraModelType.PINHOLE, params, SIZE, extrinsics=pose)
     recover(lambda: renderer(gaussians, one).image, [params, pose], target)
 
 
@@ -223,8 +219,7 @@ def test_a_pose_that_is_no_rotation_is_drawn_from_where_its_rays_meet(change):
     other = PinholeCamera(k, pose, camera.height, camera.width)
     seen = GaussianRenderer()(gaussians, camera).projected  # the tangent limits of the two sit elsewhere
     ids = ((seen.means2d - torch.tensor([15.5, 11.5])).abs() < torch.tensor([9.0, 7.0])).all(1).nonzero()[:, 0]
-    ids = seen.gaussian_ids[ids]
-    gaussians = Gaussians(*(getattr(gaussians, name)[ids] for name in FIELDS))
+    gaussians = select(gaussians, seen.gaussian_ids[ids])
     expected = GaussianRenderer()(gaussians, camera).image
     assert expected.std() > 0.03
     assert (GaussianRenderer()(gaussians, other).image - expected).abs().max() < 1e-10
@@ -235,15 +230,13 @@ def test_a_pose_that_is_no_rotation_is_drawn_from_where_its_rays_meet(change):
 @pytest.mark.parametrize("kind", ["pinhole", "model"])
 def test_a_negative_focal_length_mirrors_the_image(axis, kind):
     gaussians = random_gaussians(80, 0, sh_degree=None)
-    gaussians = Gaussians(gaussians.means * torch.tensor([2.0, 2.0, 1.0]), *(getattr(gaussians, f) for f in FIELDS[1:]))
+    gaussians = replace(gaussians, means=gaussians.means * torch.tensor([2.0, 2.0, 1.0]))
     focal = [30.0, 28.0]
 
     def render(fx, fy):
         if kind == "pinhole":
             return GaussianRenderer()(gaussians, pinhole(*SIZE, (fx, fy))).image
-        params = torch.tensor([fx, fy, 15.5, 11.5], dtype=torch.float64)
-        model = CameraModel(ImageSize(*SIZE), CameraModelType.PINHOLE, params)
-        return GaussianRenderer()(gaussians, PosedCamera(model, torch.eye(4, dtype=torch.float64)[None])).image
+        return GaussianRenderer()(gaussians, posed(CameraModelType.PINHOLE, [fx, fy, 15.5, 11.5], SIZE)).image
 
     expected = render(*focal).flip(3 - axis)
     focal[axis] *= -1
@@ -269,8 +262,7 @@ STEADY = [
 
 
 def distorted(kind, coefficients, focal=8.0, dtype=torch.float64):
-    params = torch.tensor([focal, focal, 16.0, 12.0, *coefficients], dtype=dtype)
-    return PosedCamera(CameraModel(ImageSize(25, 33), kind, params), torch.eye(4, dtype=dtype)[None])
+    return posed(kind, [focal, focal, 16.0, 12.0, *coefficients], (25, 33), dtype)
 
 
 def fold_angle(kind, coefficients):
@@ -293,14 +285,14 @@ def test_what_lies_behind_the_fold_is_not_drawn(kind, coefficients):
     for turn in (0.0, 2.1, 4.0):
         x, y = angles.sin() * math.cos(turn), angles.sin() * math.sin(turn)
         gaussians = dot(torch.stack([x, y, angles.cos()], 1) * 3.0)
-        leaves = [getattr(gaussians, name).requires_grad_() for name in FIELDS]
+        gaussians, inputs = leaves(gaussians)
         out = GaussianRenderer(alpha_threshold=0)(gaussians, camera, outputs=("image",))
         expected = (angles < fold).nonzero()[:, 0]
         assert torch.equal(out.projected.gaussian_ids, expected)
         out.image.square().sum().backward()
-        assert all(x.grad.isfinite().all() for x in leaves)
-        assert not leaves[0].grad[angles >= fold].any()
-        assert leaves[0].grad[:10].any()
+        assert all(x.grad.isfinite().all() for x in inputs)
+        assert not inputs[0].grad[angles >= fold].any()
+        assert inputs[0].grad[:10].any()
 
 
 def test_the_gradient_of_a_folding_lens_is_that_of_what_it_sees():
@@ -311,8 +303,7 @@ def test_the_gradient_of_a_folding_lens_is_that_of_what_it_sees():
     renderer = GaussianRenderer(alpha_threshold=0, transmittance_stop=0)
 
     def image(params):
-        camera = PosedCamera(CameraModel(ImageSize(25, 33), kind, params), torch.eye(4).double()[None])
-        return renderer(gaussians, camera).image.sum((0, 1))
+        return renderer(gaussians, posed(kind, params, (25, 33))).image.sum((0, 1))
 
     assert torch.autograd.gradcheck(image, params, eps=1e-6, atol=1e-6, fast_mode=True)
 
@@ -325,7 +316,7 @@ def test_a_model_made_in_inference_mode_renders_there_and_outside(kind, coeffici
         camera = distorted(kind, coefficients, dtype=torch.float32)
         assert torch.equal(GaussianRenderer()(gaussians, camera).image, expected)
     leaf = gaussians.means.clone().requires_grad_()
-    moved = Gaussians(leaf, *(getattr(gaussians, name) for name in FIELDS[1:]))
+    moved = replace(gaussians, means=leaf)
     image = GaussianRenderer()(moved, camera).image
     assert torch.equal(image, expected)
     image.square().sum().backward()
@@ -338,7 +329,7 @@ def test_a_pinhole_made_in_inference_mode_can_be_trained_with(backend):
     with torch.inference_mode():
         camera = random_camera(*SIZE, 0, torch.float32)
     leaf = gaussians.means.clone().requires_grad_()
-    moved = Gaussians(leaf, *(getattr(gaussians, name) for name in FIELDS[1:]))
+    moved = replace(gaussians, means=leaf)
     GaussianRenderer(backend=backend)(moved, camera).image.square().sum().backward()
     assert leaf.grad.any()
 

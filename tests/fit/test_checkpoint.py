@@ -71,6 +71,9 @@ def test_other_files_are_refused(path, content):
     path.write_bytes(content)
     with pytest.raises(DataError, match="not a whole checkpoint"):
         load_checkpoint(path)
+    path.unlink()
+    with pytest.raises(DataError, match=r"checkpoint\.safetensors.*No such file"):
+        load_checkpoint(path)
 
 
 def test_safetensors_of_other_programs_are_refused(path):
@@ -79,25 +82,10 @@ def test_safetensors_of_other_programs_are_refused(path):
         load_checkpoint(path)
 
 
-def test_missing_file_is_named(path):
-    with pytest.raises(DataError, match=r"checkpoint\.safetensors.*No such file"):
-        load_checkpoint(path)
-
-
 def sealed(text, tensors):
     """A file with the right checksum."""
     metadata = {"format": checkpoint._FORMAT, "state": text, "sha256": _digest_all(text, tensors)}
     return safetensors.torch.save(tensors, metadata)
-
-
-def test_code_is_not_written(path):
-    class Attack:
-        def __reduce__(self):
-            return (print, ("run",))
-
-    with pytest.raises(TypeError, match="Attack"):
-        save_checkpoint(path, {"x": Attack()})
-    assert not path.exists()
 
 
 @pytest.mark.parametrize(
@@ -120,26 +108,18 @@ def test_a_right_checksum_is_not_trusted(path, text, tensors, reason):
         load_checkpoint(path)
 
 
-def test_values_that_a_checkpoint_cannot_hold_are_not_written(path):
-    for value in ({1, 2}, b"bytes", {3: "number as key"}, {"a/b": 1}):
+class Attack:
+    def __reduce__(self):
+        return (print, ("run",))
+
+
+def test_code_and_values_that_a_checkpoint_cannot_hold_are_not_written(path):
+    for value in (Attack(), {1, 2}, b"bytes", {3: "number as key"}, {"a/b": 1}):
         with pytest.raises(TypeError):
             save_checkpoint(path, {"x": value})
     with pytest.raises(ValueError, match="JSON"):
         save_checkpoint(path, {"x": float("nan")})
     assert not path.exists()
-
-
-def test_a_failed_write_leaves_the_old_file(path, monkeypatch):
-    save_checkpoint(path, {"step": 1})
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="space"):
-        save_checkpoint(path, {"step": 2})
-    assert load_checkpoint(path) == {"step": 1}
-    assert [p.name for p in path.parent.iterdir()] == ["checkpoint.safetensors"]
 
 
 def test_a_file_system_that_cannot_sync_folders_is_no_fault(path, monkeypatch):

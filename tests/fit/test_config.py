@@ -16,20 +16,17 @@ from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
 from kgs.fit.plan import expected_memory, make_plan, most_gaussians, timetable, with_pace
 
 
-def test_full_length_is_the_release():
-    times = timetable(replace(PAPER, steps=10_000))
-    assert times.sh == (1000, 2000, 3000)
-    assert times.densify == tuple(range(600, 10_000, 100))
-    assert len(times.densify) == 94
-    assert times.reset == (3000, 6000, 9000)
-
-
-def test_short_fit_scales_counts():
-    times = timetable(replace(PAPER, steps=2000))
-    assert times.sh == (200, 400, 600)
-    assert times.densify == tuple(range(200, 2000, 100))  # on as much evidence as the recipe, see timetable
-    assert times.reset == (600, 1200)
-    assert times.evaluate[-1] == 2000
+@pytest.mark.parametrize(
+    ("steps", "sh", "densify", "reset"),
+    [
+        (10_000, (1000, 2000, 3000), range(600, 10_000, 100), (3000, 6000, 9000)),  # the release
+        (2000, (200, 400, 600), range(200, 2000, 100), (600, 1200)),  # on as much evidence, see timetable
+    ],
+)
+def test_a_short_fit_scales_the_counts_of_the_release(steps, sh, densify, reset):
+    times = timetable(replace(PAPER, steps=steps))
+    assert (times.sh, times.densify, times.reset) == (sh, tuple(densify), reset)
+    assert times.evaluate[-1] == steps
 
 
 @pytest.mark.parametrize("steps", [1, 7, 100, 999])
@@ -62,11 +59,6 @@ def test_more_than_three_views_take_more_steps_and_fade_more_slowly(views, steps
 def test_plain_is_paper_without_dropping():
     assert replace(PRESETS["plain"], drop=PAPER.drop) == PRESETS["paper"] == PAPER
     assert PRESETS["plain"].drop == 0
-
-
-def test_config_survives_json():
-    config = FitConfig(steps=300, drop=0.1, seed=4, recipe=Recipe(dssim_weight=0.3))
-    assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 WRONG = {
@@ -104,15 +96,11 @@ def test_a_reset_may_not_remove_everything():
 
 
 def test_numpys_numbers_and_paths_as_text_become_pythons():
-    config = FitConfig(steps=np.int64(7), drop=np.float32(0.5), max_gaussians=np.int32(9), init="file", init_file="a")
+    numbers = {"steps": np.int64(7), "drop": np.float32(0.5), "max_gaussians": np.int32(9)}
+    config = FitConfig(**numbers, init="file", init_file="a", recipe=Recipe(dssim_weight=0.3))
     assert [type(x) for x in (config.steps, config.drop, config.max_gaussians)] == [int, float, int]
     assert config.init_file == Path("a")
     assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-
-
-def test_unknown_entry_is_refused():
-    with pytest.raises(ValueError, match="FitConfig"):
-        FitConfig.from_dict({"stepz": 3})
 
 
 def test_the_coarse_share_is_counted_in_steps():
@@ -141,12 +129,6 @@ def test_a_degree_changes_the_timetable_and_says_why():
     assert (plan.config.sh_degree, len(plan.times.sh)) == (2, 2)
     assert plan.needs == {"sh_degree": {"by": "rule"}}
     assert (first.config.sh_degree, first.times.sh, first.needs) == (None, (), {})
-
-
-@pytest.mark.parametrize("device", ["foo", "meta", "cuda:99"])
-def test_a_device_that_is_not_there_is_refused_by_the_plan(device):
-    with pytest.raises(ValueError, match="^device: expected"):
-        make_plan(SCENE, FitConfig(device=device))
 
 
 def test_more_gaussians_or_pixels_take_more_memory():

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from factories import pinhole, with_camera
 from kornia.metrics import psnr
 
 from kgs.datasets import synthetic_scene
-from kgs.datasets.scene import pinholes
 from kgs.fit.config import FitConfig
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
@@ -19,12 +19,9 @@ HEIGHT, WIDTH, FOCAL, DEPTH = 10, 40, 20.0, 5.0
 
 def rig(*centers):
     """Cameras side by side that look along z; a shift by one unit moves what is at `DEPTH` by four pixels."""
-    intrinsics = torch.eye(4).repeat(len(centers), 1, 1)
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = FOCAL
-    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
     extrinsics = torch.eye(4).repeat(len(centers), 1, 1)
     extrinsics[:, 0, 3] = -torch.tensor(centers)
-    return pinholes(intrinsics, extrinsics, (HEIGHT, WIDTH))
+    return with_camera(pinhole(HEIGHT, WIDTH, FOCAL, dtype=torch.float32, cameras=len(centers)), extrinsics)
 
 
 def wall(depth=DEPTH):
@@ -60,7 +57,7 @@ def test_a_pixel_without_depth_is_not_shown():
 @pytest.fixture(scope="module")
 def fit():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
-    config = FitConfig(steps=30, sh_degree=0, init="sift", evaluations=1)
+    config = FitConfig(steps=5, sh_degree=0, init="random", init_points=2000, evaluations=1)
     return Trainer(scene, make_plan(scene, config), choose_points(scene, config)).fit()
 
 

@@ -61,14 +61,12 @@ def test_too_few_views_to_leave_one_out_follow_the_rule(views):
     assert (config, found) == (with_pace(replace(OPEN, sh_degree=0), views), {"sh_degree": by_rule})
 
 
-def test_without_steps_for_probes_the_rule_decides(eight):
-    by_rule = {"chosen": 0, "by": "rule", "why": "too few steps for probes"}
-    assert decided(eight, replace(OPEN, steps=20))[1] == {"sh_degree": by_rule}
-
-
-def test_in_small_pictures_the_rule_decides(eight):
+def test_without_steps_or_in_small_pictures_the_rule_decides(eight):
     small = replace(eight, train=eight.train.halved())
-    assert decided(small)[1]["sh_degree"]["why"] == "too small images for probes"
+    for scene, config, why in ((eight, replace(OPEN, steps=20), "steps"), (small, OPEN, "small images")):
+        found = decided(scene, config)[1]["sh_degree"]
+        assert (found["chosen"], found["by"]) == (0, "rule")
+        assert why in found["why"]
 
 
 def test_what_is_given_is_not_decided(eight):

@@ -6,8 +6,8 @@ import statistics
 from dataclasses import replace
 
 import pytest
+from command import run
 
-from kgs.app.cli import main
 from kgs.datasets import synthetic_scene
 from kgs.fit import Trainer, initial_points
 from kgs.fit.config import PAPER
@@ -20,9 +20,7 @@ FILES = {"splat.ply", "metrics.json", "config.json", "curve.png", "checkpoint.sa
 
 
 def fit(scene, out, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(scene), "-o", str(out), *map(str, arguments)])
-    assert stop.value.code == 0
+    assert run("fit", scene, "-o", out, *arguments) == 0
     assert {path.name for path in out.iterdir()} >= FILES
     metrics = json.loads((out / "metrics.json").read_text())
     assert len(list((out / "test").iterdir())) == len(metrics["test"]["views"])
@@ -64,8 +62,6 @@ def test_dropping_gains_over_seeds():
 
 def test_the_demo_shows_a_room(tmp_path):
     """Views that were not used, from three photos: better than any blur of them."""
-    with pytest.raises(SystemExit) as stop:
-        main(["demo", "-o", str(tmp_path)])
-    assert stop.value.code == 0
+    assert run("demo", "-o", tmp_path) == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
     assert min(run["test"]["psnr"] for run in runs.values()) >= 25.0

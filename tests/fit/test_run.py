@@ -3,47 +3,46 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from kgs.app import fit_folder as app
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import Published, train
 from kgs.app.scene_request import SceneRequest
-from kgs.app.stages import Stages
-from kgs.datasets.synthetic import synthetic_scene
 from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
-from kgs.init_points import InitialPoints
 
 CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
 
 
-@pytest.fixture(scope="module")
-def scene() -> Any:
-    return synthetic_scene(train_views=3, test_views=1, size=(24, 32), seed=0)
-
-
-@pytest.fixture(autouse=True)
-def _few_points(monkeypatch: Any) -> None:
-    points = torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 3.0])
-    first = InitialPoints(points, torch.full((150, 3), 0.5), "random")
-    monkeypatch.setattr(app, "choose_points", lambda *_: first)
+@pytest.fixture(scope="module", autouse=True)
+def _few_points(points: Any) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(app, "choose_points", lambda *_: points)
+        yield
 
 
 def fit_folder(scene: Any, config: FitConfig, out: Path, lines: list[str] | None = None, **options: Any) -> Published:
     """Fit; the lines that are said are added to `lines`."""
     say = ([] if lines is None else lines).append
     return app.fit_folder(scene, config, out, SceneRequest("/photos"), say=say, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(scene: Any, tmp_path_factory: Any) -> Path:
+    """The folder of a fit that nothing disturbed."""
+    out: Path = tmp_path_factory.mktemp("whole")
+    fit_folder(scene, CONFIG, out)
+    return out
 
 
 @pytest.fixture
@@ -84,8 +83,9 @@ def test_a_second_signal_acts_at_once(trainer: Trainer, tmp_path: Path) -> None:
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
 
 
-def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    fit_folder(scene, CONFIG, tmp_path / "whole")
+def test_an_interrupted_fit_writes_its_results_and_goes_on(
+    scene: Any, whole: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
     plain = Trainer.__init__
 
     def interrupted(self: Trainer, *arguments: Any) -> None:
@@ -93,12 +93,12 @@ def test_an_interrupted_fit_writes_its_results_and_goes_on(scene: Any, tmp_path:
         at_step(self, 10, lambda: os.kill(os.getpid(), signal.SIGTERM))
 
     monkeypatch.setattr(Trainer, "__init__", interrupted)
-    cut = fit_folder(scene, CONFIG, tmp_path / "cut")
-    assert (cut.fit.metrics["steps"], cut.signal, cut.folder) == (10, signal.SIGTERM, tmp_path / "cut")
-    assert (tmp_path / "cut" / "splat.ply").is_file()
-    ended = fit_folder(scene, CONFIG, tmp_path / "cut", resume=True)
+    cut = fit_folder(scene, CONFIG, tmp_path)
+    assert (cut.fit.metrics["steps"], cut.signal, cut.folder) == (10, signal.SIGTERM, tmp_path)
+    assert (tmp_path / "splat.ply").is_file()
+    ended = fit_folder(scene, CONFIG, tmp_path, resume=True)
     assert (ended.fit.metrics["steps"], ended.signal) == (12, 0)
-    assert (tmp_path / "cut" / "splat.ply").read_bytes() == (tmp_path / "whole" / "splat.ply").read_bytes()
+    assert (tmp_path / "splat.ply").read_bytes() == (whole / "splat.ply").read_bytes()
 
 
 def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
@@ -132,56 +132,36 @@ def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Pa
     assert saved == [*range(1, 13), 12]
 
 
-def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, whole: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    fit_folder(scene, CONFIG, tmp_path, lines=lines)
-    whole = (tmp_path / "splat.ply").read_bytes()
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-7])
     fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
     assert any("went on from the previous checkpoint" in line for line in lines)
-    assert (tmp_path / "splat.ply").read_bytes() == whole
+    assert (tmp_path / "splat.ply").read_bytes() == (whole / "splat.ply").read_bytes()
     for damaged in (path, previous(path)):
         damaged.write_bytes(b"")
     with pytest.raises(DataError, match=CHECKPOINT):
         fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
 
 
-def test_where_there_is_nothing_to_resume_it_says_so(scene: Any, tmp_path: Path) -> None:
-    lines: list[str] = []
-    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, lines=lines)
-    assert f"{tmp_path}: there is nothing to resume: the fit starts at the beginning" in lines
-    lines.clear()
-    fit_folder(scene, replace(CONFIG, steps=2), tmp_path, resume=True, lines=lines)
-    assert not any("nothing to resume" in line for line in lines)
-
-
-def test_stages_are_named_as_they_begin_and_the_memory_is_told(scene: Any, tmp_path: Path) -> None:
+def test_stages_memory_and_what_is_not_resumed_are_told(scene: Any, tmp_path: Path) -> None:
     short = replace(CONFIG, steps=2)
     lines: list[str] = []
-    fit_folder(scene, short, tmp_path, lines)
+    fit_folder(scene, short, tmp_path, lines, resume=True)
+    nothing = f"{tmp_path}: there is nothing to resume: the fit starts at the beginning"
+    assert nothing in lines
     stages = ["1 of 4: initial points", "2 of 4: fit", "3 of 4: film", "4 of 4: page"]
     assert [line for line in lines if " of 4: " in line] == stages
     (memory,) = [line for line in lines if line.endswith(" GiB of memory")]
     assert lines.index(stages[0]) < lines.index(memory) < lines.index(stages[1])
     lines.clear()
     fit_folder(scene, short, tmp_path, lines, resume=True)
+    assert nothing not in lines
     assert [line for line in lines if " of 4: " in line] == stages[1:]
-
-
-def test_cameras_are_a_stage_of_unposed_photos() -> None:
-    lines: list[str] = []
-    stages = Stages(lines.append, unposed=True)
-    for name in ("cameras", "page"):
-        stages.begin(name)
-    assert lines == ["1 of 5: cameras", "5 of 5: page"]
-
-
-def test_a_fresh_fit_never_resumes_what_was_there(scene: Any, tmp_path: Path) -> None:
-    short = replace(CONFIG, steps=2)
-    fit_folder(scene, short, tmp_path)
     fit_folder(scene, replace(short, seed=1), tmp_path)
-    assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1
+    assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1  # nothing of the former fit
 
 
 def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> None:
@@ -192,14 +172,3 @@ def test_a_signal_that_is_ignored_stays_so(trainer: Trainer, tmp_path: Path) -> 
     finally:
         signal.signal(signal.SIGHUP, before)
     assert trainer.step == 12
-
-
-def test_nobody_has_to_listen(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    """stdout and stderr closed by their readers: the results are written all the same."""
-    for name in ("stdout", "stderr"):
-        reader, writer = os.pipe()
-        os.close(reader)
-        monkeypatch.setattr(sys, name, open(writer, "w"))  # noqa: SIM115  # closed by nobody, as a shell's
-    app.fit_folder(scene, replace(CONFIG, steps=2), tmp_path, SceneRequest("/photos"))
-    monkeypatch.undo()
-    assert (tmp_path / "metrics.json").is_file()

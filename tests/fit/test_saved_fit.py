@@ -66,24 +66,7 @@ def test_wrong_requests_are_named(tmp_path: Path, request_: Any, field: str) -> 
 
 
 @pytest.mark.parametrize(
-    "fit",
-    [
-        {"steps": "2000"},
-        {"steps": 2000.0},
-        {"steps": True},
-        {"steps": 10**9},
-        {"drop": "0.2"},
-        {"seed": 2**60},
-        {"max_gaussians": 1.5},
-        {"max_bytes": 0},
-        {"init_points": 0},
-        {"init_file": 3},
-        {"recipe": []},
-        {"recipe": {"lr_means": None}},
-        {"recipe": {"densify_interval": 0}},
-        {"recipe": {"speed": 1.0}},
-        {"stepz": 1},
-    ],
+    "fit", [{"steps": "2000"}, {"init_file": 3}, {"recipe": []}, {"recipe": {"speed": 1.0}}, {"stepz": 1}]
 )
 def test_wrong_numbers_of_the_fit_are_named(tmp_path: Path, fit: dict[str, Any]) -> None:
     with pytest.raises(DataError, match=r"config\.json.*fit"):

@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-import kgs.fit
-
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
@@ -155,8 +153,6 @@ print(kgs.machine.peak_rss_mb())
 
 def test_the_package_the_command_and_the_numbers_of_a_fit_are_read_without_heavy_libraries(imported):
     assert imported[0] == "heavy:"
-    importlib.import_module("kgs.app.fit_folder")  # all modules of a fit
-    assert not any(inspect.ismodule(getattr(kgs.fit, name)) for name in kgs.fit.__all__)
 
 
 def test_no_module_of_one_system_alone(imported):

@@ -206,16 +206,10 @@ def test_it_runs_in_full(path, workplace):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_one_cell_near_the_top_sets_the_sizes(path):
-    cells = nbformat.read(path, as_version=4).cells
-    reading = [i for i, cell in enumerate(cells) if "KGS_QUICK" in cell.source]
-    assert reading == [1]
-    assert [i for i, cell in enumerate(cells) if "environ" in cell.source] == [1]
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_is_stored_as_run_from_top_to_bottom(path):
+def test_one_cell_near_the_top_sets_the_sizes_and_it_is_stored_as_run_from_top_to_bottom(path):
     notebook = nbformat.read(path, as_version=4)
+    assert [i for i, cell in enumerate(notebook.cells) if "KGS_QUICK" in cell.source] == [1]
+    assert [i for i, cell in enumerate(notebook.cells) if "environ" in cell.source] == [1]
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     outputs = [output for cell in code for output in cell.outputs]
