@@ -82,7 +82,7 @@ def test_renders_are_clamped_before_they_are_measured_and_record_no_gradient():
 
 def test_the_worst_psnr_does_not_count_as_the_best():
     """A black render of a white photo has 0 dB, a render that equals its photo an infinite PSNR, None."""
-    views = make_views()
+    views = random_views()
     white = replace(views, images=torch.ones_like(views.images))
     assert comparable(mean_psnr(renderer_of(torch.zeros_like(white.images)), white)) == 0.0
     assert comparable(mean_psnr(renderer_of(white.images), white)) == BEST
