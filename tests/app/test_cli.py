@@ -170,6 +170,7 @@ def test_demo_fits_with_dropping(tmp_path, capsys):
     assert {"index.html", "demo.png", "curve.png", "splat.ply"} <= set(os.listdir(tmp_path))
 
 
+@pytest.mark.slow
 def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40, "--compare") == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
@@ -276,6 +277,7 @@ def test_a_warning_is_one_line_without_code(folder, tmp_path, capsys):
     assert lines[0].startswith("kgs: initial points: SIFT found")
 
 
+@pytest.mark.slow
 def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, capsys):
     assert run("fit", folder, "-o", tmp_path, "--steps", 40, "--init", "random", "--init-points", 50) == 0
     assert json.loads((tmp_path / "metrics.json").read_text())["init"] == {"kind": "random", "points": 50}

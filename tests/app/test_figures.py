@@ -62,6 +62,7 @@ def test_a_sheet_shows_the_photo_and_each_render(tmp_path):
         assert float((pixel - images[image, :, 0, 0]).abs().max()) < 0.01
 
 
+@pytest.mark.slow
 def test_memory_and_versions():
     before = peak_rss_mb()
     room = 0

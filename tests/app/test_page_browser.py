@@ -190,6 +190,7 @@ def test_the_first_view_is_a_whole_photo_on_every_screen(
     assert psnr(shown, array(renders[CENTRAL])) >= 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape", [(16, 9), *(pytest.param(shape, marks=pytest.mark.slow) for shape in ((4, 3), (9, 16)))]
 )
@@ -366,6 +367,7 @@ def test_dragging_keys_and_pyramids_move_the_eye(opened: Browser) -> None:
     opened.wait(f"{eye} === {there}")
 
 
+@pytest.mark.slow
 def test_a_key_turns_the_pictures_by_a_quarter(opened: Browser, renders: Any) -> None:
     start = show(opened, CENTRAL)
     opened.run("viewer.canvas.removeAttribute('style'); viewer.canvas.focus()")
@@ -383,6 +385,7 @@ def test_a_key_turns_the_pictures_by_a_quarter(opened: Browser, renders: Any) ->
     assert np.array_equal(show(opened, CENTRAL), start)
 
 
+@pytest.mark.slow
 def test_graphics_that_the_browser_took_back_come_again(opened: Browser) -> None:
     before = show(opened, 0)
     opened.run("window.loss = viewer.renderer.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
@@ -446,6 +449,7 @@ def test_the_distance_has_limits_and_a_drag_ends_a_quarter_beyond_the_cameras_un
     assert opened.run(TURNED)[0] == pytest.approx(2.5, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, page: Path) -> None:
     browser.size(1000, 500)
     browser.open(page, READY)
@@ -465,6 +469,7 @@ def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, pa
     assert browser.run("scrollY") == before
 
 
+@pytest.mark.slow
 def test_it_sways_until_it_is_touched(browser: Browser, page: Path) -> None:
     browser.size(1000, 800, motion="no-preference")
     browser.open(page, READY)

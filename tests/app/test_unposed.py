@@ -96,6 +96,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     assert run("eval", tmp_path / "moved") == 0
 
 
+@pytest.mark.slow
 def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
     nine = folder(9)
     assert run("fit", nine, "-o", tmp_path / "all", "--downscale", 3, *FIT) == 0  # of photos of 192x144

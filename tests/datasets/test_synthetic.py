@@ -101,6 +101,7 @@ def test_orbit_views_look_inwards_at_the_table_before_ground_and_sky(orbit):
     assert torch.allclose(angles.diff(), torch.tensor(2 * np.pi / 5).double(), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_sky_shines_and_the_ground_is_shaded():
     made = garden.make_garden(0)
     rows = np.arange(made.unlit)

@@ -127,6 +127,7 @@ def test_probes_of_many_views_have_a_dozen_of_them(monkeypatch):
     assert {len(scene.train) for scene, _ in stand_in.seen} == {probes.MAX_VIEWS}
 
 
+@pytest.mark.slow
 def test_the_same_seed_decides_the_same(eight):
     first = decided(eight, OPEN, choose_points)
     assert decided(eight, OPEN, choose_points) == first

@@ -27,6 +27,7 @@ def test_an_ordinary_scene_is_torch_in_float64(thresholds):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0, 1, 9])
 def test_any_number_of_features(width):
     projected, certain = sample(12, (5, 9))
@@ -41,6 +42,7 @@ def test_it_is_numba_within_rounding():
     assert_close(run(projected, projected.colors, certain), expected, certain)
 
 
+@pytest.mark.slow
 def test_several_cameras_in_row_slices():
     gaussians = random_gaussians(10, 1, torch.float32, None, 16, (0.05, 1.0))
     cameras = batch(*(random_camera(16, 11, seed, torch.float32) for seed in range(2)))
@@ -53,6 +55,7 @@ def test_several_cameras_in_row_slices():
         composite(projected, features, options=RasterOptions(max_bytes=500), backend="triton")
 
 
+@pytest.mark.slow
 def test_a_row_slice_is_freed_before_the_next_is_made(monkeypatch):
     """In the backward pass too: `max_bytes` is for one of them."""
     projected, certain = sample(10, (24, 9))
@@ -125,6 +128,7 @@ def test_the_same_bits_in_each_run_and_a_second_backward_pass():
 # -- stiff cases ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opacity", [1e-30, 0.99, 1.0, 1e38, torch.inf])
 @pytest.mark.parametrize("threshold", [0.0, TH])
 def test_opacities_from_nothing_to_everything(opacity, threshold):
@@ -135,6 +139,7 @@ def test_opacities_from_nothing_to_everything(opacity, threshold):
     assert_close(got, expected, certain, 2e-5, 2e-6 + 1e-6 * max(0, math.log2(min(opacity, 1e38))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [30.0, 1e4])
 @pytest.mark.parametrize("turn", [0.0, 0.6, math.pi / 2])
 def test_needles_and_footprints_wider_than_the_picture(length, turn):
@@ -148,6 +153,7 @@ def test_needles_and_footprints_wider_than_the_picture(length, turn):
     assert_close(run(layers, features, torch.ones(()), **exact), expected, torch.ones(()), 5e-5, 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["means2d", "factors", "opacities"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e12])
 def test_what_is_not_finite_or_overflows_is_as_in_torch(field, value):
@@ -164,6 +170,7 @@ def test_what_is_not_finite_or_overflows_is_as_in_torch(field, value):
             assert torch.allclose(a.double(), b.double(), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_long_lists_end_where_the_light_does():
     layers = footprints([0.8] * 60, size=(5, 3))
     features = random(60, 3)

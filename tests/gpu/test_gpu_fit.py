@@ -81,6 +81,7 @@ def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     assert 1 <= waited <= MOST_WAITS
 
 
+@pytest.mark.slow
 def test_gradients_of_two_steps_are_numbas(scene, few):
     pytest.importorskip("numba")
     fits = [trainer(scene, few, backend) for backend in ("triton", "numba")]

@@ -26,6 +26,7 @@ def test_harmonics_of_every_degree_and_features(degree, cameras, handed_over):
     assert not handed_over
 
 
+@pytest.mark.slow
 def test_features_of_any_width_no_colors_and_opacities_of_each_camera():
     gaussians, cameras = wide_scene(None, 100, cameras=2)
     for width in (0, 1, 17):
@@ -36,6 +37,7 @@ def test_features_of_any_width_no_colors_and_opacities_of_each_camera():
     assert_alike(replace(gaussians, opacities=torch.rand(2, 100)), cameras, "triton")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("largest", [1.9, 50.0])
 @pytest.mark.parametrize("threshold", [1 / 255, 0.0])
 def test_large_opacities_widen_what_is_seen_unless_they_belong_to_one_that_is_not_finite(largest, threshold):
@@ -49,6 +51,7 @@ def test_large_opacities_widen_what_is_seen_unless_they_belong_to_one_that_is_no
     assert torch.equal(found.gaussian_ids, expected.gaussian_ids)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "colors"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30])
 def test_what_is_not_finite_or_overflows_is_left_out(field, value):
@@ -89,6 +92,7 @@ def test_options(options):
     assert_alike(*wide_scene(1, 100), "triton", **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [[[50.0, 4.0], [0.0, 60.0]], [[-50.0, 0.0], [0.0, 60.0]]])
 def test_cameras_with_skew_and_negative_focal_lengths(block, handed_over):
     gaussians, cameras = wide_scene(n=100)
@@ -98,6 +102,7 @@ def test_cameras_with_skew_and_negative_focal_lengths(block, handed_over):
     assert not handed_over
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [

@@ -222,6 +222,7 @@ def test_few_points_are_enough_where_many_agree(draw: str) -> None:
     assert 450 <= len(result.points) <= 500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
     views = views.halved()
@@ -276,6 +277,7 @@ def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> N
     assert 0.2 < float((depths.amin(1) > SKY * far).double().mean()) <= 1 / (1 + PER_SKY)
 
 
+@pytest.mark.slow
 def test_a_sweep_to_infinity_finds_the_same_depths_where_there_is_no_sky(views: Views, span) -> None:
     small = views.halved()
     for to, until in zip(sweep_depths(small, *span, to_infinity=True), sweep_depths(small, *span), strict=True):
