@@ -332,6 +332,7 @@ def test_a_large_package_that_cannot_be_loaded(monkeypatch):
         cli.run._of_a_broken_package(ImportError("of ours", name="kgs.errors"))
 
 
+@pytest.mark.slow
 def test_all_photos_can_be_trained_on(folder, tmp_path, capsys):
     assert run("fit", folder, "-o", tmp_path, "--hold-out", 0, "--steps", 6, *FIT) == 0
     assert "no photo was held out" in capsys.readouterr().out
@@ -344,6 +345,7 @@ def test_all_photos_can_be_trained_on(folder, tmp_path, capsys):
     assert "--hold-out: expected" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_scene_may_have_one_photo(folder, tmp_path):
     scene, out = tmp_path / "scene", tmp_path / "out"
     shutil.copytree(folder / "train", scene / "train")

@@ -172,6 +172,7 @@ def test_the_canvas_shows_what_kgs_renders(opened: Browser, renders: Any) -> Non
         assert np.abs(shown - expected).max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 844), (844, 390)])
 def test_the_first_view_is_a_whole_photo_on_every_screen(
     browser: Browser, page: Path, renders: Any, width: int, height: int
@@ -235,6 +236,7 @@ def test_an_antialiased_splat_is_drawn_as_such(browser: Browser, scene: Any, tmp
         assert level > psnr(shown, array(plain[index].clamp(0, 1))) + 6
 
 
+@pytest.mark.slow
 def test_strays_change_nothing_of_what_is_shown(browser: Browser, scene: Any, renders: Any, tmp_path: Path) -> None:
     """Behind all cameras: one that is left out, one that is not so far away, and one with a harmonic of 1e8."""
     gaussians, cameras = scene
@@ -418,6 +420,7 @@ TURNED = """(() => {
 })()"""
 
 
+@pytest.mark.slow
 def test_the_distance_has_limits_and_a_drag_ends_a_quarter_beyond_the_cameras_unless_it_roams(opened: Browser) -> None:
     start = opened.run("viewer.eye.distance")
     for factor, limit in ((1.3, 3), (0.7, 0.3)):
@@ -486,6 +489,7 @@ def test_it_sways_until_it_is_touched(browser: Browser, page: Path) -> None:
     assert not browser.run("viewer.isSwaying")  # where the system asks for less motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: str) -> None:
     browser.size(400, 800, scheme)

@@ -158,6 +158,7 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
     assert any(line.startswith(f"{unfinished}: holds the results") for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failures", [2, 3])  # of the evaluation's, the last one, and the second try of that
 def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
     scene: Any, done: Path, monkeypatch: Any, failures: int
@@ -320,6 +321,7 @@ def test_an_eval_that_fails_while_it_writes_leaves_files_of_kgs(scene: Any, done
     assert seed_of(done) == 1
 
 
+@pytest.mark.slow
 def test_what_an_unfinished_fit_is_replaced_by_is_said(scene: Any, done: Path) -> None:
     assert "is replaced when this one is done; to go on with it, use --resume" in fit(scene, CONFIG, done)[0]
     staging.Staging(done).start()
@@ -419,6 +421,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_first(scene: Any, tmp_pat
     assert (tmp_path / "file").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected at least 6x6 pixels, got 5x5"):
         fit(synthetic_scene(train_views=2, size=(5, 5)), CONFIG, tmp_path / "out")

@@ -344,6 +344,7 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
     assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [250_000, pytest.param(600_000, marks=pytest.mark.slow)])
 def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
     """The first of two, in this process; and the second, in another one that it aborts."""
@@ -371,6 +372,7 @@ def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]
 
 
+@pytest.mark.slow
 def test_neither_solver_sees_what_alpha_hides(folder, tmp_path, monkeypatch):
     shown = []
 

@@ -26,6 +26,7 @@ def test_it_says_versions_devices_and_which_backend_is_taken(capsys):
     assert len(lines) <= 24  # one screen
 
 
+@pytest.mark.slow
 def test_a_backend_that_is_wrong_or_fails_is_told_and_is_a_failure(monkeypatch, capsys):
     real = check.GaussianRenderer.forward
 

@@ -165,6 +165,7 @@ def train_with_mcmc():
     assert losses[-1] < 0.8 * losses[0]
 
 
+@pytest.mark.slow
 def test_mcmc_strategy_trains(monkeypatch):
     """On a CPU, with torch in place of its two functions in CUDA."""
     monkeypatch.setattr(ops, "compute_relocation", relocated)

@@ -43,6 +43,7 @@ def test_fields_are_those_of_a_scene_without_first_points(scene):
     torch.testing.assert_close(scene.train.cameras.cy, torch.full((3,), 41.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["room", pytest.param("orbit", marks=pytest.mark.slow)])
 def test_same_seed_gives_the_same_bits_and_another_seed_another_scene(kind):
     first, again, other = (synthetic_scene(kind, 2, 1, SMALL, seed) for seed in (0, 0, 1))
@@ -124,6 +125,7 @@ def _pairs_per_ray(made, size, extrinsics):
     return len(pairs) / rays[0] / rays[1]
 
 
+@pytest.mark.slow
 def test_the_work_is_bounded(orbit):
     ahead = np.eye(4)
     ahead[:3, 3] = -room.EYE

@@ -56,6 +56,7 @@ def trainer(scene, points, backend, **options):
     return Trainer(scene, make_plan(scene, FitConfig(steps=50, sh_degree=1, backend=backend, **options)), points)
 
 
+@pytest.mark.slow
 def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     fit = trainer(scene, few, "triton")
     fit._look_every = 20  # as on a GPU

@@ -215,6 +215,7 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
     assert planes_wanted(views.select([0]), 2.0, 10.0) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [pytest.param("uniform", marks=pytest.mark.slow), "spread"])
 def test_few_points_are_enough_where_many_agree(draw: str) -> None:
     result = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
@@ -245,6 +246,7 @@ def test_a_spread_draw_follows_the_area_not_the_density() -> None:
     assert float((drawn[:, 1] < 10).double().mean()) < 0.25
 
 
+@pytest.mark.slow
 def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
     every = [dense_points(views.halved(), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")]
     assert len(every[0]) == len(every[1])

@@ -159,6 +159,7 @@ def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
     assert not torch.equal(first, other)
 
 
+@pytest.mark.slow
 def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
     drops, configs = [], []
 

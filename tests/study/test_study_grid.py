@@ -46,6 +46,7 @@ def where(request):
     return {"scheduler": request.getfixturevalue("cluster").scheduler_address}
 
 
+@pytest.mark.slow
 def test_rows_come_in_the_order_of_the_cells(tmp_path, threads):
     cells = [{"x": x, "log": str(tmp_path), "seconds": 0.6 * (x == 0), "kill": None} for x in range(4)]
     rows = run_grid(cells, do, tmp_path / "g.jsonl", scheduler=threads, say=quiet)
