@@ -38,7 +38,7 @@ def _row(result, setting, scene="ordinary"):
 
 def test_it_writes_tables_and_plots(measured):
     out, result = measured
-    assert set(result) == {"generator", "rows", "threads", "versions"}
+    assert set(result) == {"rows", "threads", "versions"}
     assert (out / "precision.md").read_text().count("| ordinary |") == 1
     with (out / "precision.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == len(result["rows"])
