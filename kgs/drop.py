@@ -63,7 +63,7 @@ class DropGaussian(nn.Module):
     The rate of a call is `p * schedule(progress)`. The training loop sets `progress`, in [0, 1]; a layer whose progress
     is never set is plain dropout at p. The first call in `train()` warns about that, and about opacities outside
     [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer as it is, outside its
-    graphs: a rate that rises would otherwise be compiled anew in each step.
+    graphs: a rising rate would otherwise be recompiled in each step.
 
     Args:
         p: the final drop rate, in [0, 1). The paper uses 0.2 for every scene.
