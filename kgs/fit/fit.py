@@ -16,6 +16,7 @@ from kgs.renderer import GaussianRenderer
 from kgs.types import RasterOptions
 
 from .config import FitConfig
+from .targets import background_of
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,7 @@ class Fit:
 
     @cached_property
     def _background(self) -> Tensor | None:
-        background = self.scene.background
-        return background.to(self.device, torch.float32) if background.any() else None
+        return background_of(self.scene, self.device)
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera) -> Tensor:

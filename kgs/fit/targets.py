@@ -7,7 +7,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.camera import move_camera
-from kgs.datasets.scene import Views
+from kgs.datasets.scene import Scene, Views
 from kgs.losses import TargetMoments, target_moments
 
 
@@ -32,6 +32,11 @@ class Target(NamedTuple):
             return self
         image = self.image + self.clear * (background - self.background)[:, None, None]
         return self._replace(image=image, moments=target_moments(image), background=background)
+
+
+def background_of(scene: Scene, device: torch.device) -> Tensor | None:
+    """The background of a scene for the renderer, `(3,)`; None for black."""
+    return scene.background.to(device, torch.float32) if scene.background.any() else None
 
 
 def targets(views: Views, background: Tensor, device: torch.device) -> list[Target]:

@@ -32,7 +32,7 @@ from .fit import Fit
 from .plan import Plan, make_plan
 from .poses import decayed, place_cameras
 from .state import TrainState, check_saved, fingerprint, state_errors
-from .targets import Target, targets
+from .targets import Target, background_of, targets
 
 _LOOK = 20  # steps between limits of the scales, and on a GPU between looks for faults: a read waits for all work
 
@@ -69,7 +69,7 @@ class Trainer:
         device = plan.device
         self._look_every = 1 if device.type == "cpu" else _LOOK
         self._loss = float("nan")
-        self._background = scene.background.to(device, torch.float32) if scene.background.any() else None
+        self._background = background_of(scene, device)
         self._views = targets(scene.train, scene.background, device)
         self._halved = targets(scene.train.halved(), scene.background, device) if plan.times.coarse else []
         self._fingerprint = fingerprint(scene)
@@ -316,7 +316,8 @@ class Trainer:
 
     def _measure_curve(self) -> None:
         state = self.state
-        levels = {"test_psnr": self.psnr(self.scene.test), "train_psnr": self.psnr(self.scene.train)}
+        fit = self.result()
+        levels = {"test_psnr": fit.psnr(self.scene.test), "train_psnr": fit.psnr(self.scene.train)}
         state.curve.append({"step": state.step, "seconds": round(state.seconds, 3), **levels})
 
     def _densify(self) -> None:

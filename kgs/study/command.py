@@ -1,9 +1,13 @@
 """`kgs study`: what DropGaussian is worth."""
 
+import os
+import sys
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from kgs.app.cli.options import Existing, Out
+from kgs.errors import DataError
 
 
 def study(
@@ -37,17 +41,43 @@ def study(
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out, also of fits that are
             done.
         report_only: fit nothing; write the report of the fits that are done.
-    """
-    from kgs.study import study
 
-    return study(
-        out=out,
-        preset=preset,
-        processes=processes,
-        scheduler=scheduler,
-        lpips_weights=lpips_weights,
-        report_only=report_only,
+    Raises:
+        DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
+    """
+    from . import beyond, beyond_report, presets
+    from .cells import sparse_cell
+    from .grid import finished_rows, read_rows, run_grid
+    from .report import write_report
+
+    data = None if "KGS_DATA" not in os.environ else Path(os.environ["KGS_DATA"])
+    if preset == "beyond":
+        cells = beyond.beyond_cells(data)
+        path = out / "beyond.jsonl"
+        do_cell = beyond.beyond_cell
+        write = beyond_report.write_beyond
+    else:
+        cells = presets.sparse_cells(preset, data)
+        path = out / "sparse.jsonl"
+        do_cell = sparse_cell
+        write = write_report
+    if (report_only or read_rows(path)) and not finished_rows(cells, path):
+        raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
+    work = partial(
+        do_cell,
+        data=None if data is None else os.path.abspath(data),
+        lpips_weights=None if lpips_weights is None else os.path.abspath(lpips_weights),
     )
+    try:
+        if not report_only:
+            run_grid(cells, work, path, scheduler=scheduler, processes=processes)
+    finally:
+        rows = finished_rows(cells, path)
+        if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
+            scenes = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
+            options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
+            write(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
+    return int(len(rows) < len(cells))
 
 
 def check_study(lpips_weights: Path | None, **_: Any) -> None:

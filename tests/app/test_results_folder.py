@@ -264,7 +264,7 @@ def test_cameras_that_waited_for_a_fit_come_with_it(
 
 
 def test_a_stopped_move_is_completed_before_other_cameras_are_found(scene: Any, done: Path, monkeypatch: Any) -> None:
-    """They may have to wait in the place of the cameras of the fit that is moved."""
+    """They may have to wait where the cameras of the moved fit are."""
     with monkeypatch.context() as patch:
         patch.setattr(staging.Staging, "complete", lambda self: None)
         fit(scene, OTHER, done)

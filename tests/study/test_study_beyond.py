@@ -11,9 +11,10 @@ from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Scene, pinholes
 from kgs.datasets.synthetic import ARC_CENTER, ARC_HEIGHT, ARC_RADIUS, ARC_SPAN, room, synthetic_depths, views_beyond
 from kgs.geometry import camera_centers
-from kgs.study import beyond, study
+from kgs.study import beyond
 from kgs.study.beyond import Target, beyond_cells, from_the_middle, measure_target, synthetic_targets
 from kgs.study.beyond_report import write_beyond
+from kgs.study.command import study
 
 SIZE = (24, 32)
 

@@ -8,7 +8,8 @@ import pytest
 from study_rows import tiny_cell
 
 from kgs import DataError
-from kgs.study import grid, presets, study
+from kgs.study import grid, presets
+from kgs.study.command import study
 
 
 @pytest.fixture(scope="module")

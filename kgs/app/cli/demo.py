@@ -91,7 +91,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
     say(f"initial points: {len(points.points)} ({points.kind})")
     plan = make_plan(scene, config)
-    Trainer(scene, plan, points).train_step()  # thrown away: to compile the kernels is no part of the training
+    Trainer(scene, plan, points).train_step()  # discarded: it compiles the kernels before the clock starts
     fits = dict[str, "Fit"]()
     runs = dict[str, Any]()
     for name, drop in drops.items():
