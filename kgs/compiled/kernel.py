@@ -12,6 +12,8 @@ import numba as nb
 import numpy as np
 from numba.core import event
 
+from .lanes import floor, power_of_two
+
 f32 = np.float32
 ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
 _LARGEST = np.finfo(np.float32).max
@@ -50,11 +52,11 @@ _E4, _E5, _E6 = f32(9.618437357674640e-3), f32(1.339887440266574e-3), f32(1.5353
 
 @inline
 def exp2(x):
-    """2^x for -126 <= x <= 126: a polynomial times a number made of its exponent bits."""
-    n = np.floor(x + HALF)
+    """2^x of lanes, for -126 <= x <= 128: a polynomial times a power of two."""
+    n = floor(x + HALF)
     f = x - n
-    y = (((((_E6 * f + _E5) * f + _E4) * f + _E3) * f + _E2) * f + _E1) * f + ONE
-    return y * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+    y = (((((f * _E6 + _E5) * f + _E4) * f + _E3) * f + _E2) * f + _E1) * f + ONE
+    return y * power_of_two(n)
 
 
 @inline

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs.compiled.lanes import ROW
 from kgs.compiled.threads import over
+from kgs.memory import array
 
 from .binning_kernels import (
     SIZE,
@@ -31,6 +33,11 @@ from .binning_kernels import (
 
 BANDS = 16
 LEAST = 4096  # entries of a band: the fixed work of a band costs as much as some hundreds of entries
+
+
+def table_width(channels: int, median_depth: bool) -> int:
+    """Columns of the table: what `fill_tables` writes, in whole lanes."""
+    return -(-(7 + channels + median_depth) // ROW) * ROW
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ class TileCoverage:
 
     def __init__(
         self,
-        arrays: Sequence[NDArray[Any]],
+        inputs: Sequence[NDArray[Any]],
         image_size: tuple[int, int],
         cameras: int,
         eps2d: np.float32,
@@ -87,17 +94,17 @@ class TileCoverage:
         self.total_rows = cameras * self.grid[0]
         self._width = width
         self._over = partial(over, threads)
-        means2d, factors, opacities, features, depths, camera_ids = arrays
+        means2d, factors, opacities, features, depths, camera_ids = inputs
         m = len(depths)
-        rows = np.empty((m, 2), np.int32)
-        ids, self.ranks = np.empty((2, m), np.int32)
+        rows = array((m, 2), np.int32)
+        ids = array(m, np.int32)
+        self.ranks = array(m, np.int32)
         self._over(m, find_rows, means2d, factors, opacities, eps2d, alpha_threshold, height, rows)
         n = sort_by_depth(depths.view(np.uint32), rows, ids, self.ranks)
         self.ids = ids[:n]
-        self.heads = np.empty((n, 2), np.int32)
-        self.geometry = np.empty((n, 8), np.float32)
-        self.table = np.empty((n, 7 + channels + median_depth), np.float32)
-        inputs = (means2d, factors, opacities, features, depths, camera_ids)
+        self.heads = array((n, 2), np.int32)
+        self.geometry = array((n, 8))
+        self.table = array((n, table_width(channels, median_depth)))
         sizes = (eps2d, alpha_threshold, self.grid[0], rows, channels)
         self._over(n, fill_tables, self.ids, *inputs, *sizes, self.heads, self.geometry, self.table)
         self._count(max_spans)
@@ -118,9 +125,9 @@ class TileCoverage:
     def _spans(self, begin: int, end: int, low: int, high: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """Where the spans of each Gaussian start, and the spans of the Gaussians `low` to `high` in some rows."""
         heads = self.heads[low:high]
-        starts = np.empty(high - low + 1, np.int64)
+        starts = array(high - low + 1, np.int64)
         begin_spans(heads, begin, end, starts)
-        spans = np.empty(starts[-1], np.int32)
+        spans = array(starts[-1], np.int32)
         rest = (begin, end, self.grid[0], self._width, heads, self.geometry[low:high], starts, spans)
         self._over(high - low, find_spans, *rest)
         return starts, spans
@@ -138,12 +145,12 @@ class TileCoverage:
         targets = before + np.arange(1, count) * (work[end - 1] - before) / count
         bounds = np.unique([begin, *(np.searchsorted(work, targets) + 1), end])
         offsets = np.zeros(len(bounds), np.int64)
-        members = np.empty(len(spans), np.int32)
+        members = array(len(spans), np.int32)
         band_of_row = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
         find_members(self.heads, begin, end, band_of_row, offsets, members)
         ends = np.concatenate([[0], np.cumsum(self.entries_per_row[begin:end])])[bounds - begin]
-        table = np.empty((offsets[-1], self.table.shape[1]), np.float32)
-        entries = np.empty(ends[-1], np.int32)
+        table = array((int(offsets[-1]), self.table.shape[1]))
+        entries = array(ends[-1], np.int32)
         return RowSlice(begin, starts, spans, bounds, offsets, members[: offsets[-1]], table, entries, ends)
 
     def band(self, part: RowSlice, b: int) -> Band:

@@ -4,7 +4,7 @@ In depth order, for each of the n Gaussians that reach a row of tiles:
 
     heads     (n, 2) first row of tiles, numbered through all cameras, and how many
     geometry  (n, 8) what its spans follow from: x, y, half height, squared radius, xy/yy, det/yy, 1/yy, rightmost
-    table     (n, 7 + F) what compositing reads: log2 o, x, y, two whitening vectors, features, maybe its depth
+    table     (n, 7 + F and more) what compositing reads: log2 o, x, y, two whitening vectors, features, its depth
 """
 
 import math
@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from kgs.compiled.kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
+from kgs.compiled.lanes import ROW, load_row, store
 
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048
@@ -217,8 +218,9 @@ def count_entries(begin, end, first_row, columns, heads, starts, spans, members,
 def gather_rows(members, table, rows):
     """The rows of the table of all members. A loop of its own: with the next in one function both take longer."""
     for m in range(len(members)):
-        for j in range(table.shape[1]):
-            rows[m, j] = table[members[m], j]
+        row = table[members[m]]
+        for j in range(0, table.shape[1], ROW):
+            store(rows[m], j, load_row(row, j))
 
 
 @jit

@@ -12,9 +12,10 @@ from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Im
 from kgs.backends.row_slices import row_slices
 from kgs.compiled.arrays import arrays
 from kgs.compiled.threads import over
+from kgs.memory import array, empty
 
 from . import compositing_kernels as kernels
-from .binning import Band, RowSlice, TileCoverage
+from .binning import Band, RowSlice, TileCoverage, table_width
 
 _NUMBER = 4  # bytes
 Floats = NDArray[np.float32]
@@ -39,9 +40,8 @@ class CpuCompositor(Compositor):
         self._blocks = _blocks(features.shape[1])
         channels = sum(width for _, width in self._blocks)
         # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of kept T
-        table_width = 7 + channels + call.median_depth
-        sums_width = 6 + channels + 2 * options.absgrad
-        per_span = _NUMBER * (1 + 1 + table_width + sums_width)
+        sums_width = len(self._blocks) * kernels.ROW
+        per_span = _NUMBER * (1 + 1 + table_width(channels, call.median_depth) + sums_width)
         per_entry = _NUMBER * (1 + kernels.P // kernels.K)
         inputs = (projected.means2d, projected.factors, projected.opacities, features)
         self._size = projected.image_size
@@ -93,30 +93,22 @@ class CpuCompositor(Compositor):
         needs_features = needs[3]
         needs_absolute = self._absgrad and needs[0]
         grads, behind = arrays(grad_features, grad_transmittance[:, 0])
-        columns = self._coverage.table.shape[1] - 1 - self._median_depth
-        totals = np.zeros((len(self._coverage.ids), columns + 2 * needs_absolute), np.float32)
+        totals = array((len(self._coverage.ids), len(self._blocks) * kernels.ROW))
+        totals[:] = 0.0
         no_images = (np.empty_like(behind), _nothing(3), _nothing(4))
         for rows in self._row_slices:
             part, done = self._forward(rows, no_images, True) if kept is None else kept
             kept = None
-            self._backward(part, done, grads, behind, totals, (needs_moments, needs_absolute, needs_features))
+            self._backward(part, done, grads, behind, totals, needs_absolute)
             del part, done  # before the next is made
-        wanted = (*[needs_moments] * 3, needs_features)
-        shapes = [x.shape if want else (0, *x.shape[1:]) for x, want in zip(inputs, wanted, strict=True)]
-        input_grads = [inputs.features.new_empty(shape) for shape in shapes]
+        wanted = (*[needs_moments] * 3, needs_features, needs_absolute)
+        like = (*inputs, inputs.means2d)
+        results = [empty(tuple(x.shape) if want else (0, *x.shape[1:]), x) for x, want in zip(like, wanted, strict=True)]
         factors, opacities = arrays(inputs.factors, inputs.opacities)
         moments = (self._coverage.ranks, totals, factors, opacities, self._eps2d)
-        over(torch.get_num_threads(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*input_grads))
-        gradients = tuple(x if need else None for x, need in zip(input_grads, needs, strict=True))
-        return gradients, self._absolute(inputs.means2d, totals) if needs_absolute else None
-
-    def _absolute(self, means2d: Tensor, totals: Floats) -> Tensor:
-        """The sums of absolute values, the last two columns of `totals`, for all Gaussians."""
-        ranks = torch.from_numpy(self._coverage.ranks)
-        sums = torch.from_numpy(totals[:, -2:])
-        absolute = means2d.new_zeros(means2d.shape)
-        absolute[ranks >= 0] = sums[ranks[ranks >= 0]]
-        return absolute
+        over(torch.get_num_threads(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))
+        gradients = tuple(x if need else None for x, need in zip(results[:4], needs, strict=True))
+        return gradients, results[4] if needs_absolute else None
 
     def _forward(self, rows: tuple[int, int], outputs: tuple[Floats, ...], keep: bool) -> tuple[RowSlice, list[_Done]]:
         """Fill transmittance, median depth and sums; without sums only compute what `backward` needs again."""
@@ -130,7 +122,7 @@ class CpuCompositor(Compositor):
                 band = self._coverage.band(part, b)
                 tiles = len(band.offsets) - 1
                 chunks = len(band.entries) // kernels.K + tiles if keep else 0
-                starts = np.empty((chunks, kernels.P), np.float32)
+                starts = array((chunks, kernels.P))
                 reached = np.empty(tiles, np.int64)
                 lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
                 for first, width in self._blocks if len(sums) else self._blocks[:1]:
@@ -143,18 +135,26 @@ class CpuCompositor(Compositor):
         return part, done
 
     def _backward(
-        self, part: RowSlice, done: list[_Done], grads: Floats, grad_transmittance: Floats, totals: Floats, wanted: Any
+        self,
+        part: RowSlice,
+        done: list[_Done],
+        grads: Floats,
+        grad_transmittance: Floats,
+        totals: Floats,
+        needs_absolute: bool,
     ) -> None:
-        """Add to `totals` what each Gaussian gets: six moments and dL/d features, `(n, 6 + F)`."""
-        sums = np.zeros((len(part.members), totals.shape[1]), np.float32)
+        """Add to `totals` what each Gaussian gets, a row for each block of features."""
+        sums = array((len(self._blocks), len(part.members), kernels.ROW))
 
         def work(begin: int, end: int) -> None:
             for own in done[begin:end]:
                 band = own.band
                 lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
-                for first, width in self._blocks:
-                    rest = (own.starts, own.reached, grads, grad_transmittance, *wanted, sums[band.members])
-                    kernels.composite_backward(*lists, self._threshold, self._stop, first, (0,) * width, *rest)
+                of_band = (own.starts, own.reached, grads, grad_transmittance, needs_absolute)
+                for (first, width), rows in zip(self._blocks, sums, strict=True):
+                    rows[band.members] = 0.0
+                    block = (self._threshold, self._stop, first, (0,) * width)
+                    kernels.composite_backward(*lists, *block, *of_band, rows[band.members])
 
         threads = torch.get_num_threads()
         over(threads, len(done), work, pieces=len(done))

@@ -1,9 +1,9 @@
 """Front-to-back compositing of the lists of a band, and its gradient; formulas as in `kgs.backends.torch`.
 
-A tile is P pixels, the lanes. T is kept at the beginning of every chunk of K entries; the backward pass goes from chunk
-to chunk, back to front, and computes alphas and T of each again, with the same bits. Features come in blocks that a
-kernel is compiled for: V is linear in the features and in dL/dT, so blocks are differentiated one after the other, and
-their moments are added.
+A tile is P pixels, twice the `Lanes` of a kernel: four rows at a time. T is kept at the beginning of every chunk of
+K entries; the backward pass goes from chunk to chunk, back to front, and computes alphas and T of each again, with the
+same bits. Features come in blocks that a kernel is compiled for: V is linear in the features and in dL/dT, so blocks
+are differentiated one after the other, and their moments are added.
 
 What the kernels take, for C cameras, T tiles of a band and blocks of F features:
 
@@ -15,24 +15,43 @@ What the kernels take, for C cameras, T tiles of a band and blocks of F features
     starts                                (chunks, P), T at the beginning of each chunk; or empty
     reached                               (T,), how many entries of each tile were composited
     transmittance, depths                 (C, H, W), the latter the median depth; or empty
-    sums                                  (C, features, H, W); in the backward pass (members, 6 + features)
+    sums                                  (C, features, H, W); in the backward pass (members, ROW) of a block:
+                                          six moments, dL/d features, and from ABSOLUTE on two sums of |dL/d mean|
     grads, grad_transmittance             (C, features, H, W) and (C, H, W), derivatives of the loss
 """
 
 import numpy as np
 
 from kgs.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
+from kgs.compiled.lanes import (
+    ROW,
+    WIDTH,
+    load,
+    load_row,
+    magnitude,
+    maximum,
+    minimum,
+    multiply_add,
+    spread,
+    store,
+    total,
+    totals,
+    where_above,
+    where_at_least,
+)
 
 from .binning_kernels import SIZE, variances
 
 P = SIZE * SIZE
-K = 16
+K = 32
 WIDTHS = (3, 4, 8)  # of blocks of features
+MOMENTS = 6
+FEATURES = 8  # of a row, at most
+ABSOLUTE = MOMENTS + FEATURES
 TINY = 2.0**-125  # smaller alphas and T are 0: products with them would be denormal, and slow
 _ALPHA_MAX = f32(0.99)
 _FLOOR = f32(-126.0)  # of the exponent to base 2: below it floats are denormal
 _CENTRE = f32(0.5 * (SIZE - 1))
-_SLAB = 4 * P
 TWICE_LN2 = f32(1.3862943611198906)  # of the derivative of the exponent to base 2, by the whitening vectors
 _BLOCK = 64
 
@@ -46,22 +65,42 @@ def place_pixels(pixels):
 
 
 @inline
-def gather(table, entries, first, n, feature, channels, layers):
-    """Copy what a chunk needs: reads that miss the caches, many under way at a time."""
+def gather(table, entries, first, n, corner, feature, channels, layers):
+    """Copy what a chunk needs, many reads that miss the caches at a time; centres are about that of the tile."""
     for k in range(n):
-        i = entries[first + k]
-        for j in range(7):
-            layers[k, j] = table[i, j]
-        for f in range(channels):
-            layers[k, 7 + f] = table[i, 7 + feature + f]
+        row = table[entries[first + k]]
+        store(layers, k * ROW, load_row(row, 0) - load_row(corner, 0))
+        if feature > 0:
+            for f in range(channels):
+                layers[k * ROW + 7 + f] = row[7 + feature + f]
 
 
 @inline
-def alpha_of(o, ax, ay, bx, by, dx, dy, threshold):
-    """Alpha of a layer at a pixel."""
-    va, vb = ax * dx + ay * dy, bx * dx + by * dy
-    a = min(exp2(max(o - va * va - vb * vb, _FLOOR)), _ALPHA_MAX)
-    return a if a >= threshold else ZERO
+def alpha_of(layers, k, x, y, threshold):
+    """Alpha of layer k at some pixels."""
+    at = k * ROW
+    dx = x - layers[at + 1]
+    dy = y - layers[at + 2]
+    va = dx * layers[at + 3] + dy * layers[at + 4]
+    vb = dx * layers[at + 5] + dy * layers[at + 6]
+    exponent = maximum(spread(layers[at]) - va * va - vb * vb, _FLOOR)
+    alpha = minimum(exp2(exponent), _ALPHA_MAX)
+    return where_at_least(alpha, threshold, alpha, ZERO)
+
+
+@inline
+def add_color(f, F, color, weight, layers, k):
+    """The sum of feature f with that of layer k."""
+    if f < F:
+        color = color + weight * layers[k * ROW + 7 + f]
+    return color
+
+
+@inline
+def keep_color(f, F, color, s, p):
+    """Write the sum of feature f."""
+    if f < F:
+        store(s, (1 + f) * P + p, color)
 
 
 @jit
@@ -74,162 +113,196 @@ def composite_forward(
     F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
     place_pixels(pixels)
-    s = scratch((3 + F) * P)  # T, w, sums, depth of the last layer before which T was at least one half
-    layers = np.empty((K, 7 + F), np.float32)
+    s = scratch((2 + F) * P)  # T, sums, depth of the last layer before which T was at least one half
+    layers = scratch(K * ROW)
+    corner = scratch(ROW)  # what a row of the table is about
+    corner[:] = ZERO
     last_column = table.shape[1] - 1
     keep = len(starts) > 0
     for t in range(len(reached)):
         camera, tile = (first_tile + t) // (grid[0] * grid[1]), (first_tile + t) % (grid[0] * grid[1])
         y0, x0 = tile // grid[1] * SIZE, tile % grid[1] * SIZE
-        cx, cy = f32(x0) + _CENTRE, f32(y0) + _CENTRE
+        corner[1] = f32(x0) + _CENTRE
+        corner[2] = f32(y0) + _CENTRE
         for p in range(P):  # pixels beyond the image are opaque
             s[p] = ONE if (x0 + p % SIZE < width and y0 + p // SIZE < height) else ZERO
         for p in range((F + 1) * P):
-            s[2 * P + p] = ZERO
+            s[P + p] = ZERO
         first, last = offsets[t], offsets[t + 1]
         chunk = first // K + t
         e = first
         while e < last:
-            most = ZERO
-            for p in range(P):
-                most = max(most, s[p])
-            if most == ZERO:
+            if total(load(s, 0) + load(s, WIDTH) + load(s, 2 * WIDTH) + load(s, 3 * WIDTH)) == ZERO:
                 break
             if keep:
                 for p in range(P):
                     starts[chunk, p] = s[p]
                 chunk += 1
             n = min(K, last - e)
-            gather(table, entries, e, n, feature, F, layers)
-            for k in range(n):
-                o, ux, uy = layers[k, 0], layers[k, 1] - cx, layers[k, 2] - cy
-                ax, ay, bx, by = layers[k, 3], layers[k, 4], layers[k, 5], layers[k, 6]
-                if median:
-                    depth = table[entries[e + k], last_column]
-                    for p in range(P):
-                        s[(2 + F) * P + p] = depth if s[p] >= HALF else s[(2 + F) * P + p]
-                for p in range(P):
-                    a = alpha_of(o, ax, ay, bx, by, pixels[p] - ux, pixels[P + p] - uy, threshold)
-                    w = a * s[p]
-                    left = s[p] - w
-                    left = left if left >= stop else ZERO
-                    s[P + p] = w
-                    s[p] = left
-                for f in range(F):
-                    c = layers[k, 7 + f]
-                    for p in range(P):
-                        s[(2 + f) * P + p] += c * s[P + p]
+            gather(table, entries, e, n, corner, feature, F, layers)
+            for p in range(0, P, WIDTH):
+                x = load(pixels, p)
+                y = load(pixels, P + p)
+                before = load(s, p)
+                depth = load(s, (1 + F) * P + p)
+                c0 = load(s, (1 + min(0, F)) * P + p)
+                c1 = load(s, (1 + min(1, F)) * P + p)
+                c2 = load(s, (1 + min(2, F)) * P + p)
+                c3 = load(s, (1 + min(3, F)) * P + p)
+                c4 = load(s, (1 + min(4, F)) * P + p)
+                c5 = load(s, (1 + min(5, F)) * P + p)
+                c6 = load(s, (1 + min(6, F)) * P + p)
+                c7 = load(s, (1 + min(7, F)) * P + p)
+                for k in range(n):
+                    alpha = alpha_of(layers, k, x, y, threshold)
+                    if median:
+                        depth = where_at_least(before, HALF, table[entries[e + k], last_column], depth)
+                    weight = alpha * where_at_least(before, stop, before, ZERO)
+                    before = multiply_add(before, ZERO - alpha, before)
+                    c0 = add_color(0, F, c0, weight, layers, k)
+                    c1 = add_color(1, F, c1, weight, layers, k)
+                    c2 = add_color(2, F, c2, weight, layers, k)
+                    c3 = add_color(3, F, c3, weight, layers, k)
+                    c4 = add_color(4, F, c4, weight, layers, k)
+                    c5 = add_color(5, F, c5, weight, layers, k)
+                    c6 = add_color(6, F, c6, weight, layers, k)
+                    c7 = add_color(7, F, c7, weight, layers, k)
+                store(s, p, where_at_least(before, stop, before, ZERO))
+                keep_color(0, F, c0, s, p)
+                keep_color(1, F, c1, s, p)
+                keep_color(2, F, c2, s, p)
+                keep_color(3, F, c3, s, p)
+                keep_color(4, F, c4, s, p)
+                keep_color(5, F, c5, s, p)
+                keep_color(6, F, c6, s, p)
+                keep_color(7, F, c7, s, p)
+                store(s, (1 + F) * P + p, depth)
             e += n
         reached[t] = e - first
         for y in range(min(SIZE, height - y0)):
             for x in range(min(SIZE, width - x0)):
                 left = transmittance[camera, y0 + y, x0 + x] = s[y * SIZE + x]
                 if median:
-                    depths[camera, y0 + y, x0 + x] = s[(2 + F) * P + y * SIZE + x] if left < HALF else ZERO
+                    depths[camera, y0 + y, x0 + x] = s[(1 + F) * P + y * SIZE + x] if left < HALF else ZERO
                 for f in range(min(F, sums.shape[1] - feature)):
-                    sums[camera, feature + f, y0 + y, x0 + x] = s[(2 + f) * P + y * SIZE + x]
+                    sums[camera, feature + f, y0 + y, x0 + x] = s[(1 + f) * P + y * SIZE + x]
 
 
 @jit
 def composite_backward(
     first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, reached,
-    grads, grad_transmittance,
-    needs_moments, needs_absolute, needs_features, sums,
+    grads, grad_transmittance, needs_absolute, sums,
 ):  # fmt: skip
     """For each member the six moments of dL/d ln alpha about its centre, and dL/d features, added to `sums`.
 
-    `sums` is `(members, 6 + F)`, and two columns wider where the sums of |dL/d mean| are needed, too. `starts` and
-    `reached` are as `composite_forward` left them; `grad_transmittance` is used with the first block.
+    The sums of |dL/d mean| are computed where they are needed. `starts` and `reached` are as `composite_forward` left
+    them; `grad_transmittance` is used with the first block.
     """
     height, width = grad_transmittance.shape[1], grad_transmittance.shape[2]
     F = len(channels)
     pixels = scratch(2 * P)
     place_pixels(pixels)
     g = scratch(F * P)
-    layers = np.empty((K, 7 + F), np.float32)
-    s = scratch((K + 1) * _SLAB)  # of each layer of a chunk: alpha, w, T before it, V from this layer on
+    behind = scratch(P)  # V behind the layers that are still to come
+    layers = scratch(K * ROW)
+    corner = scratch(ROW)  # what a row of the table is about
+    corner[:] = ZERO
+    alphas = scratch(K * P)  # of each layer of a chunk, later dL/d ln alpha
+    weights = scratch(K * P)
+    after = scratch(K * P)  # T
     for t in range(len(reached)):
         count = reached[t]
         if count == 0:
             continue
         camera, tile = (first_tile + t) // (grid[0] * grid[1]), (first_tile + t) % (grid[0] * grid[1])
         y0, x0 = tile // grid[1] * SIZE, tile % grid[1] * SIZE
-        cx, cy = f32(x0) + _CENTRE, f32(y0) + _CENTRE
+        corner[1] = f32(x0) + _CENTRE
+        corner[2] = f32(y0) + _CENTRE
         for p in range(P):
-            s[3 * P + p] = ZERO
+            behind[p] = ZERO
         for p in range(F * P):
             g[p] = ZERO
-        for y in range(min(SIZE, height - y0)):
-            for x in range(min(SIZE, width - x0)):
+        for row in range(min(SIZE, height - y0)):
+            for column in range(min(SIZE, width - x0)):
                 if feature == 0:
-                    s[3 * P + y * SIZE + x] = grad_transmittance[camera, y0 + y, x0 + x]
+                    behind[row * SIZE + column] = grad_transmittance[camera, y0 + row, x0 + column]
                 for f in range(min(F, grads.shape[1] - feature)):
-                    g[f * P + y * SIZE + x] = grads[camera, feature + f, y0 + y, x0 + x]
+                    g[f * P + row * SIZE + column] = grads[camera, feature + f, y0 + row, x0 + column]
         for chunk in range((count - 1) // K, -1, -1):
             base = offsets[t] + chunk * K
             n = min(K, count - chunk * K)
-            for p in range(P):
-                s[n * _SLAB + 3 * P + p] = s[3 * P + p]  # V behind this chunk
-            for p in range(P):
-                s[2 * P + p] = starts[offsets[t] // K + t + chunk, p]
-            gather(table, entries, base, n, feature, F, layers)
+            gather(table, entries, base, n, corner, feature, F, layers)
+            start = starts[offsets[t] // K + t + chunk]
+            for p in range(0, P, WIDTH):
+                x = load(pixels, p)
+                y = load(pixels, P + p)
+                before = load(start, p)
+                for k in range(n):
+                    alpha = alpha_of(layers, k, x, y, threshold)
+                    store(alphas, k * P + p, alpha)
+                    store(weights, k * P + p, alpha * where_at_least(before, stop, before, ZERO))
+                    before = multiply_add(before, ZERO - alpha, before)
+                    store(after, k * P + p, before)
+                v = load(behind, p)
+                for k in range(n - 1, -1, -1):
+                    value = load(g, p) * layers[k * ROW + 7]
+                    for f in range(1, F):
+                        value = value + load(g, f * P + p) * layers[k * ROW + 7 + f]
+                    alpha = load(alphas, k * P + p)
+                    left = load(after, k * P + p)
+                    step = value - where_at_least(left, stop, v, ZERO)
+                    v = multiply_add(v, where_at_least(left, stop, ONE - alpha, ZERO), alpha * value)
+                    store(alphas, k * P + p, where_above(_ALPHA_MAX, alpha, load(weights, k * P + p) * step, ZERO))
+                store(behind, p, v)
             for k in range(n):
-                b = k * _SLAB
-                o, ux, uy = layers[k, 0], layers[k, 1] - cx, layers[k, 2] - cy
-                ax, ay, bx, by = layers[k, 3], layers[k, 4], layers[k, 5], layers[k, 6]
-                for p in range(P):
-                    a = alpha_of(o, ax, ay, bx, by, pixels[p] - ux, pixels[P + p] - uy, threshold)
-                    w = a * s[b + 2 * P + p]
-                    left = s[b + 2 * P + p] - w
-                    s[b + p] = a
-                    s[b + P + p] = w
-                    s[b + _SLAB + 2 * P + p] = left if left >= stop else ZERO
-            for k in range(n - 1, -1, -1):
-                i = entries[base + k]
-                b = (k * _SLAB) & 0x7FFFFFFF  # so that the compiler knows it is not negative: indices wrap
-                if needs_moments:
-                    ux, uy = layers[k, 1] - cx, layers[k, 2] - cy
-                    m0 = mx = my = mxx = mxy = myy = ZERO
-                    for p in range(P):
-                        value = ZERO
-                        for f in range(F):
-                            value += layers[k, 7 + f] * g[f * P + p]
-                        a, w = s[b + p], s[b + P + p]
-                        later = s[b + _SLAB + 3 * P + p] if s[b + _SLAB + 2 * P + p] > ZERO else ZERO
-                        step = value - later
-                        s[b + 3 * P + p] = later + a * step
-                        d = w * step if a < _ALPHA_MAX else ZERO
-                        dx, dy = pixels[p] - ux, pixels[P + p] - uy
-                        m0 += d
-                        mx += d * dx
-                        my += d * dy
-                        mxx += d * dx * dx
-                        mxy += d * dx * dy
-                        myy += d * dy * dy
-                        s[b + p] = d
-                    sums[i, 0] += m0
-                    sums[i, 1] += mx
-                    sums[i, 2] += my
-                    sums[i, 3] += mxx
-                    sums[i, 4] += mxy
-                    sums[i, 5] += myy
-                if needs_absolute:
-                    ax, ay, bx, by = layers[k, 3], layers[k, 4], layers[k, 5], layers[k, 6]
-                    ux, uy = layers[k, 1] - cx, layers[k, 2] - cy
-                    left_right = up_down = ZERO
-                    for p in range(P):
-                        dx, dy = pixels[p] - ux, pixels[P + p] - uy
-                        va, vb = ax * dx + ay * dy, bx * dx + by * dy
-                        left_right += abs(s[b + p] * (va * ax + vb * bx))
-                        up_down += abs(s[b + p] * (va * ay + vb * by))
-                    sums[i, sums.shape[1] - 2] += TWICE_LN2 * left_right
-                    sums[i, sums.shape[1] - 1] += TWICE_LN2 * up_down
-                if needs_features:
-                    for f in range(F):
-                        total = ZERO
-                        for p in range(P):
-                            total += s[b + P + p] * g[f * P + p]
-                        sums[i, 6 + feature + f] += total
+                add_layer(k, F, needs_absolute, pixels, layers, alphas, weights, g, sums[entries[base + k]])
+
+
+@inline
+def add_layer(k, F, needs_absolute, pixels, layers, derivatives, weights, g, row):
+    """Add to `row`, `(ROW,)`, what layer k of a chunk gets from a tile; derivatives are dL/d ln alpha."""
+    at = k * ROW
+    dx = load(pixels, 0) - layers[at + 1]  # the same in each row
+    m = spread(ZERO)
+    my = spread(ZERO)
+    myy = spread(ZERO)
+    for p in range(0, P, WIDTH):
+        d = load(derivatives, k * P + p)
+        dy = load(pixels, P + p) - layers[at + 2]
+        m = m + d
+        my = my + d * dy
+        myy = myy + d * dy * dy
+    across = spread(ZERO)
+    up = spread(ZERO)
+    if needs_absolute:
+        for p in range(0, P, WIDTH):
+            d = load(derivatives, k * P + p)
+            dy = load(pixels, P + p) - layers[at + 2]
+            va = dx * layers[at + 3] + dy * layers[at + 4]
+            vb = dx * layers[at + 5] + dy * layers[at + 6]
+            across = across + magnitude(d * (va * layers[at + 3] + vb * layers[at + 5]))
+            up = up + magnitude(d * (va * layers[at + 4] + vb * layers[at + 6]))
+    c0 = color_sum(0, F, k, weights, g)
+    c1 = color_sum(1, F, k, weights, g)
+    c2 = color_sum(2, F, k, weights, g)
+    c3 = color_sum(3, F, k, weights, g)
+    c4 = color_sum(4, F, k, weights, g)
+    c5 = color_sum(5, F, k, weights, g)
+    c6 = color_sum(6, F, k, weights, g)
+    c7 = color_sum(7, F, k, weights, g)
+    moments = (m, m * dx, my, m * dx * dx, my * dx, myy)
+    gained = totals((*moments, c0, c1, c2, c3, c4, c5, c6, c7, across * TWICE_LN2, up * TWICE_LN2))
+    store(row, 0, load_row(row, 0) + gained)
+
+
+@inline
+def color_sum(f, F, k, weights, g):
+    """The sum of weight times dL/d image of feature f, in lanes."""
+    result = spread(ZERO)
+    if f < F:
+        for p in range(0, P, WIDTH):
+            result = result + load(weights, k * P + p) * load(g, f * P + p)
+    return result
 
 
 @jit
@@ -241,27 +314,37 @@ def add_members(begin, end, offsets, members, sums, totals):
             i = members[m]
             if i >= end:
                 break
-            for j in range(totals.shape[1]):
-                totals[i, j] += sums[m, j]
+            for b in range(len(sums)):
+                for j in range(ROW):
+                    totals[i, b * ROW + j] += sums[b, m, j]
 
 
 @jit
 def fill_gradients(
-    begin, end, ranks, totals, factors, opacities, eps2d, d_means2d, d_factors, d_opacities, d_features
+    begin, end, ranks, totals, factors, opacities, eps2d, d_means2d, d_factors, d_opacities, d_features, d_absolute,
 ):  # fmt: skip
     """From moments to gradients, see `kgs.covariance.moment_gradients`; what is not wanted is empty."""
     F = d_features.shape[1] if len(d_features) else 0
     needs_moments = len(d_opacities) > 0
-    gathered = np.empty((_BLOCK, 6 + F), np.float32)
+    needs_absolute = len(d_absolute) > 0
+    gathered = np.empty((_BLOCK, totals.shape[1]), np.float32)
     for block in range(begin, end, _BLOCK):
         stop = min(block + _BLOCK, end)
         for g in range(block, stop):  # reads that miss the caches, many under way at a time
-            for j in range(6 + F):
+            for j in range(totals.shape[1]):
                 gathered[g - block, j] = totals[ranks[g], j] if ranks[g] >= 0 else ZERO
         for g in range(block, stop):
             total = gathered[g - block]
             for f in range(F):
-                d_features[g, f] = total[6 + f]
+                d_features[g, f] = total[f // FEATURES * ROW + MOMENTS + f % FEATURES]
+            for b in range(ROW, totals.shape[1], ROW):  # V is linear in the features
+                for j in range(MOMENTS):
+                    total[j] += total[b + j]
+                for j in range(ABSOLUTE, ROW):
+                    total[j] += total[b + j]
+            if needs_absolute:
+                d_absolute[g, 0] = total[ABSOLUTE]
+                d_absolute[g, 1] = total[ABSOLUTE + 1]
             if not needs_moments:
                 continue
             a0, a1, a2 = factors[g, 0, 0], factors[g, 0, 1], factors[g, 0, 2]

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from kgs.compiled.arrays import arrays
 from kgs.compiled.threads import over
+from kgs.memory import array
 
 from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
 
@@ -28,7 +29,7 @@ def loss_and_gradient(
     channels, height, width = x.shape
     bands = channels * -(-height // BAND)
     pieces = min(PIECES, -(-x.size // LEAST))
-    maps = np.empty((3, *x.shape), np.float32)
+    maps = array((3, *x.shape))
     sums = np.zeros((bands, 2))
     over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
     absolute, ssim = sums.sum(0) / x.size
@@ -36,7 +37,7 @@ def loss_and_gradient(
     if not gradient:
         return loss, None
     image_gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
-    padded = np.empty((channels, height + 2 * RADIUS, width), np.float32)
+    padded = array((channels, height + 2 * RADIUS, width))
     bands = channels * -(-padded.shape[1] // BAND)
     over(threads, bands, ssim_gradient, half, x, y, maps, padded, pieces=pieces)
     by_ssim = np.float32(-dssim_weight / x.size)

@@ -13,7 +13,7 @@ from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, Frame, whole_frame
 from kgs.compiled.arrays import Array, arrays
 from kgs.compiled.threads import over
-from kgs.memory import empty
+from kgs.memory import array, empty
 from kgs.projection import finite_gaussians, visibility_cutoff
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
@@ -67,7 +67,7 @@ class _Projection(torch.autograd.Function):
         counts = np.zeros((-(-n // BLOCK), 2), np.int64)  # visible and not finite, of each block
         parts = []
         for c, view in enumerate(views):
-            lists = [*(inputs[0].new_empty(shape) for shape in shapes), inputs[0].new_empty(n, dtype=torch.int64)]
+            lists = [*(empty(shape, inputs[0]) for shape in shapes), torch.from_numpy(array(n, np.int64))]
             out = tuple(x.numpy() for x in lists)
             threads = torch.get_num_threads()
             over(threads, len(counts), footprints, *values, c, view, frustum, out, counts, pieces=16)
