@@ -75,7 +75,6 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     """
     from kgs.app.files.exports import write_exports
     from kgs.app.files.figures import write_curve, write_sheet
-    from kgs.app.files.outputs import film_in
     from kgs.app.files.staging import Staging
     from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
@@ -120,7 +119,6 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
         "kgs demo",
         fits,
         notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
-        film=film_in(folder),
     )
     staging.seal()
     staging.complete()
