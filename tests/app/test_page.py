@@ -13,8 +13,9 @@ import torch
 from factories import batch, random_camera, random_gaussians
 
 import kgs
+from kgs.app.files.plot import psnr_plot
 from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
-from kgs.app.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
+from kgs.app.page.figures import facts, measure_table, verdict, without_folders
 from kgs.app.page.write import MOST_BYTES
 
 SIZE = (24, 32)

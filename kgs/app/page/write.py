@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.app.files.film import path_near_plane
+from kgs.app.files.plot import psnr_plot
 from kgs.camera import MARGIN
 from kgs.json_files import write_whole
 from kgs.types import RasterOptions
@@ -16,7 +17,7 @@ from kgs.version import __version__
 from .cameras import training_cameras, viewer_scene
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .data import Packed, pack
-from .figures import facts, measure_table, psnr_of_views, psnr_plot, verdict, without_folders
+from .figures import facts, measure_table, psnr_of_views, verdict, without_folders
 from .pictures import GAIN, encoded
 
 MOST_BYTES = 8_000_000  # of a page
