@@ -334,7 +334,7 @@ def test_an_error_of_the_encoder_reaches_the_caller(last: int) -> None:
             raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space left"):
-        encoders._in_thread(work, iter(range(10)))  # type: ignore[arg-type]
+        encoders._in_thread(work, iter(range(10)))
     assert encoded[: last + 1] == list(range(last + 1))
 
 

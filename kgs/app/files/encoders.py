@@ -88,13 +88,13 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int]) -> str:
     return why
 
 
-def _in_thread(work: Callable[[Frame], None], frames: Iterable[Frame]) -> int:
+def _in_thread(work: Callable[[Any], Any], frames: Iterable[Any]) -> int:
     """Call `work` with each frame in a thread of its own, in order, while the next ones are made; returns their number.
 
     What `work` or the frames raise is raised here, once the frames before it are done.
     """
     count = 0
-    waiting = deque[Future[None]]()
+    waiting = deque[Future[Any]]()
     with ThreadPoolExecutor(1, "encoder") as encoder:
         for frame in frames:
             waiting.append(encoder.submit(work, frame))
