@@ -293,6 +293,26 @@ def test_the_colours_of_a_film_are_those_of_the_frames(tmp_path: Path, suffix: s
     np.testing.assert_allclose(shown.astype(int), colors, rtol=0, atol=6)
 
 
+def test_each_frame_has_its_time(tmp_path: Path, suffix: str) -> None:
+    """Read by PyAV, which takes all times of a file into account."""
+    av = pytest.importorskip("av")
+    path = tmp_path / f"a{suffix}"
+    assert encoders.encode(path, [np.zeros((48, 64, 3), np.uint8)] * 60, (64, 48)) == ""
+    with av.open(str(path)) as file:
+        times = [frame.time for frame in file.decode(video=0)]
+        stream = file.streams.video[0]
+        assert stream.average_rate == 24
+        assert file.duration / 1e6 == pytest.approx(2.5, abs=0.002)
+        assert stream.metadata.get("DURATION", "00:00:02.500000000") == "00:00:02.500000000"
+    assert times == pytest.approx([i / 24 for i in range(60)], abs=1e-4)
+
+
+def test_a_webm_of_unknown_layout_is_no_film(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(encoders, "_HEAD_BYTES", 64)
+    assert write_film(tmp_path / "a.webm", render, views_of((12, 16)), 1.0).startswith("no a.webm: ")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_frames_are_made_while_others_are_encoded(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
     """The second frame is made before the first one is encoded, which waits for it; no more than a few are ahead."""
     made: list[int] = []
