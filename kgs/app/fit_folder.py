@@ -86,7 +86,7 @@ def fit_folder(
     """
     out = Path(out)
     stages = Stages(say) if stages is None else stages
-    check_packages("jinja2", "matplotlib")  # even what is used only after training
+    check_packages("jinja2")  # even what is used only after training
     plan = make_plan(scene, config)
     _check_size(scene, config, lpips)
     names = png_names([*scene.train.names, *scene.test.names])

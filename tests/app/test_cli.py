@@ -289,7 +289,7 @@ def test_without_a_terminal_there_is_a_line_for_each_tenth(folder, tmp_path, cap
     assert f"open {tmp_path / 'index.html'} in a browser" in said.out
 
 
-@pytest.mark.parametrize("package", ["tyro", "matplotlib"])
+@pytest.mark.parametrize("package", ["tyro", "jinja2"])
 def test_a_missing_extra_is_one_line_before_any_work(folder, tmp_path, package, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     assert run("fit", folder, "-o", tmp_path / "out") == 2

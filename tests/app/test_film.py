@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -292,38 +293,69 @@ def test_the_colours_of_a_film_are_those_of_the_frames(tmp_path: Path, suffix: s
     np.testing.assert_allclose(shown.astype(int), colors, rtol=0, atol=6)
 
 
-def test_a_film_of_too_many_bytes_is_made_smaller(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
-    monkeypatch.setattr(film, "FRAMES", 6)
-    monkeypatch.setattr(encoders, "BITS", 4.0)
-    path, views = tmp_path / f"film{suffix}", views_of((180, 240))
-    noise = torch.rand(6, 3, 180, 240, generator=torch.Generator().manual_seed(0))
-    frames = iter(noise)
-    assert write_film(path, lambda _: next(frames)[None], views, 1.0) == ""
-    size = path.stat().st_size
-    assert film.film_within(path, size) == path.read_bytes()
-    smaller = tmp_path / f"smaller{suffix}"
-    smaller.write_bytes(film.film_within(path, size // 3))
-    assert 0 < smaller.stat().st_size <= size // 3
-    video, count = cv2.VideoCapture(str(smaller)), 0
-    while (found := video.read())[0]:
-        count += 1
-        height, width = found[1].shape[:2]
-    assert count == 6
-    assert width / height == pytest.approx(4 / 3, rel=0.05)
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
-    assert film.film_within(path, 100) == b""
+def test_each_frame_has_its_time(tmp_path: Path, suffix: str) -> None:
+    """Read by PyAV, which takes all times of a file into account."""
+    av = pytest.importorskip("av")
+    path = tmp_path / f"a{suffix}"
+    assert encoders.encode(path, [np.zeros((48, 64, 3), np.uint8)] * 60, (64, 48)) == ""
+    with av.open(str(path)) as file:
+        times = [frame.time for frame in file.decode(video=0)]
+        stream = file.streams.video[0]
+        assert stream.average_rate == 24
+        assert file.duration / 1e6 == pytest.approx(2.5, abs=0.002)
+        assert stream.metadata.get("DURATION", "00:00:02.500000000") == "00:00:02.500000000"
+    assert times == pytest.approx([i / 24 for i in range(60)], abs=1e-4)
 
 
-def test_an_mp4_where_there_is_no_encoder_any_more_is_shown_as_webm(tmp_path: Path, monkeypatch: Any) -> None:
-    pytest.importorskip("av")
-    frames = np.random.default_rng(0).integers(0, 256, (6, 180, 240, 3)).astype(np.uint8)
-    with monkeypatch.context() as patch:
-        patch.setenv(encoders.ASKED, "libx264")
-        assert encoders.encode(tmp_path / "film.mp4", frames, (240, 180), 4e6) == ""
-    monkeypatch.setitem(sys.modules, "av", None)
-    smaller = film.film_within(tmp_path / "film.mp4", 60_000)
-    assert 0 < len(smaller) <= 60_000
-    assert smaller[:4] == b"\x1aE\xdf\xa3"  # EBML
+def test_a_webm_of_unknown_layout_is_no_film(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(encoders, "_HEAD_BYTES", 64)
+    assert write_film(tmp_path / "a.webm", render, views_of((12, 16)), 1.0).startswith("no a.webm: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_are_made_while_others_are_encoded(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
+    """The second frame is made before the first one is encoded, which waits for it; no more than a few are ahead."""
+    made: list[int] = []
+    encoded: list[int] = []
+    ahead: list[int] = []
+    second = threading.Event()
+    write = encoders._in_thread
+
+    def frames() -> Any:
+        for i in range(30):
+            made.append(i)
+            if i == 1:
+                second.set()
+            ahead.append(len(made) - len(encoded))
+            yield np.full((48, 64, 3), 8 * i, np.uint8)
+
+    def watched(work: Any, frames: Any) -> int:
+        def slowly(frame: Any) -> None:
+            assert second.wait(20)
+            work(frame)
+            encoded.append(frame[0, 0, 0] // 8)
+
+        return write(slowly, frames)
+
+    monkeypatch.setattr(encoders, "_in_thread", watched)
+    assert encoders.encode(tmp_path / f"a{suffix}", frames(), (64, 48)) == ""
+    assert encoded == made == list(range(30))
+    assert max(ahead) <= 8
+
+
+@pytest.mark.parametrize("last", [0, 2, 9])
+def test_an_error_of_the_encoder_reaches_the_caller(last: int) -> None:
+    """Also of the last frame, after which no other one is made; and no frame comes after it."""
+    encoded: list[int] = []
+
+    def work(frame: Any) -> None:
+        encoded.append(frame)
+        if frame == last:
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        encoders._in_thread(work, iter(range(10)))
+    assert encoded[: last + 1] == list(range(last + 1))
 
 
 def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:

@@ -13,8 +13,9 @@ import torch
 from factories import batch, random_camera, random_gaussians
 
 import kgs
+from kgs.app.files.plot import psnr_plot
 from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
-from kgs.app.page.figures import facts, measure_table, psnr_plot, verdict, without_folders
+from kgs.app.page.figures import facts, measure_table, verdict, without_folders
 from kgs.app.page.write import MOST_BYTES
 
 SIZE = (24, 32)
@@ -28,13 +29,12 @@ def views(*values: float) -> dict[str, Any]:
     return {"psnr": sum(values) / len(values), "ssim": 0.5, "lpips_vgg": None, "views": rows}
 
 
-def content(pictures: list[Picture] | None = None, film: bytes = b"", **words: Any) -> PageContent:
+def content(pictures: list[Picture] | None = None, **words: Any) -> PageContent:
     """A page of three photos, of which the last one was held out; `words` are entries of its text."""
     return PageContent(
         PageSplat(GAUSSIANS, background=torch.zeros(3)),
         PagePhotos(CAMERAS, NAMES, ["training", "training", "test"], pictures or []),
         PageText(**{"title": "a title", **words}),
-        film,
     )
 
 
@@ -111,16 +111,15 @@ def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
     assert cited[0].endswith(f"version = {{{kgs.__version__}}}")
 
 
-def test_a_stray_gaussian_costs_no_film_and_is_named(tmp_path: Path) -> None:
+def test_a_stray_gaussian_is_named(tmp_path: Path) -> None:
     means = GAUSSIANS.means.clone()
     means[3, 0] = 1e12
     path = tmp_path / "index.html"
-    page = content(film=bytes(20_000))
+    page = content()
     words = write_page(path, replace(page, splat=replace(page.splat, gaussians=replace(GAUSSIANS, means=means))))
     assert words == "all but 1 stray Gaussian"
     text = path.read_text(encoding="utf-8")
     assert "This page shows all but 1 stray Gaussian" in text
-    assert "<video" in text
 
 
 def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
@@ -162,18 +161,6 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
 def test_one_sentence_says_how_good_it_is(runs: Any, expected: str) -> None:
     assert expected in verdict(runs)
     assert verdict({}) == verdict({"": {"test": None}}) == ""
-
-
-def test_a_film_is_left_out_before_anything_of_the_splat(tmp_path: Path) -> None:
-    path, film = tmp_path / "index.html", bytes(20_000)
-    assert "<video" not in write(path)
-    bare = len(path.read_bytes())
-    for start, kind in ((b"\0\0\0\x20ftypisom", "mp4"), (b"\x1aE\xdf\xa3", "webm"), (b"", "webm")):
-        assert f'src="data:video/{kind};base64,' in write(path, film=start + film)
-    text = write(path, film=film, most_bytes=bare + 20_000)  # base64 makes 27 000 of them
-    assert "<video" not in text
-    assert "This page shows" not in text
-    assert "<video" not in write(path, film=bytes(1_100_001))
 
 
 def test_curves_stay_in_their_picture() -> None:

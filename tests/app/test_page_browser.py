@@ -18,7 +18,6 @@ from factories import batch, random_camera, random_gaussians, with_camera
 
 import kgs
 from kgs import Gaussians
-from kgs.app.files import film as films
 from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
 from kgs.app.page.fit_page import write_fit_page
 from kgs.app.sfm import pose_photos
@@ -81,9 +80,6 @@ def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
     views = [{"name": names[3], "psnr": 20.0, "ssim": 0.5, "ssim_zero_padded": 0.5, "lpips_vgg": 0.25}]
     curve = [{"step": i, "seconds": 1.0 * i, "test_psnr": 20 + i / 9, "train_psnr": 25.0 + i} for i in range(4)]
     metrics = {"test": {**views[0], "views": views}, "train": None, "curve": curve, "seconds": 3.0, "steps": 3}
-    film = path.with_name("film.webm")
-    views_of_film = Views(cameras, renders, tuple(names))
-    assert films.write_film(film, lambda _: renders[:1], views_of_film, 4.0) == ""
     settings = {"init_file": "/photos/someone/points.ply", "a_setting_with_a_long_name": "x" * 60}
     write_page(
         path,
@@ -91,7 +87,6 @@ def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
             PageSplat(gaussians, BACKGROUND),
             PagePhotos(cameras, names, PARTS, pictures),
             PageText("A test", {"": metrics}, settings=settings),
-            film.read_bytes(),
         ),
     )
     return path
@@ -111,11 +106,7 @@ def bare_page(gaussians: Gaussians, cameras: Any, **options: Any) -> PageContent
     return PageContent(splat, PagePhotos(cameras, list("abcd"), PARTS), PageText("a"))
 
 
-def test_it_and_its_film_load_from_a_file_without_the_network_or_an_error(opened: Browser, page: Path) -> None:
-    film = "document.querySelector('video')"
-    opened.wait(f"{film}.readyState >= 2")
-    assert opened.run(f"[{film}.videoWidth, {film}.videoHeight]") == [SIZE[1], SIZE[0]]
-    assert opened.run(f"{film}.duration") == pytest.approx(films.FRAMES / films.RATE, abs=0.01)
+def test_it_loads_from_a_file_without_the_network_or_an_error(opened: Browser, page: Path) -> None:
     assert [url for url in opened.requests if not url.startswith("data:")] == [page.as_uri()]
     assert opened.problems == []
 
@@ -472,21 +463,95 @@ def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, pa
     assert browser.run("scrollY") == before
 
 
-@pytest.mark.slow
-def test_it_sways_until_it_is_touched(browser: Browser, page: Path) -> None:
-    browser.size(1000, 800, motion="no-preference")
-    browser.open(page, READY)
-    place = "JSON.stringify(viewer.eye.position)"
-    start = browser.run(place)
-    browser.wait(f"{place} !== {start!r}")
-    browser.run("document.querySelector('.stage').dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
-    assert not browser.run("viewer.isSwaying")
-    stopped = browser.run(place)
+PLACE = "JSON.stringify(viewer.eye.position)"
+TOUCHES = {
+    "a press": "document.querySelector('.stage').dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))",
+    "a key": "viewer.canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))",
+    "a zoom": "viewer.zoom(1.1)",
+    "Start": "document.querySelector('.start').click()",
+    "a photo": "viewer.choice.dispatchEvent(new Event('change'))",
+}
+
+
+def is_pressed(browser: Browser) -> bool:
+    return bool(browser.run("document.querySelector('.play').getAttribute('aria-pressed') === 'true'"))
+
+
+def is_at_rest(browser: Browser) -> bool:
+    """Whether the eye stands still, once a flight to a photo had its time."""
+    wait = "new Promise((done) => setTimeout(done, 1000))"
+    before = browser.run(f"{wait}.then(() => {PLACE})")
     browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    assert browser.run(place) == stopped
+    return bool(browser.run(PLACE) == before)
+
+
+def test_play_flies_the_tour_in_its_time_and_around_again(browser: Browser, page: Path) -> None:
+    """By the clock that a browser gives to frames: each second has a sixth of the poses, up to those of the film."""
     browser.size(1000, 800)
     browser.open(page, READY)
-    assert not browser.run("viewer.isSwaying")  # where the system asks for less motion
+    assert not is_pressed(browser)
+    clock = """(() => {
+      window.steps = [];
+      window.requestAnimationFrame = (step) => steps.push(step);
+      window.matchMedia = () => ({ matches: false });
+      viewer.draw = () => {};
+      window.now = 0;
+      window.pass = (seconds) => {
+        for (const end = now + 1000 * seconds; now < end - 1; now += 50) steps.splice(0).forEach((step) => step(now));
+        return [viewer.eye.position, viewer.eye.rotation];
+      };
+    })()"""
+    browser.run(clock)
+    browser.run("viewer.place(3)")  # not one of the tour
+    browser.run("document.querySelector('.play').click()")
+    assert is_pressed(browser)
+    browser.run("pass(0.05)")
+    poses = browser.run("viewer.scene.tour.poses")
+    assert len(poses) == 144
+    eye = np.array(browser.run("viewer.eye.position"))
+    start = int(np.argmin([np.linalg.norm(np.array(pose["position"]) - eye) for pose in poses]))
+    passed = 0
+    for seconds in (3, 1, 2, 6, 5):  # more than two rounds
+        position, rotation = browser.run(f"pass({seconds})")
+        passed += seconds
+        expected = poses[(start + 24 * passed) % 144]
+        np.testing.assert_allclose(position, expected["position"], atol=1e-6)
+        np.testing.assert_allclose(rotation, expected["rotation"], atol=1e-5)
+    browser.run("document.querySelector('.play').click()")
+    assert not is_pressed(browser)
+    before = browser.run(PLACE)
+    browser.run("pass(1)")
+    assert browser.run(PLACE) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("touch", TOUCHES.values(), ids=TOUCHES)
+def test_the_tour_ends_with_any_touch(browser: Browser, page: Path, touch: str) -> None:
+    """The slow one that the page begins with, and the one that was asked for."""
+    browser.size(400, 800, motion="no-preference")
+    browser.open(page, READY)
+    for has_asked in (False, True):
+        if has_asked:
+            browser.run("document.querySelector('.play').click()")
+        assert is_pressed(browser) == has_asked
+        start = browser.run(PLACE)
+        browser.wait(f"{PLACE} !== {start!r}")
+        browser.run(touch)
+        assert not is_pressed(browser)
+        assert is_at_rest(browser)
+
+
+def test_where_less_motion_is_wanted_play_shows_pictures(opened: Browser) -> None:
+    assert is_at_rest(opened)
+    opened.run("viewer.draw = () => seen.add(JSON.stringify(viewer.eye)); window.seen = new Set()")
+    opened.run("document.querySelector('.play').focus()")
+    press(opened, "Enter", code="Enter", text="\r")  # the button takes the keyboard
+    opened.wait("seen.size >= 2")
+    assert is_pressed(opened)
+    poses = opened.run("viewer.scene.tour.poses.map((pose) => JSON.stringify(pose.position))")
+    shown = opened.run("[...seen].map((eye) => JSON.stringify(JSON.parse(eye).position))")
+    places = [poses.index(position) for position in shown]
+    assert (places[1] - places[0]) % 144 == 36
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
+from kgs.app.files import film
 from kgs.app.page.cameras import viewer_scene
+from kgs.datasets.scene import Views
 
 MEANS = torch.tensor([[0.0, 0.0, 4.0]])
 
@@ -103,18 +106,27 @@ def test_a_single_camera_has_a_small_arc_also_one_that_looks_down() -> None:
     assert np.linalg.norm(arc["origin"]) == pytest.approx(1)
 
 
-def test_the_sway_begins_at_the_first_camera_and_passes_them_all() -> None:
-    scene = around(-20.0, 0.0, 30.0)
-    places = np.array([pose["position"] for pose in scene["sway"]])
-    cameras = np.array([camera["position"] for camera in scene["cameras"]])
-    distances = np.linalg.norm(places - cameras[:, None], axis=2)
-    assert distances[scene["first"]].argmin() == 0
-    assert distances.min(axis=1).max() < 0.15
-    steps = np.linalg.norm(np.diff(places, axis=0, append=places[:1]), axis=1)
-    assert steps.max() < 0.3  # also from the last to the first
-    for pose in scene["sway"]:
-        rotation = np.array(pose["rotation"])
-        assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5
+@pytest.mark.parametrize("size", [1e-5, 1.0, 1e5])
+def test_the_tour_is_the_path_of_the_film(tmp_path: Path, monkeypatch: Any, size: float) -> None:
+    """Of scenes of any size: against the cameras that the film of the training views is rendered from."""
+    monkeypatch.setattr(film, "FRAMES", 144)
+    cameras = batch(*(camera(size * x) for x in (-1.0, 0.1, 0.7, 2.0)))
+    parts = ["training"] * 3 + ["test"]
+    tour = viewer_scene(cameras, list("abcd"), parts, size * MEANS)["tour"]
+    filmed = []
+
+    def render(one: PinholeCamera) -> Tensor:
+        filmed.append(one.extrinsics[0])
+        return torch.zeros(1, 3, 60, 80)
+
+    views = Views(cameras, torch.zeros(4, 3, 60, 80), tuple("abcd")).select([0, 1, 2])
+    assert film.write_film(tmp_path / "a.webm", render, views, 4 * size) == ""
+    assert tour["seconds"] == len(filmed) / 24
+    poses = torch.stack(filmed)
+    rotations = torch.tensor([pose["rotation"] for pose in tour["poses"]]).double()
+    positions = torch.tensor([pose["position"] for pose in tour["poses"]]).double()
+    torch.testing.assert_close(rotations, poses[:, :3, :3], rtol=0, atol=1e-6)
+    torch.testing.assert_close(positions, torch.linalg.inv(poses)[:, :3, 3], rtol=0, atol=1e-5 * size)
 
 
 def test_pyramids_are_smaller_than_the_distance_of_neighbours() -> None:

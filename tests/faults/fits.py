@@ -21,9 +21,7 @@ __all__ = ["PATIENCE", "Fit", "memory_of"]
 SIZE = (48, 64)
 PATIENCE = 300.0  # seconds after which a process is taken to hang
 _PROCESSES = multiprocessing.get_context("forkserver")  # which has imported what they need once for all of them
-_PROCESSES.set_forkserver_preload(
-    ["kgs.datasets", "kgs.app.fit_folder", "torch._dynamo", "matplotlib.figure", "trimesh"]
-)
+_PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.app.fit_folder", "torch._dynamo", "trimesh"])
 
 
 def _config(steps: int, points: Path, **changes: Any) -> FitConfig:

@@ -48,7 +48,7 @@ def demo(
     from kgs.machine import check_tools
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    check_tools(device, backend, "matplotlib", "jinja2")
+    check_tools(device, backend, "jinja2")
     check_folder(out, _files())
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
@@ -75,7 +75,6 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     """
     from kgs.app.files.exports import write_exports
     from kgs.app.files.figures import write_curve, write_sheet
-    from kgs.app.files.outputs import film_in
     from kgs.app.files.staging import Staging
     from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
@@ -120,7 +119,6 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
         "kgs demo",
         fits,
         notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
-        film=film_in(folder),
     )
     staging.seal()
     staging.complete()
@@ -142,7 +140,7 @@ def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backen
     FitConfig(steps=steps)
     if min(size) < 12:  # the window of SSIM
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
-    check_installed(device, backend, "matplotlib", "jinja2")
+    check_installed(device, backend, "jinja2")
     check_folder(out, _files(), make=False)
     if "fit" in read_list(out):
         raise DataError(out, "", "holds the results of kgs fit: choose another folder")

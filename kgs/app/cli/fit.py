@@ -89,7 +89,7 @@ def fit(
     from .checks import SMALLEST
     from .unposed import find_scene, is_unposed, on_ctrl_c
 
-    check_packages("matplotlib", "safetensors", "jinja2")
+    check_packages("safetensors", "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     request = SceneRequest(
         scene=os.path.abspath(scene),
@@ -176,7 +176,7 @@ def check_fit(
     check_options(downscale, hold_out)
     unposed = is_unposed(scene)
     solver = ["pycolmap"] if unposed else []
-    check_installed(config.device, config.backend, "matplotlib", "safetensors", "jinja2", *solver)
+    check_installed(config.device, config.backend, "safetensors", "jinja2", *solver)
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_folder(out, replaced_files(out), scene, make=False)

@@ -1,13 +1,11 @@
 """A film of a splat: a smooth path through the training cameras at one speed, as a file that browsers play."""
 
 import os
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -20,7 +18,7 @@ from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import meeting_point, typical_depths
 
 from .cameras import upright
-from .encoders import MP4, RATE, encode, film_suffix
+from .encoders import encode
 from .images import eight_bits
 
 FRAMES = 144
@@ -29,10 +27,8 @@ _TURN = 40.0  # largest v^2 / r at speed 1, in path lengths: only turns of a rad
 _PIECES = 4000  # in which a path is measured
 LONGEST = 640  # pixels of the longer side
 _STOPS = 12  # largest number of cameras on a path: as many as three seconds can pass smoothly
-_LEAST_SIDE = 64  # pixels of a film that is made smaller
 _SWAY = 0.03  # radius of the path around a single camera, as a share of the scene's depth
 _CLEAR = 0.5  # of the nearest typical depth
-_SPARE = 4  # H.264: the bits for a pixel can be divided by this before there are fewer pixels
 Array = NDArray[np.float64]
 
 
@@ -86,41 +82,6 @@ def path_near_plane(means: Tensor, cameras: PinholeCamera, near_plane: float) ->
         near_plane: of the fit, in world units, which the result is not below.
     """
     return max(near_plane, _CLEAR * typical_depths(means, cameras)[0])
-
-
-def film_within(path: Path, most_bytes: int) -> bytes:
-    """The content of a film that `write_film` wrote, encoded again if it has more than `most_bytes`.
-
-    H.264 gets fewer bits for a pixel first; then, and VP8 at once, as OpenCV knows no other rate for it, fewer pixels.
-    b"" where the film cannot be made so small.
-    """
-    content = path.read_bytes()
-    video = cv2.VideoCapture(str(path))
-    width = video.get(cv2.CAP_PROP_FRAME_WIDTH)
-    height = video.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    frames = []
-    if len(content) > most_bytes:
-        is_read, frame = video.read()
-        while is_read:
-            frames.append(frame)
-            is_read, frame = video.read()
-    suffix = film_suffix()[0] if path.suffix == MP4 else path.suffix
-    share = 1.0
-    spare = _SPARE if suffix == MP4 else 1
-    bits = 8 * len(content) * RATE / max(1, len(frames))  # per second
-    with tempfile.TemporaryDirectory() as folder:
-        smaller = Path(folder) / f"film{suffix}"
-        while frames and len(content) > most_bytes:
-            share *= 0.9 * most_bytes / len(content)
-            pixels = min(1.0, spare * share)
-            size = (2 * int(width * pixels**0.5 / 2), 2 * int(height * pixels**0.5 / 2))
-            if min(size) < _LEAST_SIDE:
-                return b""
-            resized = (cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames)
-            if encode(smaller, resized, size, bits * share):
-                return b""
-            content = smaller.read_bytes()
-    return content
 
 
 def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:

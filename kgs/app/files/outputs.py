@@ -50,11 +50,6 @@ def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, mak
         out.mkdir(parents=True, exist_ok=True)
 
 
-def film_in(folder: Path) -> Path | None:
-    """The film in a folder of results, if there is one."""
-    return next((folder / name for name in FILMS if (folder / name).is_file()), None)
-
-
 def png_names(views: Iterable[str]) -> dict[str, str]:
     """A unique file name for a render of each view: folders become part of the name, the ending becomes .png.
 

@@ -10,15 +10,16 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs.app.files.film import tour
-from kgs.geometry import camera_centers, common_up
+from kgs.app.files.encoders import RATE
+from kgs.app.files.film import FRAMES, paced
+from kgs.geometry import camera_centers, common_up, typical_depths
 
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # depth of a pyramid, as a share of the median distance between neighbouring cameras
 _LARGEST_PYRAMID = 0.1  # its upper bound, as a share of the median depth of the scene
 _LEAST_ARC = 0.3  # radians
 _RING_GAP = 2 * math.pi / 3  # cameras with smaller gaps between them surround the scene
-_SWAY_POSES = 60
+_DIGITS = 6  # of a position, after the point, in depths of the scene
 
 
 def viewer_scene(
@@ -49,7 +50,8 @@ def viewer_scene(
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
         turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
-        sway: rotations and positions of a closed path through the training cameras, see :func:`tour`.
+        tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.paced` (poses), and
+            its length (seconds).
     """
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()
@@ -76,7 +78,6 @@ def viewer_scene(
     first = max(middle[: math.ceil(len(middle) / 3)], key=lambda i: known.get(names[i], -math.inf))
     distance = entries[first]["distance"]
     up = common_up(cameras.extrinsics)
-    path = tour(cameras.extrinsics[training], np.arange(_SWAY_POSES) / _SWAY_POSES, depth)
     return {
         "cameras": entries,
         "first": first,
@@ -84,7 +85,7 @@ def viewer_scene(
         "pyramid": _pyramid_depth(positions, depth),
         "arc": _arc(rotations, positions, first, distance, up.numpy()),
         "turned": [_turned(cameras.extrinsics, quarters, positions, first, distance) for quarters in (1, 2, 3)],
-        "sway": _sway(path.numpy(), positions[first]),
+        "tour": _tour(training_cameras(cameras, parts), means),
     }
 
 
@@ -92,6 +93,13 @@ def are_training(parts: Sequence[str]) -> list[bool]:
     """Which photos count as training photos, by what they were used for: all but "test", or all if all are "test"."""
     training = [part != "test" for part in parts]
     return training if any(training) else [True] * len(parts)
+
+
+def training_cameras(cameras: PinholeCamera, parts: Sequence[str]) -> PinholeCamera:
+    """Those of the training photos, on the CPU; see :func:`are_training`."""
+    rows = torch.tensor(are_training(parts))
+    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+    return PinholeCamera(*(value.cpu()[rows] for value in values))
 
 
 def lenses(cameras: PinholeCamera) -> list[tuple[Array, Array, NDArray[np.intp]]]:
@@ -175,13 +183,18 @@ def _widened(low: float, high: float) -> list[float]:
     return [low - more, high + more]
 
 
-def _sway(poses: Array, start: Array) -> list[dict[str, Any]]:
-    """World-to-camera poses `(F, 4, 4)` of a closed path as rotations and positions; the one nearest `start` first."""
+def _tour(cameras: PinholeCamera, means: Tensor) -> dict[str, Any]:
+    """The path of the film through some cameras: `FRAMES` rotations and positions at equal times, and seconds."""
+    depth = typical_depths(means, cameras)[1]
+    poses = paced(cameras.extrinsics, FRAMES, depth).numpy()
     rotations = poses[:, :3, :3]
     positions = -np.einsum("fji,fj->fi", rotations, poses[:, :3, 3])
-    begin = int(np.linalg.norm(positions - start, axis=1).argmin())
-    order = [(begin + i) % len(poses) for i in range(len(poses))]
-    return [{"rotation": rotations[i].round(6).tolist(), "position": positions[i].round(6).tolist()} for i in order]
+    digits = _DIGITS - math.floor(math.log10(depth))
+    rows = zip(rotations.round(_DIGITS).tolist(), positions.round(digits).tolist(), strict=True)
+    return {
+        "seconds": FRAMES / RATE,
+        "poses": [{"rotation": rotation, "position": position} for rotation, position in rows],
+    }
 
 
 def _pyramid_depth(positions: Array, depth: float) -> float:

@@ -84,10 +84,8 @@ class PageContent:
         splat: the splat in the viewer.
         photos: the photos and their cameras.
         text: title, measures, notes and settings.
-        film: the content of an MP4 or WebM file; b"" for none.
     """
 
     splat: PageSplat
     photos: PagePhotos
     text: PageText
-    film: bytes = b""

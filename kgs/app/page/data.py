@@ -55,13 +55,11 @@ class Packed(NamedTuple):
         content: the planes of all columns as one gzip file.
         left_out: strays that were left out, and what was reduced to respect the limit of size, in words that follow "it
             shows"; "" for nothing.
-        is_reduced: whether anything was reduced to respect the limit of size.
     """
 
     layout: dict[str, Any]
     content: bytes
     left_out: str = ""
-    is_reduced: bool = False
 
 
 class Column(NamedTuple):
@@ -119,7 +117,7 @@ def pack(
     reductions = list[str]()
     for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
         if len(packed.content) <= most_bytes:
-            return packed._replace(left_out=", ".join(words + reductions), is_reduced=bool(reductions))
+            return packed._replace(left_out=", ".join(words + reductions))
     contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
     order = np.argsort(-contributions, kind="stable")
     count = len(rows)
@@ -130,7 +128,7 @@ def pack(
         chosen = {name: value[order[:count]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
     words += [*reductions, f"{count} of {len(rows)} Gaussians"]
-    return packed._replace(left_out=", ".join(words), is_reduced=True)
+    return packed._replace(left_out=", ".join(words))
 
 
 def _strays(means: Array, cameras: PinholeCamera) -> NDArray[np.bool_]:

@@ -1,10 +1,12 @@
-"""The content of metrics.json and config.json as tables, lists of facts and a plot, without absolute paths."""
+"""The content of metrics.json and config.json as tables and lists of facts, without absolute paths."""
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
+
+from kgs.app.files.plot import PARTS, Runs, with_run
 
 # Titles and digits of the measures, by their keys in metrics.json.
 MEASURES = {
@@ -13,8 +15,6 @@ MEASURES = {
     "ssim_zero_padded": ("SSIM (zero padded)", 3),
     "lpips_vgg": ("LPIPS", 3),
 }
-# Names of the sets of views by their keys in metrics.json; `verdict` speaks of the first one that was measured.
-PARTS = {"test": "held out", "train": "training", "views": "photos"}
 # What renders look like whose PSNR is at least this many dB.
 _LEVELS = (
     (32.0, "hard to tell from the photos at a glance"),
@@ -25,16 +25,6 @@ _LEVELS = (
 )
 # The folders of an absolute path inside a text.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[\\/](?:[^\\/\s]+[\\/])+(?=[^\\/\s])")
-# The plot, in the units of its SVG: its size, and the borders of the area with the lines.
-_WIDTH = 640
-_HEIGHT = 260
-_LEFT = 48
-_RIGHT = 620
-_TOP = 12
-_BOTTOM = 230
-
-Runs = Mapping[str, Mapping[str, Any]]  # the content of metrics.json by the name of the run; "" if there is only one
-Curve = tuple[str, str, str, list[tuple[float, float]]]  # run, key of the part, label, (seconds, PSNR)
 
 
 def without_folders(value: Any) -> str:
@@ -79,7 +69,7 @@ def verdict(runs: Runs) -> str:
     }[part]
     text = f"PSNR on {which}: not measured."
     if levels:
-        numbers = ", ".join(_with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
+        numbers = ", ".join(with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
         text = f"PSNR on {which}: {numbers}, that is {_in_words(list(levels.values())[-1])}."
     if part != "train":
         return text
@@ -95,54 +85,13 @@ def _in_words(psnr: float) -> str:
 def measure_table(runs: Runs) -> tuple[list[str], list[list[str]]]:
     """Head and rows of a table with one row per measure: mean, minimum and maximum over the views of each part."""
     measured = [(run, part, metrics[part]) for run, metrics in runs.items() for part in PARTS if metrics.get(part)]
-    head = ["", *(_with_run(f"{PARTS[part]} ({len(values['views'])})", run) for run, part, values in measured)]
+    head = ["", *(with_run(f"{PARTS[part]} ({len(values['views'])})", run) for run, part, values in measured)]
     rows = list[list[str]]()
     for key, (title, digits) in MEASURES.items():
         cells = [_mean_and_range(values, key, digits) for _, _, values in measured]
         if any(cells):
             rows.append([title, *cells])
     return head, rows
-
-
-def psnr_plot(runs: Runs) -> dict[str, Any] | None:
-    """PSNR over the seconds of training in the coordinates of an SVG; None if no curve has two points."""
-    curves = list[Curve]()
-    for run, metrics in runs.items():
-        for part in ("test", "train"):
-            curve = [(point["seconds"], point[f"{part}_psnr"]) for point in metrics.get("curve") or []]
-            points = [(seconds, psnr) for seconds, psnr in curve if psnr is not None]
-            if len(points) > 1:
-                curves.append((run, part, _with_run(PARTS[part], run), points))
-    if not curves:
-        return None
-    seconds = _ticks([point[0] for *_, points in curves for point in points])
-    levels = _ticks([point[1] for *_, points in curves for point in points])
-
-    def x(value: float) -> float:
-        return round(_LEFT + (_RIGHT - _LEFT) * (value - seconds[0]) / (seconds[-1] - seconds[0]), 1)
-
-    def y(value: float) -> float:
-        return round(_BOTTOM - (_BOTTOM - _TOP) * (value - levels[0]) / (levels[-1] - levels[0]), 1)
-
-    return {
-        "width": _WIDTH,
-        "height": _HEIGHT,
-        "left": _LEFT,
-        "right": _RIGHT,
-        "top": _TOP,
-        "bottom": _BOTTOM,
-        "x_ticks": [(x(value), f"{value:g}") for value in seconds],
-        "y_ticks": [(y(value), f"{value:g}") for value in levels],
-        "lines": [
-            {
-                "method": "without" if run.startswith("without") else "default",
-                "dotted": part == "train",
-                "label": label,
-                "points": " ".join(f"{x(a)},{y(b)}" for a, b in points),
-            }
-            for run, part, label, points in curves
-        ],
-    }
 
 
 def _mean_and_range(values: Mapping[str, Any], key: str, digits: int) -> str:
@@ -155,22 +104,6 @@ def _mean_and_range(values: Mapping[str, Any], key: str, digits: int) -> str:
     if len(each) > 1:
         text += f" ({min(each):.{digits}f} to {max(each):.{digits}f})"
     return text
-
-
-def _ticks(values: Sequence[float]) -> list[float]:
-    """A few round numbers that enclose all values; a span of less than 0.01 is extended to 0.01."""
-    low = min(values)
-    span = max(max(values) - low, 0.01)
-    magnitude = 10 ** math.floor(math.log10(span / 4))
-    step = next((s * magnitude for s in (5, 2) if s * magnitude <= span / 4), magnitude)
-    first = math.floor(low / step)
-    last = math.ceil((low + span) / step)
-    return [round(i * step, 10) for i in range(first, last + 1)]
-
-
-def _with_run(text: str, run: str) -> str:
-    """A label, followed by the name of its run if that has one."""
-    return f"{text}, {run}" if run else text
 
 
 def _as_text(value: Any) -> str:

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from kgs.app.console import each
 from kgs.app.files.cameras import rolled
-from kgs.app.files.film import film_within
-from kgs.app.files.outputs import film_in
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.scene import Views
@@ -26,7 +24,7 @@ from kgs.json_files import read_json
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
 from .pictures import Picture
-from .write import MOST_FILM_BYTES, write_page
+from .write import write_page
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
@@ -43,7 +41,6 @@ def write_fit_page(
     notes: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
     report: Path | None = None,
-    film: Path | None = None,
     photos: bool = True,
     roll: float = 0.0,
 ) -> str:
@@ -59,7 +56,6 @@ def write_fit_page(
         notes: sentences to show below the one that says how good the fit is.
         settings: the content of config.json.
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
-        film: an MP4 or WebM file to show.
         photos: whether the page shows photos, renders and their differences.
         roll: degrees by which all pictures are turned clockwise, see :func:`kgs.app.files.cameras.rolled`.
 
@@ -104,7 +100,6 @@ def write_fit_page(
             report=_report_facts(_read_report(report)),
             left_out=left_out(first_run.get("needs") or {}),
         ),
-        film=b"" if film is None else film_within(film, MOST_FILM_BYTES),
     )
     return write_page(path, content)
 
@@ -117,7 +112,6 @@ def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> 
         {"": fit},
         settings=read_json(folder / "config.json"),
         report=fit.scene.root / CAMERAS_REPORT,
-        film=film_in(folder),
         photos=request.photos,
         roll=request.roll,
     )

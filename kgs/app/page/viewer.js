@@ -1,6 +1,7 @@
 "use strict";
-// The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos. Until it is touched
-// it sways slowly along a path through these cameras. It turns as far around the splat as they do, unless it may roam.
+// The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos and along them, on
+// the path of the film: slowly until it is touched, and at the speed of the film where one plays it. It turns as far
+// around the splat as these cameras do, unless it may roam.
 // OpenCV axes: the rows of a rotation are the directions right, down and forward in the world.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -20,9 +21,10 @@ const LEAST_PART = 1 / 2;  // likewise, of what it covers from the photo's camer
 const ROAMING_STEP = 0.1;  // radians: how finely this is tested
 const NEAR_CAMERA = 0.02;  // of the distance: an eye farther than this from all cameras is beside them
 const LEAST_ZOOM = 0.3, MOST_ZOOM = 3;  // of the distance at the camera that the eye was last placed at
-const SWAY_SECONDS_PER_CAMERA = 4;
-const SWAY_BEGIN_SECONDS = 2;
-const LONGEST_FRAME_SECONDS = 0.1;  // of the sway: it goes on where it was after a pause
+const SLOW_SECONDS_PER_CAMERA = 4;  // of a tour that nobody asked for
+const TOUR_BEGIN_SECONDS = 2;  // in which the eye joins the path
+const TOUR_STILL_SECONDS = 1.5;  // of each picture, where the system asks for less motion
+const LONGEST_FRAME_SECONDS = 0.1;  // of a tour: it goes on where it was after a pause
 const TURN_PER_KEY = 0.06;
 const MOVE_PER_KEY = 20;  // pixels
 const ZOOM_PER_KEY = 0.9;
@@ -48,6 +50,8 @@ function softened(change, angle, [low, high]) {
   return clamped(angle + share * change, least, most) - angle;
 }
 
+const wantsLessMotion = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+
 // The point that an eye turns around.
 function target({ position, rotation, distance }) {
   return add(position, rotation[2], distance);
@@ -69,12 +73,13 @@ class Viewer {
     this.quarters = 0;  // by which all pictures are turned clockwise
     this.isRoaming = false;
     this.isEngaged = false;  // the last press of a pointer was on the stage
-    this.isSwaying = false;
+    this.tour = null;  // the latest one, while it goes on
+    this.playButton = frame.querySelector(".play");
     this.place(scene.first);
     this.listen(frame);
     new ResizeObserver(() => this.requestDraw()).observe(this.canvas);
     this.draw();
-    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.sway();
+    if (!wantsLessMotion()) this.flyTour(this.slowRound());
   }
 
   // -- The eye: rotation, position, distance to the point that it turns around, and the intrinsics of a photo's camera.
@@ -92,12 +97,12 @@ class Viewer {
   // Moves the eye to a camera smoothly.
   flyTo(index) {
     const from = this.eye;
-    this.isSwaying = false;
+    this.endTour();
     this.place(index);
     const to = this.eye;
     const begin = performance.now();
     const flight = ++this.flight;
-    const jump = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    const jump = wantsLessMotion();
     const step = (now) => {
       if (flight !== this.flight) return;
       const time = jump ? 1 : clamped((now - begin) / FLIGHT_MILLISECONDS, 0, 1);
@@ -123,29 +128,44 @@ class Viewer {
     };
   }
 
-  // Moves the eye along the path through the training cameras until something else moves it.
-  sway() {
-    const { cameras, first, sway: path } = this.scene;
-    const stops = Math.min(12, cameras.filter((camera) => camera.part !== "test").length);  // as in kgs/app/files/film.py
-    const posesPerSecond = path.length / (SWAY_SECONDS_PER_CAMERA * Math.max(2, stops));
-    const begin = this.eye;
+  // Seconds of a round of the tour at which one can look at the scene in peace.
+  slowRound() {
+    const stops = this.scene.cameras.filter((camera) => camera.part !== "test").length;
+    return SLOW_SECONDS_PER_CAMERA * clamped(stops, 2, 12);  // of more, kgs/app/files/film.py skips some
+  }
+
+  // Moves the eye along the cameras of the film, around and around, from where it is until something else moves it. Where
+  // the system asks for less motion, it shows one picture after the other instead.
+  flyTour(secondsPerRound) {
+    const { poses } = this.scene.tour;
+    const begin = { ...this.eye, distance: this.usualDistance };
+    const distances = poses.map(({ position }) => Math.hypot(...add(position, begin.position, -1)));
+    const start = distances.indexOf(Math.min(...distances));
+    const still = wantsLessMotion() ? Math.ceil(TOUR_STILL_SECONDS * poses.length / secondsPerRound) : 0;
+    const tour = {};
     let isVisible = true, seconds = 0, before = null;
     const observer = new IntersectionObserver((entries) => {
       isVisible = entries[entries.length - 1].isIntersecting;
     });
     observer.observe(this.canvas);
-    this.isSwaying = true;
+    this.flight++;
+    this.tour = tour;
+    const pose = (index) => ({ ...begin, ...poses[(start + index) % poses.length] });
+    const eyeAt = (seconds) => {
+      const place = poses.length * seconds / secondsPerRound;
+      if (still) return pose(still * Math.floor(place / still));
+      const begun = Math.min(1, seconds / TOUR_BEGIN_SECONDS);
+      const onPath = this.between(pose(Math.floor(place)), pose(Math.floor(place) + 1), place % 1);
+      return this.between(begin, onPath, begun * begun * (3 - 2 * begun));
+    };
     const step = (now) => {
-      if (!this.isSwaying) {
+      if (tour !== this.tour) {
         observer.disconnect();
         return;
       }
       if (isVisible && before !== null) {
         seconds += Math.min(LONGEST_FRAME_SECONDS, (now - before) / 1000);
-        const place = posesPerSecond * seconds;
-        const [from, to] = [0, 1].map((next) => ({ ...begin, ...path[(Math.floor(place) + next) % path.length] }));
-        const begun = Math.min(1, seconds / SWAY_BEGIN_SECONDS);
-        this.eye = this.between(begin, this.between(from, to, place % 1), begun * begun * (3 - 2 * begun));
+        this.eye = eyeAt(seconds);
         this.draw();
       }
       before = now;
@@ -154,9 +174,22 @@ class Viewer {
     requestAnimationFrame(step);
   }
 
+  endTour() {
+    this.tour = null;
+    this.playButton.setAttribute("aria-pressed", "false");
+  }
+
+  // Begins the tour at the speed of the film, or ends it; returns whether it goes on.
+  playOrEnd() {
+    const isPlaying = this.playButton.getAttribute("aria-pressed") === "true";
+    if (isPlaying) this.endTour();
+    else this.flyTour(this.scene.tour.seconds);
+    return !isPlaying;
+  }
+
   change(values) {
     this.flight++;
-    this.isSwaying = false;
+    this.endTour();
     this.eye = { ...this.eye, ...values };
     this.requestDraw();
   }
@@ -240,7 +273,9 @@ class Viewer {
     this.quarters = (this.quarters + 1) % 4;
     this.scene = {
       ...scene, ...this.uprights[this.quarters], cameras: scene.cameras.map(turned),
-      sway: scene.sway.map((pose) => ({ ...pose, rotation: turnedFrame(pose.rotation) })),
+      tour: {
+        ...scene.tour, poses: scene.tour.poses.map((pose) => ({ ...pose, rotation: turnedFrame(pose.rotation) })),
+      },
     };
     this.change(turned(this.eye));
     this.frame.style.setProperty("--aspect", this.eye.size.join(" / "));
@@ -365,7 +400,7 @@ class Viewer {
       this.isEngaged = stage.contains(event.target);
     });
     stage.addEventListener("pointerdown", (event) => {
-      this.isSwaying = false;
+      this.endTour();
       if (!pointers.size) this.dragged = 0;
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
     });
@@ -416,6 +451,7 @@ class Viewer {
       const button = frame.querySelector(name);
       button.addEventListener("click", () => button.setAttribute("aria-pressed", String(toggle())));
     };
+    addSwitch(".play", () => this.playOrEnd());
     addSwitch(".roam", () => this.isRoaming = !this.isRoaming);
     addSwitch(".pyramids", () => !this.overlay.toggleAttribute("hidden"));
     const full = frame.querySelector(".full");

@@ -7,23 +7,20 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import torch
-from kornia.geometry.camera import PinholeCamera
-
 from kgs.app.files.film import path_near_plane
+from kgs.app.files.plot import psnr_plot
 from kgs.camera import MARGIN
 from kgs.json_files import write_whole
 from kgs.types import RasterOptions
 from kgs.version import __version__
 
-from .cameras import are_training, viewer_scene
+from .cameras import training_cameras, viewer_scene
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .data import Packed, pack
-from .figures import facts, measure_table, psnr_of_views, psnr_plot, verdict, without_folders
+from .figures import facts, measure_table, psnr_of_views, verdict, without_folders
 from .pictures import GAIN, encoded
 
 MOST_BYTES = 8_000_000  # of a page
-MOST_FILM_BYTES = 1_100_000  # 1.5 MB of the page, in base64
 _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
 _FILES = [
@@ -44,8 +41,7 @@ def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -
 
     The viewer opens at one of the training cameras nearest the mean pose, see `viewer_scene`. File names are shown as
     they are given. The splat is packed into the bytes that the rest of the page leaves, see
-    :func:`kgs.app.page.data.pack`. The film is left out where it has more than `MOST_FILM_BYTES`, or where anything of
-    the splat would have to be left out for it.
+    :func:`kgs.app.page.data.pack`.
 
     Args:
         path: the file to write.
@@ -60,18 +56,22 @@ def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -
         OSError: the file cannot be written.
     """
     page = _Page(content)
-    film = _film_uri(content.film)
-    packed = _packed(content, page, film, most_bytes)
-    if film and packed.is_reduced:
-        film = ""
-        packed = _packed(content, page, film, most_bytes)
-    size = len(page.html(film, packed))
-    write_whole(path, page.html(film, packed, size))
+    splat = content.splat
+    room = max(0, most_bytes - len(page.html()) - _LAYOUT_BYTES)
+    packed = pack(
+        splat.gaussians,
+        content.photos.cameras,
+        room * 3 // 4,  # base64 turns 3 bytes into 4
+        splat.weights,
+        splat.options.near_plane,
+    )
+    size = len(page.html(packed))
+    write_whole(path, page.html(packed, size))
     return packed.left_out
 
 
 class _Page:
-    """Makes the HTML of a page, with a film and a splat that vary until the page is small enough."""
+    """Makes the HTML of a page, first without its splat, which is packed into what the rest leaves."""
 
     def __init__(self, content: PageContent) -> None:
         import jinja2
@@ -90,11 +90,10 @@ class _Page:
         environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
         self._template = environment.get_template("page.html.jinja")
 
-    def html(self, film: str, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
+    def html(self, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
         """The whole file.
 
         Args:
-            film: data URI of the film; "" for none.
             packed: the splat; None leaves it out.
             page_bytes: the size that the page says it has. The text is equally long for all sizes below 10 MB.
         """
@@ -112,33 +111,12 @@ class _Page:
             }
         data = {"scene": self._scene, "settings": self._settings, **splat}
         text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-        html: str = self._template.render(**self._context, **words, film=film, data=Markup(text))
+        html: str = self._template.render(**self._context, **words, data=Markup(text))
         return html.encode(errors="backslashreplace")  # file names can contain bytes that are not UTF-8
 
 
-def _packed(content: PageContent, page: _Page, film: str, most_bytes: int) -> Packed:
-    """The splat, packed into what the film and the rest of the page leave."""
-    room = max(0, most_bytes - len(page.html(film)) - _LAYOUT_BYTES)
-    splat = content.splat
-    return pack(
-        splat.gaussians,
-        content.photos.cameras,
-        room * 3 // 4,  # base64 turns 3 bytes into 4
-        splat.weights,
-        splat.options.near_plane,
-    )
-
-
-def _film_uri(film: bytes) -> str:
-    """The film as a data URI; "" if there is none, or it has more than `MOST_FILM_BYTES`."""
-    if not 0 < len(film) <= MOST_FILM_BYTES:
-        return ""
-    kind = "mp4" if film[4:8] == b"ftyp" else "webm"
-    return f"data:video/{kind};base64,{base64.b64encode(film).decode()}"
-
-
 def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
-    """What the template shows besides film and splat; `scene` is that of :func:`viewer_scene`."""
+    """What the template shows besides the splat; `scene` is that of :func:`viewer_scene`."""
     from markupsafe import Markup
 
     photos = content.photos
@@ -176,21 +154,15 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:
     """The settings of renderer.js."""
     near_plane = splat.options.near_plane
+    training = training_cameras(photos.cameras, photos.parts)
     return {
         "nearPlane": near_plane,
-        "farNearPlane": path_near_plane(splat.gaussians.means, _training_cameras(photos), near_plane),
+        "farNearPlane": path_near_plane(splat.gaussians.means, training, near_plane),
         "lowPass": RasterOptions.eps2d,
         "antialiased": splat.options.antialiased,
         "margin": MARGIN,
         "background": splat.background.tolist(),
     }
-
-
-def _training_cameras(photos: PagePhotos) -> PinholeCamera:
-    rows = torch.tensor(are_training(photos.parts))
-    cameras = photos.cameras
-    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
-    return PinholeCamera(*(value.cpu()[rows] for value in values))
 
 
 def _counts(parts: Sequence[str]) -> str:
