@@ -151,5 +151,7 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
         raise ValueError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
-    # 0 where nothing shines through: 0 times an infinite background would be NaN
-    return image + transmittance * torch.where(background.isinf() & (transmittance == 0), 0.0, background)
+    if background.device.type != "cpu" or bool(background.isinf().any()):  # elsewhere the answer would be waited for
+        # 0 where nothing shines through: 0 times an infinite background would be NaN
+        background = torch.where(background.isinf() & (transmittance == 0), 0.0, background)
+    return torch.addcmul(image, transmittance, background)

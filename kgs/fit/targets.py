@@ -23,7 +23,7 @@ class Target(NamedTuple):
 
     def seen(self, render: Tensor) -> Tensor:
         """A render as the photo would show it: clamped to 1, and darkened by the border."""
-        image = render.masked_fill(render > 1, 1.0)  # it is never below 0
+        image = render.clamp(max=1.0)  # it is never below 0
         return image if self.light is None else image * self.light
 
     def over(self, background: Tensor) -> Self:

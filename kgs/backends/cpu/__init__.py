@@ -7,15 +7,17 @@ used.
 
 Rules that keep the kernels fast. Breaking any of them cost a measured factor of 1.5 to 3, without any warning:
 
-1. Pixels of a tile are the lanes of SIMD. Loops over pixels have a constant length and read and write one flat scratch
-   array at constant distances; other arrays are only read. Otherwise LLVM finds dependences and the loop stays scalar.
-2. An index must be provably >= 0, because indices wrap: a loop that counts down masks its index.
+1. Pixels of a tile are the lanes of SIMD: kernels that loop over pixels of tiles use the `Lanes` of `kgs.compiled`, and
+   what runs from layer to layer stays in them. Other loops, over columns, read and write arrays at constant distances;
+   otherwise LLVM finds dependences and the loop stays scalar.
+2. An index of an array must be provably >= 0, because indices wrap: a loop that counts down masks its index.
 3. `fastmath` lets sums be reassociated; NaN and infinity keep their meaning.
 4. Literals are float64 in numba: every constant is an `np.float32`.
 5. Reads may miss the caches, writes may not: gathers are loops of their own, and sums by Gaussian are kept for a band
    of neighbouring tiles.
 6. The number of features is a constant of the compiled kernel: the length of a tuple.
-7. Ranges and bands do not depend on the number of threads, and nothing is summed by two threads: same bits on any
+7. What a step needs comes from `kgs.memory`, which uses memory again and begins at a cache line.
+8. Ranges and bands do not depend on the number of threads, and nothing is summed by two threads: same bits on any
    number of them.
 """
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs.compiled.lanes import ROW
+from kgs.compiled.lanes import WIDTH
 from kgs.compiled.threads import over
 from kgs.memory import array
 
@@ -37,7 +37,7 @@ LEAST = 4096  # entries of a band: the fixed work of a band costs as much as som
 
 def table_width(channels: int, median_depth: bool) -> int:
     """Columns of the table: what `fill_tables` writes, in whole lanes."""
-    return -(-(7 + channels + median_depth) // ROW) * ROW
+    return -(-(7 + channels + median_depth) // WIDTH) * WIDTH
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class TileCoverage:
         self.total_rows = cameras * self.grid[0]
         self._width = width
         self._over = partial(over, threads)
-        means2d, factors, opacities, features, depths, camera_ids = inputs
+        means2d, factors, opacities, _, depths, _ = inputs
         m = len(depths)
         rows = array((m, 2), np.int32)
         ids = array(m, np.int32)

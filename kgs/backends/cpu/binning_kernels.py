@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from kgs.compiled.kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
-from kgs.compiled.lanes import ROW, load_row, store
+from kgs.compiled.lanes import WIDTH, load, store
 
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048
@@ -219,8 +219,8 @@ def gather_rows(members, table, rows):
     """The rows of the table of all members. A loop of its own: with the next in one function both take longer."""
     for m in range(len(members)):
         row = table[members[m]]
-        for j in range(0, table.shape[1], ROW):
-            store(rows[m], j, load_row(row, j))
+        for j in range(0, table.shape[1], WIDTH):
+            store(rows[m], j, load(row, j))
 
 
 @jit

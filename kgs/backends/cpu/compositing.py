@@ -103,7 +103,9 @@ class CpuCompositor(Compositor):
             del part, done  # before the next is made
         wanted = (*[needs_moments] * 3, needs_features, needs_absolute)
         like = (*inputs, inputs.means2d)
-        results = [empty(tuple(x.shape) if want else (0, *x.shape[1:]), x) for x, want in zip(like, wanted, strict=True)]
+        results = [
+            empty(tuple(x.shape) if want else (0, *x.shape[1:]), x) for x, want in zip(like, wanted, strict=True)
+        ]
         factors, opacities = arrays(inputs.factors, inputs.opacities)
         moments = (self._coverage.ranks, totals, factors, opacities, self._eps2d)
         over(torch.get_num_threads(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))

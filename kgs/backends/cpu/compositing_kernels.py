@@ -1,6 +1,6 @@
 """Front-to-back compositing of the lists of a band, and its gradient; formulas as in `kgs.backends.torch`.
 
-A tile is P pixels, twice the `Lanes` of a kernel: four rows at a time. T is kept at the beginning of every chunk of
+A tile is P pixels, four times the `Lanes` of a kernel: two rows at a time. T is kept at the beginning of every chunk of
 K entries; the backward pass goes from chunk to chunk, back to front, and computes alphas and T of each again, with the
 same bits. Features come in blocks that a kernel is compiled for: V is linear in the features and in dL/dT, so blocks
 are differentiated one after the other, and their moments are added.
@@ -24,10 +24,8 @@ import numpy as np
 
 from kgs.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
 from kgs.compiled.lanes import (
-    ROW,
     WIDTH,
     load,
-    load_row,
     magnitude,
     maximum,
     minimum,
@@ -45,6 +43,7 @@ from .binning_kernels import SIZE, variances
 P = SIZE * SIZE
 K = 32
 WIDTHS = (3, 4, 8)  # of blocks of features
+ROW = WIDTH  # numbers of a row of the table, and of sums of a member and a block
 MOMENTS = 6
 FEATURES = 8  # of a row, at most
 ABSOLUTE = MOMENTS + FEATURES
@@ -69,7 +68,7 @@ def gather(table, entries, first, n, corner, feature, channels, layers):
     """Copy what a chunk needs, many reads that miss the caches at a time; centres are about that of the tile."""
     for k in range(n):
         row = table[entries[first + k]]
-        store(layers, k * ROW, load_row(row, 0) - load_row(corner, 0))
+        store(layers, k * ROW, load(row, 0) - load(corner, 0))
         if feature > 0:
             for f in range(channels):
                 layers[k * ROW + 7 + f] = row[7 + feature + f]
@@ -292,7 +291,7 @@ def add_layer(k, F, needs_absolute, pixels, layers, derivatives, weights, g, row
     c7 = color_sum(7, F, k, weights, g)
     moments = (m, m * dx, my, m * dx * dx, my * dx, myy)
     gained = totals((*moments, c0, c1, c2, c3, c4, c5, c6, c7, across * TWICE_LN2, up * TWICE_LN2))
-    store(row, 0, load_row(row, 0) + gained)
+    store(row, 0, load(row, 0) + gained)
 
 
 @inline
