@@ -7,7 +7,7 @@ harmonics). What wrong depths, noise and hidden surfaces do to colours is no fun
 predicted, or little of it; exposure and white balance are removed before, and outliers are bounded.
 
 The fall of the variance of the errors is what harmonics can take off the squared error of a fit. They are chosen where
-this would raise a typical fit, `TYPICAL` decibels on test views, by more than `MIN_GAIN`: a fit gets about half of it.
+this would raise a typical fit, `TYPICAL` decibels on test views, by more than `MIN_GAIN`.
 """
 
 import math
