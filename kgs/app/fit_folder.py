@@ -1,4 +1,4 @@
-"""What `kgs fit` does, in its order: scene, initial points, probes, training, files, page; then all is published."""
+"""What `kgs fit` does, in its order: scene, initial points, training, files, page; then all is published."""
 
 import shutil
 import signal
@@ -25,10 +25,10 @@ from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import Plan, expected_memory, make_plan, most_gaussians
-from kgs.fit.probes import decide
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
+from kgs.fit.view_dependence import decide
 from kgs.json_files import write_json
 from kgs.machine import check_packages
 from kgs.metrics.lpips import Lpips
@@ -175,7 +175,7 @@ def _trainer(
     say(f"initial points: {len(points.points)} ({points.kind})")
     memory = expected_memory(scene, most_gaussians(plan.config, len(points.points)))
     say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
-    return Trainer(scene, decide(scene, plan, choose_points, each), points), out
+    return Trainer(scene, decide(plan, points), points), out
 
 
 class _Notes:

@@ -113,8 +113,8 @@ class FitConfig:
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
-        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: short fits (probes)
-            find out what the training views need.
+        sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3
+            if the colours of the training views depend on the direction, else 0.
         refine_poses: optimise the poses of the training cameras too. It helps if they are half a degree or more off;
             accurate poses get slightly worse. The mean and the spread of the poses stay, and so do test cameras.
         coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1].

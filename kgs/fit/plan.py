@@ -44,7 +44,7 @@ class Plan:
 
     Args:
         config: the settings, with numbers for the scene where they were left open. A `sh_degree` of None counts as 0;
-            :func:`kgs.fit.probes.decide` replaces it.
+            :func:`kgs.fit.view_dependence.decide` replaces it.
         device: of the fit.
         backend: "numba", "triton" or "torch".
         times: the steps at which things happen.

@@ -110,8 +110,8 @@ def left_out(needs: dict[str, Any]) -> str:
     gaussians = needs.get("gaussians")
     if harmonics and harmonics["chosen"] == 0:
         why = harmonics.get("why", "by rule")
-        if harmonics["by"] == "probes":
-            why = f"{harmonics['gain']:+.2f} dB in {harmonics['n']} probes, noise {harmonics['noise']:.2f}"
+        if harmonics["by"] == "photos":
+            why = f"they can gain {harmonics['gain']:+.2f} dB"
         parts.append(f"harmonics ({why})")
     if gaussians and gaussians["kept"] < gaussians["fitted"]:
         share = 1 - gaussians["kept"] / gaussians["fitted"]

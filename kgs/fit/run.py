@@ -1,4 +1,4 @@
-"""A whole fit in one call: initial points, probes, training, and leaving out what the scene does not need."""
+"""A whole fit in one call: initial points, training, and leaving out what the scene does not need."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from kgs.progress import Stage, silent
 from .config import FitConfig
 from .fit import Fit
 from .plan import make_plan
-from .probes import decide
 from .prune import prune
 from .trainer import Trainer
+from .view_dependence import decide
 
 
 def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = silent) -> Fit:
@@ -22,7 +22,7 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = s
     Args:
         scene: posed training and test views; the test views are rendered only for the curve.
         config: the settings; None: the defaults.
-        stage: shows how far initial points and probes are, as `tqdm` does.
+        stage: shows how far the initial points are, as `tqdm` does.
 
     Raises:
         DataError: the scene, or the file of initial points, has none.
@@ -32,7 +32,7 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = s
     config = FitConfig() if config is None else config
     plan = make_plan(scene, config)
     points = choose_points(scene, config, stage)
-    return prune(Trainer(scene, decide(scene, plan, choose_points, stage), points).fit())
+    return prune(Trainer(scene, decide(plan, points), points).fit())
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:

@@ -16,6 +16,7 @@ from kgs.types import check_kind
 
 from .dense import FEWEST, dense_points
 from .files import read_points
+from .patches import PatchColors
 from .tracks import find_tracks
 from .triangulate import TrackedPoints, triangulate_certain
 
@@ -36,11 +37,13 @@ class InitialPoints:
         points: in the frame of the views, `(P, 3)` float32 on the CPU.
         colors: RGB in [0, 1], `(P, 3)` float32.
         kind: where the points come from: "dense", "sift", "random", "file", or the scene's `init_kind`.
+        patches: of "dense", the colours of the surface in the views that agree on it; else None.
     """
 
     points: Tensor
     colors: Tensor
     kind: str
+    patches: PatchColors | None = None
 
 
 def initial_points(
@@ -111,9 +114,9 @@ def initial_points(
     if kind == "dense":
         if enough_sift:
             near, far = _sweep_range(tracked.pixels, tracked.depths, geometry)
-        points, colors, agreed = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
+        points, colors, agreed, patches = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
         if agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
-            return InitialPoints(points, colors, kind)
+            return InitialPoints(points, colors, kind, patches)
         message = f"initial points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
         warnings.warn(message, stacklevel=2)
     count = FEWEST if count is None else count

@@ -39,7 +39,7 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
         count = torch.ones(len(rows), dtype=torch.float64)
         for other, pixels, depths in _in_other_views(geometry, points, view):
             x, y, inside = nearest_pixels(pixels, depths, *own.depths.mT.shape)
-            other_depths = 1 / _interpolate(1 / maps[other].depths.double(), pixels)
+            other_depths = 1 / interpolate(1 / maps[other].depths.double()[None], pixels)[:, 0]
             other_points = geometry.unproject(pixels, other_depths, torch.full_like(x, other))
             own_depths = camera.project(other_points)[1][:, 0]
             similar = (other_depths / depths - 1).abs() < SIMILAR
@@ -60,8 +60,22 @@ def agreed_points(
     Also returns their pixels, as columns and rows `(P, 2)`.
     """
     rows, columns, points = _points(geometry, maps[view], certain[view], view)
-    camera = geometry.one(view)
     agreed = torch.zeros(len(points), dtype=torch.bool)
+    for _, _, agrees in agreeing_views(geometry, maps, certain, points, view):
+        agreed |= agrees
+    agreeing = torch.zeros_like(maps[view].depths)
+    agreeing[rows, columns] = agreed.float()
+    window = (WINDOW, WINDOW)
+    counts = cv2.boxFilter(agreeing.numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
+    agreed &= torch.from_numpy(counts)[rows, columns] >= SUPPORT
+    return points[agreed], torch.stack([columns, rows], 1)[agreed]
+
+
+def agreeing_views(
+    geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], points: Tensor, view: int
+) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Each other view, the positions `(P, 2)` of one view's points `(P, 3)` in it, and where it agrees, bool `(P,)`."""
+    camera = geometry.one(view)
     for other, pixels, depths in _in_other_views(geometry, points, view):
         x, y, inside = nearest_pixels(pixels, depths, *maps[view].depths.mT.shape)
         other_depths = maps[other].depths[y, x].double()
@@ -72,13 +86,7 @@ def agreed_points(
         at_own_depth, _ = camera.project(geometry.unproject(other_pixels, depths, owners))
         apart = (at_other_depth - at_own_depth)[:, 0].norm(dim=1)
         near = ((other_depths / depths - 1).abs() < AGREEMENT) | (apart < AGREEMENT_PIXELS)
-        agreed |= inside & near & certain[other][y, x]
-    agreeing = torch.zeros_like(maps[view].depths)
-    agreeing[rows, columns] = agreed.float()
-    window = (WINDOW, WINDOW)
-    counts = cv2.boxFilter(agreeing.numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
-    agreed &= torch.from_numpy(counts)[rows, columns] >= SUPPORT
-    return points[agreed], torch.stack([columns, rows], 1)[agreed]
+        yield other, pixels, inside & near & certain[other][y, x]
 
 
 def _points(geometry: ViewGeometry, own: DepthMap, certain: Tensor, view: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -95,9 +103,9 @@ def _in_other_views(geometry: ViewGeometry, points: Tensor, view: int) -> Iterat
     return ((other, pixels[:, other], depths[:, other]) for other in range(len(geometry)) if other != view)
 
 
-def _interpolate(image: Tensor, pixels: Tensor) -> Tensor:
-    """The values `(P,)` of an image `(H, W)` at positions `(P, 2)`, bilinear; outside, those of the border."""
-    last = torch.tensor([image.shape[1] - 1, image.shape[0] - 1])
-    grid = (2 * pixels / last - 1)[None, None]
-    values: Tensor = grid_sample(image[None, None], grid, padding_mode="border", align_corners=True)[0, 0, 0]
+def interpolate(image: Tensor, pixels: Tensor) -> Tensor:
+    """The values `(P, C)` of an image `(C, H, W)` at positions `(P, 2)`, bilinear; outside, those of the border."""
+    last = torch.tensor([image.shape[2] - 1, image.shape[1] - 1])
+    grid = (2 * pixels / last - 1)[None, None].to(image.dtype)
+    values: Tensor = grid_sample(image[None], grid, padding_mode="border", align_corners=True)[0, :, 0].T
     return values

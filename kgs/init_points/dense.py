@@ -15,6 +15,7 @@ from kgs.geometry import ViewGeometry
 from kgs.progress import Stage, silent
 
 from .agreement import agreed_points, average_depths
+from .patches import PatchColors, patch_colors
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
 SCORE = 0.35  # the least matching score of a point; noise reaches 0.3 along a smooth surface
@@ -39,12 +40,13 @@ def dense_points(
     backend: str = "auto",
     draw: str = "uniform",
     pixels: int | None = None,
-) -> tuple[Tensor, Tensor, int]:
+) -> tuple[Tensor, Tensor, int, PatchColors]:
     """At most `count` points on which two views agree, drawn at random.
 
     The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
 
-    Returns the points and RGB, both `(P, 3)`, and the number of agreed points without those of the sky.
+    Returns the points and RGB, both `(P, 3)`, the number of agreed points without those of the sky, and the colours of
+    all agreed patches.
 
     A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
     `MOST`, in images that have together `pixels` pixels, or those of the views.
@@ -74,7 +76,9 @@ def dense_points(
     chosen = torch.randperm(len(points), generator=generator)
     chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     chosen = chosen[_with_less_sky(is_sky[chosen])]
-    return points[chosen].float(), colors[chosen], int((~is_sky).sum())
+    agreed_pixels = [places[view == i, 1:] for i in range(len(views))]
+    patches = patch_colors(views, geometry, maps, certain, agreed_pixels)
+    return points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches
 
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:

@@ -20,10 +20,10 @@ from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
-from kgs.fit.probes import decide
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
+from kgs.fit.view_dependence import decide
 from kgs.init_points import InitialPoints
 from kgs.machine import peak_rss_mb, revision
 from kgs.metrics.evaluate import MEASURES
@@ -55,8 +55,7 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     lpips = None if lpips_weights is None else _lpips(lpips_weights)
     settings, rival = _split(cell["fit"])
     config = fit_config(cell["start"], cell["seed"], settings)
-    probed = replace(config, drop=PRESETS[preset].drop)  # methods that differ in dropping decide alike
-    trainer, fit, result = fit_and_measure(scene, config, points, lpips, probed, rival)
+    trainer, fit, result = fit_and_measure(scene, config, points, lpips, rival)
     metrics = fit.metrics
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
         result["pictures"] = _pictures(fit)
@@ -77,18 +76,15 @@ def fit_and_measure(
     config: FitConfig,
     points: InitialPoints,
     lpips: Lpips | None = None,
-    probed: FitConfig | None = None,
     rival: Rival | None = None,
 ) -> tuple[Trainer, Fit, dict[str, Any]]:
     """One trainer, its fit with metrics, and what every cell stores of it.
 
-    "cpu_seconds" are those of probes, training, curve and leaving out, "wall_seconds" those of the training alone.
-    `probed`, or else `config`, is what probes decide for; `rival` replaces random dropping.
+    "cpu_seconds" are those of training, curve and leaving out, "wall_seconds" those of the training alone.
+    `rival` replaces random dropping.
     """
     begin = time.process_time()
-    decided = decide(scene, make_plan(scene, probed or config), choose_points)
-    plan = make_plan(scene, replace(config, sh_degree=decided.config.sh_degree))
-    plan = replace(plan, needs=decided.needs)
+    plan = decide(make_plan(scene, config), points)
     trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
     fit = prune(trainer.fit())
     cpu_seconds = time.process_time() - begin

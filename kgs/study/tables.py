@@ -49,7 +49,7 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     for title in families:
         scenes = main[main.method.isin({*FAMILIES[title]} - {*HEAD})].scene
         tables[title] = _settings(main[main.scene.isin(scenes)], (OFF, PAPER, *FAMILIES[title]), (OFF, PAPER))
-    tables["What the probes chose: the degree of harmonics, by seed"] = _probes(frame)
+    tables["The degree of harmonics that was chosen, by seed"] = _degrees(frame)
     tables[_NOISE] = _noise(frame)
     tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = _costs(main)
     tables["Scenes, splits and settings"] = _protocol(frame)
@@ -146,16 +146,15 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
     return lines
 
 
-def _probes(frame: pd.DataFrame) -> Lines:
-    probed = frame[frame["needs.sh_degree.chosen"].notna()].sort_values("seed", kind="stable")
-    probed = probed.rename(columns=lambda name: name.removeprefix("needs.sh_degree."))
+def _degrees(frame: pd.DataFrame) -> Lines:
+    decided = frame[frame["needs.sh_degree.chosen"].notna()].sort_values("seed", kind="stable")
+    decided = decided.rename(columns=lambda name: name.removeprefix("needs.sh_degree."))
     heads = {
         "chosen": ("chosen", "{:.0f}"),
-        "gain of degree 3 [dB]": ("gain", "{:+.2f}"),
-        "noise [dB]": ("noise", "{:.2f}"),
+        "possible gain of degree 3 [dB]": ("gain", "{:+.2f}"),
     }
     lines = []
-    for (scene, views, method), cells in grouped(probed, *KEYS[:2], "method"):
+    for (scene, views, method), cells in grouped(decided, *KEYS[:2], "method"):
         line = {"scene": f"{scene}, {views} views", "method": method, "by": ", ".join(cells.by.unique())}
         for head, (key, text) in heads.items():
             line[head] = ", ".join(text.format(number) for number in cells[key].dropna()) or "-"

@@ -68,7 +68,7 @@ def test_depths_of_the_synthetic_scene(large: tuple[Views, torch.Tensor]) -> Non
 @pytest.mark.slow
 def test_points_lie_on_the_surfaces(large: tuple[Views, torch.Tensor]) -> None:
     views, truth = large
-    points, colors, _ = dense_points(views, *span_of(truth), 2000, generator())
+    points, colors, *_ = dense_points(views, *span_of(truth), 2000, generator())
     assert points.shape == colors.shape == (2000, 3)
     assert points.dtype == colors.dtype == torch.float32
     pixels, depths = project_points(points, views.cameras)

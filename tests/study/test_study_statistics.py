@@ -226,15 +226,15 @@ def test_regret_is_against_the_best_other_method_of_each_scene():
 
 @pytest.mark.slow
 def test_the_default_stands_beside_the_others():
-    """On each scene that has it, with what its probes chose; the means are over the scenes that a method has."""
+    """On each scene that has it, with the degree that was chosen; the means are over the scenes that a method has."""
     settings = [("llff/fern", 3), ("nerfstudio/fox", 12), ("nerfstudio/fox", 6)]
     cells = [(*setting, method) for setting in settings for method in (*MAIN, "auto", "auto, off")]
     cells += [("blender/lego", 8, method) for method in MAIN]
     rows = [made_up(*cell[:2], "dense", cell[2], seed) for cell in cells for seed in range(2)]
-    probed = {"chosen": 3, "by": "probes", "over": 0, "gain": 0.4, "noise": 0.05, "n": 2}
+    decided = {"chosen": 3, "by": "photos", "over": 0, "gain": 0.4, "n": 2000}
     for row in rows:
         if row["cell"]["method"] == "auto":
-            row["result"]["needs"] = {"sh_degree": probed if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
+            row["result"]["needs"] = {"sh_degree": decided if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
     tables = sparse_tables(cells_frame(rows))
     main = next(table for title, table in tables.items() if title.startswith("Test views"))
     methods = {scene: [*lines.method] for scene, lines in main.groupby("scene")}
@@ -248,8 +248,8 @@ def test_the_default_stands_beside_the_others():
     auto, paper = (psnrs(rows, "nerfstudio/fox", method, 6) for method in ("auto", PAPER))
     gain = np.subtract(auto, paper).mean()
     assert default[f"over {PAPER} [dB] (pairs)"]["nerfstudio/fox, 6 views, dense"].startswith(f"{gain:+.2f} [")
-    chosen = tables["What the probes chose: the degree of harmonics, by seed"]
-    assert [*chosen.iloc[0]] == ["llff/fern, 3 views", "auto", "rule, probes", "0, 3", "+0.40", "0.05"]
+    chosen = tables["The degree of harmonics that was chosen, by seed"]
+    assert [*chosen.iloc[0]] == ["llff/fern, 3 views", "auto", "rule, photos", "0, 3", "+0.40"]
 
 
 def test_numbers_that_are_not_there_are_left_out():
