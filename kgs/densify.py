@@ -5,7 +5,9 @@ recipe (threshold 5e-4, pruning by opacity alone). The number of Gaussians in a 
 """
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +19,13 @@ from .types import ProjectedGaussians, check_kind
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children
 _UNSUPPORTED_OPTIMIZERS = (torch.optim.LBFGS, torch.optim.Adafactor, torch.optim.Rprop)
+
+
+class Optimizer(Protocol):
+    """What a densifier needs of an optimizer: two attributes of :class:`torch.optim.Optimizer`."""
+
+    param_groups: list[dict[str, Any]]
+    state: defaultdict[Tensor, Any]
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,7 @@ class Densifier:
     def __init__(
         self,
         model: GaussianModel,
-        optimizer: torch.optim.Optimizer,
+        optimizer: Optimizer,
         extent: float,
         *,
         grad_threshold: float = 5e-4,

@@ -7,6 +7,7 @@ world depends on `kind` and `seed` only, never on the cameras.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -169,11 +170,16 @@ def _views(setup: _Setup, eyes: Array, size: tuple[int, int], split: str) -> Vie
     intrinsics[:, 0, 2] = (width - 1) / 2
     intrinsics[:, 1, 2] = (height - 1) / 2
     extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
-    images = np.zeros((count, 3, height, width), dtype=np.float32)
     for i, eye in enumerate(eyes):
         # poses are rounded to float32 before rendering, so that the images are exactly those of the cameras
         extrinsics[i] = torch.from_numpy(_look_at(eye, setup.center))
-        images[i] = _render(setup, intrinsics[i].double().numpy(), extrinsics[i].double().numpy(), size)
+    setup.world.prepare()
+    images = np.zeros((count, 3, height, width), dtype=np.float32)
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        cameras = intrinsics.double().numpy(), extrinsics.double().numpy()
+        drawn = pool.map(lambda matrix, pose: _render(setup, matrix, pose, size), *cameras)
+        for i, image in enumerate(drawn):
+            images[i] = image
     names = tuple(f"{split}_{i:02d}" for i in range(count))
     return Views(pinholes(intrinsics, extrinsics, size), torch.from_numpy(images), names)
 
@@ -190,7 +196,8 @@ def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
     colors[v, u] = setup.world.shade(points, faces[v, u])
-    return np.asarray(colors.reshape(size[0], s, size[1], s, 3).mean(axis=(1, 3)).transpose(2, 0, 1))
+    total = sum(colors[i::s, j::s] for i in range(s) for j in range(s))
+    return np.asarray(total / np.float32(s * s)).transpose(2, 0, 1)
 
 
 def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -4,9 +4,11 @@ Source: L. Williams, "Casting Curved Shadows on Curved Surfaces", SIGGRAPH 1978.
 with penumbras; lamps spread over half a sphere are the sky, which leaves corners and the room under a table darker.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from .raycast import Array, raycast
@@ -19,7 +21,6 @@ NUM_SUN = 6  # lamps of the sun
 NUM_SKY = 18  # lamps of the sky
 SUN_COLOR = (0.74, 0.68, 0.58)
 SKY_COLOR = (0.5, 0.54, 0.6)
-CHUNK = 4096  # points at a time, so that all arrays stay in the cache
 
 
 class Lights(NamedTuple):
@@ -45,33 +46,31 @@ def daylight(casters: Array, sun: Array, sky: Array) -> Lights:
     focal = 0.5 * (MAP_SIZE - 2) * np.sqrt(DISTANCE**2 - radius**2) / radius
     center = (MAP_SIZE - 1) / 2
     intrinsics = np.array([[focal, 0, center], [0, focal, center], [0, 0, 1.0]])
-    rows = []
-    depths = []
-    for direction in directions:
-        extrinsics = np.eye(4)
-        extrinsics[:3, :3] = _frame(-direction).T
-        extrinsics[:3, 3] = -extrinsics[:3, :3] @ (middle + DISTANCE * direction)
-        depth, faces = raycast(casters, intrinsics, extrinsics, (MAP_SIZE, MAP_SIZE))
-        rows.append(intrinsics @ extrinsics[:3])
-        depths.append(np.where(faces < 0, np.inf, depth))
-    return Lights(*(np.asarray(x, np.float32) for x in (directions, colors, np.stack(rows, axis=-1), depths)))
+    poses = np.tile(np.eye(4), (len(directions), 1, 1))
+    for pose, direction in zip(poses, directions, strict=True):
+        pose[:3, :3] = _frame(-direction).T
+        pose[:3, 3] = -pose[:3, :3] @ (middle + DISTANCE * direction)
+
+    def depth_map(pose: Array) -> Array:
+        depth, faces = raycast(casters, intrinsics, pose, (MAP_SIZE, MAP_SIZE))
+        return np.where(faces < 0, np.inf, depth)
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        depths = list(pool.map(depth_map, poses))
+    rows = np.stack([intrinsics @ pose[:3] for pose in poses], axis=-1)
+    return Lights(*(np.asarray(x, np.float32) for x in (directions, colors, rows, depths)))
 
 
 def received(lights: Lights, points: Array, normals: Array) -> NDArray[np.float32]:
     """The light `(n, 3)` on points `(n, 3)` with unit normals `(n, 3)`: Lambert's cosine, over all lamps in sight."""
     lifted = np.concatenate([points + LIFT * normals, np.ones((len(points), 1))], axis=1).astype(np.float32)
-    normals = normals.astype(np.float32)
-    light = np.empty(points.shape, np.float32)
     size = lights.depths.shape[1]
     first = np.arange(len(lights.depths)) * lights.depths[0].size
-    for start in range(0, len(points), CHUNK):
-        rows = slice(start, start + CHUNK)
-        u, v, z = (lifted[rows] @ matrix for matrix in lights.rows)
-        column, line = ((x / z + np.float32(0.5)).clip(0, size - 1).astype(np.int32) for x in (u, v))
-        nearest = lights.depths.take(first + line * size + column)
-        cosines = (normals[rows] @ lights.directions.T).clip(0)
-        light[rows] = AMBIENT + (cosines * (z < nearest + LIFT / 2)) @ lights.colors
-    return light
+    u, v, z = (lifted @ matrix for matrix in lights.rows)
+    column, line = ((x / z + np.float32(0.5)).clip(0, size - 1).astype(np.int32) for x in (u, v))
+    nearest = lights.depths.take(first + line * size + column)
+    cosines = (normals.astype(np.float32) @ lights.directions.T).clip(0)
+    return AMBIENT + (cosines * (z < nearest + LIFT / 2)) @ lights.colors
 
 
 def _cap(axis: Array, count: int, least: float) -> Array:

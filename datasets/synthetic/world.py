@@ -4,7 +4,7 @@ Things are made with z up; frames turn them into OpenCV's axes: x right, y down,
 metres.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from .raycast import Array, Index
 from .textures import Texture
 
 CREASE = np.cos(np.radians(40.0))  # faces that meet at a larger angle are not smoothed into each other
+CHUNK = 2048  # points at a time, so that all arrays stay in the cache
 GAMMA = np.float32(1 / 2.2)  # colours are those of the picture, light is linear
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])  # from z up to OpenCV's axes
 
@@ -45,23 +46,61 @@ class World:
     sky: Array  # (3,), towards the middle of the sky
     unlit: int  # the first `unlit` triangles are not lit: their colours are those of their textures
 
+    def prepare(self) -> None:
+        """Make what all images share; threads that draw images would each make it for themselves."""
+        for shared in ("lights", "normal_maps"):
+            getattr(self, shared)
+
     @cached_property
     def lights(self) -> Lights:
         """The lamps, made for the first image."""
         sun, sky = (axis / np.linalg.norm(axis) for axis in (self.sun, self.sky))
         return daylight(self.triangles[self.shell :], sun, sky)
 
+    @cached_property
+    def normal_maps(self) -> Array:
+        """For each triangle the matrix `(3, 4)` from a point `(x, y, z, 1)` on it to its normal, not yet of length 1.
+
+        The normals at the corners are interpolated: the map is affine, and constant across the plane.
+        """
+        a, b, c = self.triangles.transpose(1, 0, 2)
+        area = np.cross(b - a, c - a)
+        square = (area**2).sum(axis=1)[:, None]
+        weights = np.stack([np.cross(c - a, area), np.cross(area, b - a)], axis=1) / square[..., None]
+        changes = self.normals[:, 1:] - self.normals[:, :1]
+        linear = np.einsum("fki,fkj->fij", changes, weights)
+        constant = self.normals[:, 0] - np.einsum("fij,fj->fi", linear, a)
+        return np.concatenate([linear, constant[..., None]], axis=2)
+
     def shade(self, points: Array, faces: Index) -> Array:
         """Colours `(n, 3)` of points `(n, 3)` on triangles `(n,)`: daylight on the parts' textures."""
-        owners = self.owners[faces]
         colors = np.empty((len(points), 3))
-        for owner in np.unique(owners):
-            rows = np.flatnonzero(owners == owner)
+        for owner, rows in self._rows_of_owners(faces):
             frame = self.frames[owner]
-            colors[rows] = self.textures[owner](((points[rows] - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32))
-        light = received(self.lights, points, _between(self.triangles[faces], self.normals[faces], points))
-        light[faces < self.unlit] = 1.0
-        return np.asarray(colors * light**GAMMA).clip(0.0, 1.0)
+            local = ((points[rows] - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32)
+            colors[rows] = self.textures[owner](local)
+        for start in range(0, len(points), CHUNK):
+            rows = slice(start, start + CHUNK)
+            face = faces[rows]
+            light = received(self.lights, points[rows], self._normals_at(points[rows], face))
+            light[face < self.unlit] = 1.0
+            colors[rows] *= light**GAMMA
+        return colors.clip(0.0, 1.0, out=colors)
+
+    def _normals_at(self, points: Array, faces: Index) -> Array:
+        """Unit normals `(n, 3)` at points `(n, 3)` on triangles `(n,)`."""
+        maps = self.normal_maps[faces]
+        normals = np.einsum("nij,nj->ni", maps[..., :3], points) + maps[..., 3]
+        return normals / np.sqrt(np.einsum("ni,ni->n", normals, normals))[:, None]
+
+    def _rows_of_owners(self, faces: Index) -> Iterator[tuple[int, Index]]:
+        """The rows of each part that some triangles belong to, at most `CHUNK` at a time."""
+        owners = self.owners[faces]
+        counts = np.bincount(owners)
+        order = np.argsort(owners.astype(np.uint16), kind="stable")  # 16 bits: numpy's radix sort
+        for owner, stop in enumerate(np.cumsum(counts)):
+            for start in range(stop - counts[owner], stop, CHUNK):
+                yield owner, order[start : min(start + CHUNK, stop)]
 
 
 def make_world(
@@ -107,14 +146,3 @@ def _normals(mesh: trimesh.Trimesh) -> Array:
     weights = mesh.area_faces[around] * there * ((mesh.face_normals[around] * own).sum(-1) > CREASE)
     sums = (weights[..., None] * mesh.face_normals[around]).sum(axis=1)
     return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True)).reshape(-1, 3, 3)
-
-
-def _between(triangles: Array, normals: Array, points: Array) -> Array:
-    """Unit normals `(n, 3)`: those at the corners `(n, 3, 3)`, interpolated at points `(n, 3)` of the triangles."""
-    a, b, c = triangles.transpose(1, 0, 2)
-    area = np.cross(b - a, c - a)
-    square = (area**2).sum(axis=1)
-    second = (np.cross(points - a, c - a) * area).sum(axis=1) / square
-    third = (np.cross(b - a, points - a) * area).sum(axis=1) / square
-    mixed = np.einsum("nk,nkd->nd", np.stack([1 - second - third, second, third], axis=-1), normals)
-    return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))

@@ -17,7 +17,7 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.geometry import camera_centers, degrees_between
 
-from .moments import load_moments, moments_of
+from .adam import Adam
 
 # Roughly the sum of the learning rates of one camera over a whole fit: Adam moves no number much farther.
 REACH = 0.004
@@ -48,7 +48,7 @@ class MovingPoses:
         self.extrinsics = self.given.clone()
         self._motions = [torch.zeros(6, dtype=torch.float64) for _ in given]  # 0 before each step
         groups = [{"params": [motion], "name": f"view {view}"} for view, motion in enumerate(self._motions)]
-        self._optimizer = torch.optim.Adam(groups)
+        self._optimizer = Adam(groups)
         self._seen: tuple[int, Tensor] | None = None
 
     def camera(self, camera: PinholeCamera, view: int) -> PinholeCamera:
@@ -93,7 +93,7 @@ class MovingPoses:
 
     def state_dict(self) -> dict[str, Any]:
         """All that the next steps depend on besides the arguments of the class."""
-        return {"extrinsics": self.extrinsics, "optimizer": moments_of(self._optimizer)}
+        return {"extrinsics": self.extrinsics, "optimizer": self._optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`; a KeyError, TypeError or ValueError if an entry is missing or wrong."""
@@ -101,7 +101,7 @@ class MovingPoses:
         if extrinsics.shape != self.given.shape:
             raise ValueError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(extrinsics.shape)}")
         self.extrinsics = extrinsics.double().clone()
-        load_moments(self._optimizer, state["optimizer"])
+        self._optimizer.load_state_dict(state["optimizer"])
 
     def _fix_gauge(self) -> None:
         """Turn, move and scale the world so that mean rotation, mean centre and spread of the centres are as given."""

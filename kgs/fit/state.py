@@ -19,8 +19,8 @@ from kgs.init_points import InitialPoints
 from kgs.json_files import is_number
 from kgs.model import PARAMETERS, GaussianModel
 
+from .adam import Adam
 from .config import FitConfig
-from .moments import load_moments, moments_of
 from .plan import Plan, most_gaussians
 from .poses import MovingPoses
 
@@ -67,7 +67,7 @@ class TrainState:
 
     start: Start
     model: GaussianModel
-    optimizer: torch.optim.Adam
+    optimizer: Adam
     densifier: Densifier
     drop: DropGaussian | None
     order: torch.Generator
@@ -104,7 +104,7 @@ class TrainState:
             {"params": [model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
             for name, rate in _LEARNING_RATES.items()
         ]
-        optimizer = torch.optim.Adam(groups, eps=recipe.adam_eps, fused=True)
+        optimizer = Adam(groups, eps=recipe.adam_eps)
         drop = None
         if config.drop:
             drop = DropGaussian(config.drop, config.drop_schedule, seed=seed + 1, device=plan.device)
@@ -142,7 +142,7 @@ class TrainState:
         """The state as nested dicts of tensors and plain values, copied."""
         parts = {
             "model": self.model.state_dict(),
-            "optimizer": moments_of(self.optimizer),
+            "optimizer": self.optimizer.state_dict(),
             "densifier": self.densifier.state_dict(),
             "drop": None if self.drop is None else self.drop.get_rng_state(),
             "order": self.order.get_state(),
@@ -171,7 +171,7 @@ class TrainState:
             state = cls._assemble(scene, plan, model, start)
             for name in ("step", "seconds", "stack", "curve", "notes"):
                 setattr(state, name, copy.deepcopy(values[name]))
-            load_moments(state.optimizer, copy.deepcopy(values["optimizer"]))
+            state.optimizer.load_state_dict(copy.deepcopy(values["optimizer"]))
             state.densifier.load_state_dict(values["densifier"])
             state.order.set_state(values["order"])
             if state.colors.get_state().shape == values["colors"].shape:

@@ -288,7 +288,7 @@ class Trainer:
                 state.densifier.observe(rendering.projected)
             if state.step < steps:  # as in the official release, the last step changes no parameter
                 self._move(progress)
-            state.optimizer.zero_grad(set_to_none=True)
+            state.optimizer.zero_grad()
         return self._loss
 
     def _set_progress(self, progress: float) -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 
 from kgs.errors import DataError
@@ -68,6 +67,8 @@ def _read_splat(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
 
 def _read_cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
     """The vertices that trimesh reads, and their colours or grey."""
+    import trimesh  # loads SciPy and networkx: half a second, which few fits need
+
     try:
         geometry: Any = trimesh.load(path, process=False, skip_materials=True)
         if isinstance(geometry, trimesh.Scene):

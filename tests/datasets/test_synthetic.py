@@ -10,7 +10,8 @@ from kornia.geometry.depth import warp_frame_depth
 
 from kgs.datasets.scene import Scene
 from kgs.datasets.synthetic import SUPERSAMPLING, garden, room, synthetic_depths, synthetic_scene
-from kgs.datasets.synthetic.raycast import _candidates, raycast
+from kgs.datasets.synthetic.raycast import CHUNK, _project, raycast
+from kgs.datasets.synthetic.textures import field
 
 SMALL = (42, 56)
 
@@ -120,9 +121,7 @@ def test_the_sky_shines_and_the_ground_is_shaded():
 def _pairs_per_ray(made, size, extrinsics):
     """Pairs of a triangle and a pixel in its box, of which a picture is made."""
     matrix, rays = _pinhole(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
-    corners = made.triangles.transpose(1, 0, 2) @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-    pairs, _, _ = _candidates(corners @ matrix.T, np.ones(len(made.triangles), dtype=bool), rays)
-    return len(pairs) / rays[0] / rays[1]
+    return _project(made.triangles, matrix, extrinsics, rays).counts.sum() / rays[0] / rays[1]
 
 
 @pytest.mark.slow
@@ -211,6 +210,36 @@ def test_raycast_closed_mesh_has_no_cracks_and_hides_what_is_behind():
     depths, faces = raycast(np.concatenate([ball, screen]), intrinsics, np.eye(4), size)
     np.testing.assert_allclose(depths[faces == len(ball)], 2.0, rtol=1e-12)
     assert (faces == len(ball)).mean() > 0.4
+
+
+def test_raycast_is_the_solution_of_each_pair_of_a_ray_and_a_triangle():
+    """Large triangles, of which some reach behind the camera, and small ones, among which some occur twice."""
+    rng = np.random.default_rng(0)
+    intrinsics, size = _pinhole(120, 160)
+    large = rng.normal(size=(6, 3, 3)) * [9.0, 9.0, 2.0] + [0.0, 0.0, 3.0]
+    small = rng.normal(size=(80, 1, 3)) * [2.0, 2.0, 0.5] + [0.0, 0.0, 4.0] + 0.2 * rng.normal(size=(80, 3, 3))
+    triangles = np.concatenate([large[:3], small, large[3:], small[:20]])
+    counts = _project(triangles, intrinsics, np.eye(4), size).counts
+    assert (counts > CHUNK).sum() >= 2
+    assert (counts < CHUNK / 100).sum() > 60
+    depths, faces = raycast(triangles, intrinsics, np.eye(4), size)
+    weights = _rays(intrinsics, size) @ np.linalg.inv(triangles)[:, None]
+    total = weights.sum(axis=-1)
+    hit = (weights >= 0).all(axis=-1) & (total > 0)
+    distances = np.where(hit, 1 / np.where(hit, total, 1.0), np.inf)
+    nearest = distances.min(axis=0)
+    np.testing.assert_allclose(np.where(faces < 0, np.inf, depths), nearest, rtol=1e-9)
+    last = len(triangles) - 1 - np.argmin(distances[::-1], axis=0)
+    np.testing.assert_array_equal(faces, np.where(np.isinf(nearest), -1, last))
+    assert (faces >= 86).sum() > 100
+
+
+def test_a_texture_is_a_function_of_the_point_alone():
+    points = np.random.default_rng(1).normal(size=(600, 3)).astype(np.float32)
+    texture = field(np.random.default_rng(0), 0.1, 0.5)
+    whole = texture(points)
+    for start, stop in ((0, 1), (3, 500), (255, 257), (597, 600)):
+        np.testing.assert_array_equal(texture(points[start:stop]), whole[start:stop])
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import trimesh
 from kornia.geometry.depth import depth_to_3d_v2
 
 from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene, world
-from kgs.datasets.synthetic.furniture import printed
+from kgs.datasets.synthetic.furniture import Part, plain, printed
 from kgs.datasets.synthetic.light import daylight, received
 from kgs.datasets.synthetic.pictures import blank
 from kgs.datasets.synthetic.raycast import raycast
@@ -92,8 +92,10 @@ def test_normals_are_smooth_over_a_ball_and_sharp_at_an_edge():
     np.testing.assert_allclose(world._normals(brick), np.repeat(brick.face_normals[:, None], 3, axis=1), atol=1e-12)
     rng = np.random.default_rng(0)
     faces = rng.integers(len(ball.faces), size=200)
-    points = np.einsum("nk,nkd->nd", rng.dirichlet([1, 1, 1], size=200), ball.triangles[faces])
-    mixed = world._between(ball.triangles[faces], world._normals(ball)[faces], points)
+    part = Part(ball, plain((255, 255, 255)))
+    made = world.make_world([], world.put([part], 0.0, 0.0), room.SUN, room.SKY)
+    points = np.einsum("nk,nkd->nd", rng.dirichlet([1, 1, 1], size=200), made.triangles[faces])
+    mixed = made._normals_at(points, faces)
     np.testing.assert_allclose(mixed, points / np.linalg.norm(points, axis=1, keepdims=True), atol=0.02)
 
 

@@ -131,7 +131,7 @@ def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
 
 @pytest.fixture(scope="module")
 def imported():
-    """What one process finds after importing more and more, three lines. Torch itself imports tqdm where that is."""
+    """What one process finds after importing more and more, four lines. Torch itself imports tqdm where that is."""
     code = """
 import sys
 import kgs, kgs.app.cli.run, kgs.fit.config
@@ -141,7 +141,8 @@ before = set(sys.modules)
 kgs.GaussianRenderer
 print(*sorted(set(sys.modules) - before))
 sys.modules["resource"] = None
-import kgs.fit.run, kgs.machine
+import kgs.fit.run, kgs.machine, kgs.datasets.load
+print("slow:", *{"scipy.spatial", "networkx", "trimesh", "matplotlib", "torch._dynamo"} & set(sys.modules))
 from pathlib import Path
 exists = Path.exists
 Path.exists = lambda path: False if str(path).startswith("/proc") else exists(path)
@@ -157,7 +158,11 @@ def test_the_package_the_command_and_the_numbers_of_a_fit_are_read_without_heavy
 
 def test_no_module_of_one_system_alone(imported):
     """Windows has no `resource`: a fit can still be imported, and its memory is not known where nothing tells it."""
-    assert imported[2] == "0"
+    assert imported[3] == "0"
+
+
+def test_a_fit_of_photos_does_not_wait_for_packages_that_it_does_not_call(imported):
+    assert imported[2] == "slow:"
 
 
 def test_the_renderer_is_light(imported):
