@@ -131,6 +131,15 @@ class ViewGeometry:
         world: Tensor = (local - self.extrinsics[views, :3, 3])[:, None] @ self.extrinsics[views, :3, :3]
         return world[:, 0]
 
+    def between(self, view: int, other: int) -> tuple[Tensor, Tensor]:
+        """H `(3, 3)` and t `(3,)`: a pixel (x, y) of `view` at depth d is at H (x, y, 1) d + t in `other`, homogeneous.
+
+        The third of these coordinates is its depth in `other`.
+        """
+        turn = self.extrinsics[other, :3, :3] @ self.extrinsics[view, :3, :3].mT
+        shift = self.extrinsics[other, :3, 3] - turn @ self.extrinsics[view, :3, 3]
+        return self.intrinsics[other] @ turn @ self.inverse_intrinsics[view], self.intrinsics[other] @ shift
+
     def inside_images(self, pixels: Tensor, depths: Tensor, near: float = 0.0, far: float = math.inf) -> Tensor:
         """Whether projected points `(P, V)` lie in the images, in front of the cameras, at depths from near to far."""
         within = ((pixels > -0.5) & (pixels < self.sizes - 0.5)).all(-1)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import cv2
 import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -31,17 +32,17 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
 
     `certain` holds masks `(H, W)`; the other pixels keep their depths.
     """
+    inverse = [1 / depth_map.depths.double() for depth_map in maps]
     averaged = []
     for view, own in enumerate(maps):
-        rows, columns, points = _points(geometry, own, certain[view], view)
-        camera = geometry.one(view)
-        total = 1 / own.depths[rows, columns].double()
-        count = torch.ones(len(rows), dtype=torch.float64)
-        for other, pixels, depths in _in_other_views(geometry, points, view):
+        rows, columns = certain[view].nonzero().unbind(1)
+        total = inverse[view][rows, columns]
+        count = torch.ones_like(total)
+        for other, pixels, depths in _in_other_views(geometry, own.depths[rows, columns], rows, columns, view):
             x, y, inside = nearest_pixels(pixels, depths, *own.depths.mT.shape)
-            other_depths = 1 / interpolate(1 / maps[other].depths.double()[None], pixels)[:, 0]
-            other_points = geometry.unproject(pixels, other_depths, torch.full_like(x, other))
-            own_depths = camera.project(other_points)[1][:, 0]
+            other_depths = 1 / interpolate(inverse[other][None], pixels)[:, 0]
+            turn, shift = geometry.between(other, view)
+            own_depths = convert_points_to_homogeneous(pixels) @ turn[2] * other_depths + shift[2]
             similar = (other_depths / depths - 1).abs() < SIMILAR
             similar &= inside & certain[other][y, x] & (own_depths > 0)
             total += torch.where(similar, 1 / own_depths, 0.0)
@@ -59,48 +60,59 @@ def agreed_points(
 
     Also returns their pixels, as columns and rows `(P, 2)`.
     """
-    rows, columns, points = _points(geometry, maps[view], certain[view], view)
-    agreed = torch.zeros(len(points), dtype=torch.bool)
-    for _, _, agrees in agreeing_views(geometry, maps, certain, points, view):
+    rows, columns = certain[view].nonzero().unbind(1)
+    depths = maps[view].depths[rows, columns]
+    agreed = torch.zeros(len(rows), dtype=torch.bool)
+    for _, _, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
         agreed |= agrees
     agreeing = torch.zeros_like(maps[view].depths)
     agreeing[rows, columns] = agreed.float()
     window = (WINDOW, WINDOW)
     counts = cv2.boxFilter(agreeing.numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
     agreed &= torch.from_numpy(counts)[rows, columns] >= SUPPORT
-    return points[agreed], torch.stack([columns, rows], 1)[agreed]
+    pixels = torch.stack([columns, rows], 1)[agreed]
+    points = geometry.unproject(pixels, depths[agreed].double(), torch.full((len(pixels),), view))
+    return points, pixels
 
 
 def agreeing_views(
-    geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], points: Tensor, view: int
+    geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], rows: Tensor, columns: Tensor, view: int
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Each other view, the positions `(P, 2)` of one view's points `(P, 3)` in it, and where it agrees, bool `(P,)`."""
-    camera = geometry.one(view)
-    for other, pixels, depths in _in_other_views(geometry, points, view):
+    """Each other view, the positions `(P, 2)` of one view's pixels in it, and where it agrees, bool `(P,)`."""
+    own_depths = maps[view].depths[rows, columns]
+    for other, pixels, depths in _in_other_views(geometry, own_depths, rows, columns, view):
         x, y, inside = nearest_pixels(pixels, depths, *maps[view].depths.mT.shape)
         other_depths = maps[other].depths[y, x].double()
-        other_pixels = torch.stack([x, y], 1)
-        owners = torch.full_like(x, other)
         # the other view's pixel as this view sees it: at the other view's depth, and at that of the point
-        at_other_depth, _ = camera.project(geometry.unproject(other_pixels, other_depths, owners))
-        at_own_depth, _ = camera.project(geometry.unproject(other_pixels, depths, owners))
-        apart = (at_other_depth - at_own_depth)[:, 0].norm(dim=1)
+        turn, shift = geometry.between(other, view)
+        rays = _rays(x, y) @ turn.mT
+        at_other_depth = _dehomogenise(rays * other_depths[:, None] + shift)
+        at_own_depth = _dehomogenise(rays * depths[:, None] + shift)
+        apart = (at_other_depth - at_own_depth).norm(dim=1)
         near = ((other_depths / depths - 1).abs() < AGREEMENT) | (apart < AGREEMENT_PIXELS)
         yield other, pixels, inside & near & certain[other][y, x]
 
 
-def _points(geometry: ViewGeometry, own: DepthMap, certain: Tensor, view: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and columns `(P,)` of a view's certain pixels, and their points `(P, 3)`, float64."""
-    rows, columns = certain.nonzero().unbind(1)
-    depths = own.depths[rows, columns].double()
-    points = geometry.unproject(torch.stack([columns, rows], 1), depths, torch.full_like(rows, view))
-    return rows, columns, points
+def _in_other_views(
+    geometry: ViewGeometry, depths: Tensor, rows: Tensor, columns: Tensor, view: int
+) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Each other view, with the positions `(P, 2)` and depths `(P,)` in it of a view's pixels at some depths."""
+    rays = _rays(columns, rows) * depths.double()[:, None]
+    for other in range(len(geometry)):
+        if other != view:
+            turn, shift = geometry.between(view, other)
+            there = rays @ turn.mT + shift
+            yield other, _dehomogenise(there), there[:, 2]
 
 
-def _in_other_views(geometry: ViewGeometry, points: Tensor, view: int) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Each other view, with the positions `(P, 2)` and depths `(P,)` of points in it."""
-    pixels, depths = geometry.project(points)
-    return ((other, pixels[:, other], depths[:, other]) for other in range(len(geometry)) if other != view)
+def _rays(x: Tensor, y: Tensor) -> Tensor:
+    """(x, y, 1) of each pixel, `(P, 3)` float64."""
+    return torch.stack([x, y, torch.ones_like(x)], 1).double()
+
+
+def _dehomogenise(places: Tensor) -> Tensor:
+    """Pixels `(P, 2)` of homogeneous ones; invalid at depth <= 0."""
+    return places[:, :2] / places[:, 2:]
 
 
 def interpolate(image: Tensor, pixels: Tensor) -> Tensor:

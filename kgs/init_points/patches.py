@@ -73,7 +73,7 @@ def _of_view(
     mean = sums(own, everywhere) / count.clamp_min(1)
     colors = mean[:, None].repeat(1, len(views), 1)
     visible = (count >= LEAST).repeat(1, len(views))
-    for other, places, agrees in agreeing_views(geometry, maps, certain, points, view):
+    for other, places, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
         difference = interpolate(images[other], places) - own
         shared = sums(one, agrees)
         colors[:, other] += sums(difference, agrees) / shared.clamp_min(1)

@@ -61,13 +61,14 @@ def sweep_depths(
         spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MOST_TO_INFINITY - 2))
         inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
     geometry = ViewGeometry.of(views.cameras)
+    memory = torch.empty(2, *grey.shape[1:], len(inverse))
     maps = []
     for view in stage(range(len(views)), "depth maps", "view"):
         others = _neighbours(geometry, view, typical)
         if others:
             homographies = torch.stack([_homographies(geometry, view, other, inverse) for other in others])
-            costs, scores = sweep_costs(grey[view], grey[others], homographies, backend)
-            maps.append(_refine(costs, scores, inverse, FARTHEST * far))
+            costs, unsmoothed = sweep_costs(grey[view], grey[others], homographies, backend, memory)
+            maps.append(_refine(costs, unsmoothed, inverse, FARTHEST * far))
         else:
             unknown = torch.full_like(grey[view], -1.0)
             maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
@@ -99,17 +100,13 @@ def _neighbours(geometry: ViewGeometry, view: int, depth: float) -> list[int]:
 
 def _homographies(geometry: ViewGeometry, view: int, other: int, inverse: Tensor) -> Tensor:
     """From pixels of a view to those of another, for each plane, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
-    pose = geometry.extrinsics[view]
-    other_pose = geometry.extrinsics[other]
-    rotation = other_pose[:3, :3] @ pose[:3, :3].mT
-    shift = other_pose[:3, 3] - rotation @ pose[:3, 3]
-    turns = rotation.repeat(len(inverse), 1, 1)
-    turns[:, :, 2] += inverse[:, None] * shift
-    homographies: Tensor = geometry.intrinsics[other] @ turns @ geometry.inverse_intrinsics[view]
+    turn, shift = geometry.between(view, other)
+    homographies = turn.repeat(len(inverse), 1, 1)
+    homographies[:, :, 2] += inverse[:, None] * shift
     return homographies
 
 
-def _refine(cost: Tensor, scores: Tensor, inverse: Tensor, most: float) -> DepthMap:
+def _refine(cost: Tensor, unsmoothed: Tensor, inverse: Tensor, most: float) -> DepthMap:
     """The depth of the cheapest plane of each pixel, refined by the lowest point of a parabola through three planes.
 
     It is at most `most`, also where the inverse depth is 0 or below.
@@ -122,4 +119,4 @@ def _refine(cost: Tensor, scores: Tensor, inverse: Tensor, most: float) -> Depth
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
     depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0])).clamp_min(1.0 / most)
-    return DepthMap(depths, scores.gather(0, best[None])[0], (best > 0) & (best < len(cost) - 1))
+    return DepthMap(depths, 1.0 - unsmoothed.gather(0, best[None])[0], (best > 0) & (best < len(cost) - 1))

@@ -1,6 +1,6 @@
 """Costs of a plane sweep: patches are compared by normalised cross-correlation (NCC), and the costs smoothed.
 
-Source: see `plane_sweep`. Images are warped by OpenCV, whatever the backend.
+Source: see `plane_sweep`.
 """
 
 from collections.abc import Iterator
@@ -18,47 +18,46 @@ STEP = 0.1
 JUMP = 2.0
 EDGE = 0.02  # the difference of grey values that halves the price of a jump
 LEAST_JUMP = 1.5 * STEP
+MARGIN = 1e-3  # pixels by which a place may lie outside an image: rounding of the homography
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
-_AT_ONCE = 8  # planes in a call of kernels; with 16, rows of scores and of volumes no longer fit into the cache
 
 
-def sweep_costs(image: Tensor, others: Tensor, homographies: Tensor, backend: str = "auto") -> tuple[Tensor, Tensor]:
-    """Smoothed costs and scores of each plane and pixel, each `(D, H, W)`.
+def sweep_costs(
+    image: Tensor, others: Tensor, homographies: Tensor, backend: str = "auto", memory: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Smoothed costs of each plane and pixel, and the costs before, 1 minus the scores; each `(D, H, W)`.
 
     Args:
         image: grey, float32 on a CPU, `(H, W)`.
         others: images of the neighbours, `(N, H, W)`.
         homographies: from pixels of `image` to those of a neighbour, by planes, float64, `(N, D, 3, 3)`.
         backend: "numba" and "auto" use kernels if possible.
+        memory: float32 `(2, H, W, D)`, for the results of kernels, which is faster than new memory for each view.
     """
+    middle = image.mean()  # without it, sums over windows are more exact
+    image = image - middle
+    others = others - middle
     if takes_kernels(backend, "sweep", image):
-        return _compiled_costs(image, others, homographies)
-    scores = _combine(_scores(image, other, turns) for other, turns in zip(others, homographies, strict=True))
-    return _semi_global(1.0 - scores, image), scores
+        memory = torch.empty(2, *image.shape, homographies.shape[1]) if memory is None else memory
+        return _compiled_costs(image, others, homographies, *memory)
+    costs = 1.0 - _combine(_scores(image, other, turns) for other, turns in zip(others, homographies, strict=True))
+    return _semi_global(costs, image), costs
 
 
-def _compiled_costs(image: Tensor, others: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
-    """`sweep_costs` by the kernels."""
-    from .sweep_kernels import add_scores, semi_global
+def _compiled_costs(
+    image: Tensor, others: Tensor, homographies: Tensor, smoothed: Tensor, costs: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`sweep_costs` by the kernels, written to `smoothed` and `costs`, `(H, W, D)`."""
+    from .sweep_kernels import HALO, compare, semi_global
 
     threads = torch.get_num_threads()
-    planes = homographies.shape[1]
-    best = np.full((*image.shape, planes), -np.inf, np.float32)
-    second = np.full_like(best, -np.inf)
-    grey = image.numpy()
     mean, variance = (moment.numpy() for moment in _moments(image))
-    for other, turns in zip(others, homographies, strict=True):
-        layers = (other, torch.ones_like(other))
-        for first, some in enumerate(turns.split(_AT_ONCE)):
-            warped = np.stack([[warp(layer, turn).numpy() for layer in layers] for turn in some])
-            add_scores(threads, grey, mean, variance, np.float32(VARIANCE), warped, first * _AT_ONCE, best, second)
-    if len(others) > 1:
-        best *= 0.75
-        second *= 0.25
-        best += second
+    padded = cv2.copyMakeBorder(image.numpy(), HALO, HALO, HALO, HALO, cv2.BORDER_REPLICATE)
+    neighbours = torch.nn.functional.pad(others, (0, 1, 0, 1)).numpy()
+    compare(threads, padded, mean, variance, np.float32(VARIANCE), neighbours, homographies.numpy(), costs.numpy())
     prices = tuple(np.float32(price) for price in (STEP, JUMP * EDGE, EDGE, LEAST_JUMP))
-    semi_global(threads, 1.0 - best, grey, prices, second)
-    return torch.from_numpy(second).permute(2, 0, 1), torch.from_numpy(best).permute(2, 0, 1)
+    semi_global(threads, costs.numpy(), image.numpy(), prices, smoothed.numpy())
+    return smoothed.permute(2, 0, 1), costs.permute(2, 0, 1)
 
 
 def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
@@ -66,24 +65,27 @@ def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
     mean, variance = _moments(image)
     scores = torch.empty(len(homographies), *image.shape)
     for plane, homography in enumerate(homographies):
-        warped = warp(target, homography)
-        inside = warp(torch.ones_like(target), homography)
+        warped, inside = warp(target, homography)
         warped_mean, warped_variance = _moments(warped)
         inverse_deviation = ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
         score = (_box(image * warped) - mean * warped_mean) * inverse_deviation
-        scores[plane] = torch.where(_box(inside) > 0.99, score, 0.0)
+        scores[plane] = torch.where(_box(inside.float()) > 0.99, score, 0.0)
     return scores
 
 
-def warp(image: Tensor, homography: Tensor) -> Tensor:
-    """The image at the places to which a homography maps pixels, `(H, W)`; 0 outside and behind the camera."""
+def warp(image: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
+    """The image at the places to which a homography maps pixels, and whether these lie in the image; both `(H, W)`."""
     height, width = image.shape
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = torch.from_numpy(cv2.warpPerspective(image.numpy(), homography.numpy(), (width, height), flags=flags))
-    x, y, one = homography[2]
-    if min(x * (width - 1), 0) + min(y * (height - 1), 0) + one > 0:
-        return warped
-    return torch.where(x * torch.arange(width) + (y * torch.arange(height))[:, None] + one > 0, warped, 0.0)
+    last = torch.tensor([width - 1, height - 1], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    mapped = torch.stack([columns, rows, torch.ones_like(rows)], -1).double() @ homography.mT
+    places = mapped[..., :2] / mapped[..., 2:]
+    inside = ((places >= -MARGIN) & (places <= last + MARGIN)).all(-1) & (mapped[..., 2] > 0)
+    grid = torch.where(inside[..., None], 2 * places / last - 1, 0.0)
+    warped = torch.nn.functional.grid_sample(
+        image[None, None].double(), grid[None], padding_mode="border", align_corners=True
+    )
+    return torch.where(inside, warped[0, 0].float(), 0.0), inside
 
 
 def _box(image: Tensor) -> Tensor:

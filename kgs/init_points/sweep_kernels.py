@@ -1,13 +1,16 @@
 """Costs of a plane sweep, by the formulas of `kgs.init_points.sweep_costs`; planes come last, they are the SIMD lanes.
 
-    image, mean, variance   (H, W), the latter two over the window around a pixel
-    warped                  (P, 2, H, W), another view's image warped by P planes of the sweep, and its mask of ones
+    image                   (H + 6, W + 6), its border replicated, minus the mean grey value
+    mean, variance          (H, W), of that image over the window around a pixel
+    others                  (N, H + 1, W + 1), the neighbours' images minus the same value; the last row and column
+                            have no weight
+    homographies            (N, D, 3, 3) float64, from pixels of the image to those of a neighbour
     prices                  float32: of a step by one plane; of a jump without an edge, times the next; the difference
                             of grey values that halves the price of a jump; the least price of a jump
-    best, second            (H, W, D), the two highest scores of a pixel at a plane so far
     cost, total             (H, W, D), the costs of planes, and the sum of the costs of paths
 
-Sums over windows are in float64, and all else rounds as written: results differ from torch's in a few last bits.
+Sums over windows are in float32, which suffices because the mean grey value is taken out. All rounds as written, so
+that the bits depend neither on threads nor on the processor.
 """
 
 import numpy as np
@@ -16,17 +19,20 @@ from kgs.compiled.kernel import ONE, ZERO, exact, f32, inline
 from kgs.compiled.threads import over
 
 HALO = 3  # pixels of a window on each side of its centre
-BAND = 16  # rows that one task computes
+SIDE = 2 * HALO + 1
+TILE_ROWS, TILE_COLUMNS = 32, 128  # pixels that one task compares: what it works on stays in the cache
 PATHS = 8  # that one task follows side by side
-LANES = 16  # the number of planes is padded to a multiple of this
+LANES = 16  # planes that are compared at a time, and of which the paths' memory holds a multiple
+MARGIN = 1e-3  # pixels by which a place may lie outside an image: rounding of the homography
 INFINITY = f32(np.inf)
 DIRECTIONS = [(dy, dx) for dy in (1, -1) for dx in (-1, 0, 1)] + [(0, 1), (0, -1)]  # rows and columns of a step
 
 
-def add_scores(threads, image, mean, variance, flat, warped, plane, best, second):
-    """Enter the scores of planes `plane`, `plane + 1`, ... into `best` and `second`; `flat` is added to variances."""
-    bands = -(-image.shape[0] // BAND)
-    over(threads, bands, enter_scores, image, mean, variance, flat, warped, plane, best, second, pieces=bands)
+def compare(threads, image, mean, variance, flat, others, homographies, cost):
+    """Write 1 minus the scores of all planes to `cost`; `flat` is added to variances."""
+    height, width = mean.shape
+    tiles = -(-height // TILE_ROWS) * -(-width // TILE_COLUMNS)
+    over(threads, tiles, compare_tiles, image, mean, variance, flat, others, homographies, cost, pieces=tiles)
 
 
 def semi_global(threads, cost, grey, prices, total):
@@ -38,58 +44,157 @@ def semi_global(threads, cost, grey, prices, total):
 
 
 @inline
-def row_sum(a, x):
+def sum_of_seven(a, x):
     """a[x] + ... + a[x + 6]."""
     return a[x] + a[x + 1] + a[x + 2] + a[x + 3] + a[x + 4] + a[x + 5] + a[x + 6]
 
 
+@inline
+def sum_of_rows(a, x):
+    """The sum of a column of seven numbers."""
+    return a[0, x] + a[1, x] + a[2, x] + a[3, x] + a[4, x] + a[5, x] + a[6, x]
+
+
 @exact
-def enter_scores(begin, end, image, mean, variance, flat, warped, plane, best, second):
-    """Normalised cross-correlation of windows, in bands of rows; 0 where a window leaves the other image."""
-    height, width = image.shape
-    planes = warped.shape[0]
-    sums = np.empty((planes, 4, width + 2 * HALO))  # of columns: warped, its square, its product with the image, inside
-    scores = np.empty((planes, width), np.float32)
-    share = 1.0 / (2 * HALO + 1) ** 2
-    for band in range(begin, end):
-        sums[:] = 0.0
-        for y in range(band * BAND - 2 * HALO - 1, min((band + 1) * BAND, height)):
-            # The row that enters the window below and, once the window is full, the one that leaves it above.
-            below = min(max(y + HALO, 0), height - 1)
-            above = min(max(y - HALO - 1, 0), height - 1)
-            is_full = 1.0 if y >= band * BAND else 0.0
-            for p in range(planes):
-                s0, s1, s2, s3 = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3]
-                for x in range(width):
-                    s0[HALO + x] += np.float64(warped[p, 0, below, x]) - is_full * np.float64(warped[p, 0, above, x])
-                    s3[HALO + x] += np.float64(warped[p, 1, below, x]) - is_full * np.float64(warped[p, 1, above, x])
-                for x in range(width):
-                    new, old = warped[p, 0, below, x], warped[p, 0, above, x]
-                    s1[HALO + x] += np.float64(new * new) - is_full * np.float64(old * old)
-                    s2[HALO + x] += np.float64(image[below, x] * new) - is_full * np.float64(image[above, x] * old)
-                if y < band * BAND:
-                    continue
-                for x in range(HALO):
-                    for s in range(4):  # the border is replicated
-                        sums[p, s, x] = sums[p, s, HALO]
-                        sums[p, s, HALO + width + x] = sums[p, s, HALO + width - 1]
-                for x in range(width):
-                    warped_mean = f32(row_sum(s0, x) * share)
-                    product = f32(row_sum(s2, x) * share)
-                    spread = f32(row_sum(s1, x) * share) - warped_mean * warped_mean
-                    spread = spread if spread > ZERO else ZERO
-                    inverse_deviation = ONE / np.sqrt((variance[y, x] + flat) * (spread + flat))
-                    score = (product - mean[y, x] * warped_mean) * inverse_deviation
-                    scores[p, x] = score if f32(row_sum(s3, x) * share) > f32(0.99) else ZERO
-            if y >= band * BAND:
-                for x in range(width):
-                    for p in range(planes):
-                        score = scores[p, x]
-                        first = best[y, x, plane + p]
-                        other = second[y, x, plane + p]
-                        lower = score if score < first else first
-                        best[y, x, plane + p] = first if score < first else score
-                        second[y, x, plane + p] = lower if lower > other else other
+def columns_inside(turn, y, last_x, last_y, first, last):
+    """The first and last of the columns `first` to `last` of row y that a homography maps into an image."""
+    low = np.float64(first)
+    high = np.float64(last)
+    depth = turn[2, 0], turn[2, 1] * y + turn[2, 2]  # slope and value at column 0, as of all conditions
+    for k in range(5):
+        if k < 4:
+            axis = k // 2
+            place = turn[axis, 0], turn[axis, 1] * y + turn[axis, 2]
+            if k % 2 == 0:  # the place is at least 0
+                slope = place[0] + MARGIN * depth[0]
+                value = place[1] + MARGIN * depth[1]
+            else:  # and at most the last pixel's
+                end = (last_y if axis else last_x) + MARGIN
+                slope = end * depth[0] - place[0]
+                value = end * depth[1] - place[1]
+        else:  # and in front of the camera
+            slope = depth[0]
+            value = depth[1] - 1e-9
+        if slope > 0.0:
+            low = max(low, np.ceil(-value / slope))
+        elif slope < 0.0:
+            high = min(high, np.floor(-value / slope))
+        elif value < 0.0:
+            high = low - 1.0
+    return np.int64(min(low, last + 1.0)), np.int64(max(high, first - 1.0))
+
+
+@exact
+def warp_row(turn, y, other, begin, end, row, offset):
+    """Write an image at the places of columns `begin` to `end` - 1 of row y to `row`, from `offset` on; bilinear."""
+    stride = np.int32(other.shape[1])
+    last_x = f32(other.shape[1] - 2)
+    last_y = f32(other.shape[0] - 2)
+    pixels = other.ravel()
+    across_x, across_y, across_z = f32(turn[0, 0]), f32(turn[1, 0]), f32(turn[2, 0])
+    at_x = f32(turn[0, 1] * y + turn[0, 2])
+    at_y = f32(turn[1, 1] * y + turn[1, 2])
+    at_z = f32(turn[2, 1] * y + turn[2, 2])
+    for k in range(end - begin):
+        x = f32(np.int32(begin) + np.int32(k))
+        inverse = ONE / (across_z * x + at_z)
+        u = (across_x * x + at_x) * inverse
+        v = (across_y * x + at_y) * inverse
+        u = u if u > ZERO else ZERO
+        v = v if v > ZERO else ZERO
+        u = u if u < last_x else last_x
+        v = v if v < last_y else last_y
+        column = np.int32(u)
+        line = np.int32(v)
+        right = u - f32(column)
+        down = v - f32(line)
+        i = np.uint32(line * stride + column)
+        below = np.uint32(line * stride + column + stride)
+        upper = pixels[i] + right * (pixels[i + np.uint32(1)] - pixels[i])
+        lower = pixels[below] + right * (pixels[below + np.uint32(1)] - pixels[below])
+        row[offset + k] = upper + down * (lower - upper)
+
+
+@exact
+def compare_tiles(begin, end, image, mean, variance, flat, others, homographies, cost):
+    """Normalised cross-correlation of windows, tile by tile; 0 where a window leaves the other image."""
+    height, width, planes = cost.shape
+    tiles_across = -(-width // TILE_COLUMNS)
+    share = f32(1.0 / SIDE**2)
+    row = np.zeros(TILE_COLUMNS + 2 * HALO, np.float32)
+    squares = np.zeros_like(row)
+    products = np.zeros_like(row)
+    sums = np.zeros((3, SIDE, TILE_COLUMNS), np.float32)  # over windows' rows: warped, its square, its product
+    limits = np.zeros((2, SIDE), np.int64)  # the columns of these rows inside the other image
+    best = np.empty((TILE_ROWS, LANES, TILE_COLUMNS), np.float32)
+    second = np.empty_like(best)
+    for tile in range(begin, end):
+        top = tile // tiles_across * TILE_ROWS
+        left = tile % tiles_across * TILE_COLUMNS
+        bottom = min(top + TILE_ROWS, height)
+        columns = min(left + TILE_COLUMNS, width) - left
+        first = max(left - HALO, 0)
+        last = min(left + columns + HALO, width) - 1
+        for plane in range(0, planes, LANES):
+            lanes = min(LANES, planes - plane)
+            best[:] = -INFINITY
+            second[:] = -INFINITY
+            for n in range(len(others)):
+                for p in range(lanes):
+                    turn = homographies[n, plane + p]
+                    for y in range(top - HALO, bottom + HALO):
+                        inside = min(max(y, 0), height - 1)
+                        slot = (y - top + HALO) % SIDE
+                        low, high = columns_inside(turn, inside, width - 1.0, height - 1.0, first, last)
+                        limits[0, slot] = low
+                        limits[1, slot] = high
+                        row[:] = ZERO
+                        if low <= high:
+                            warp_row(turn, inside, others[n], low, high + 1, row, low - left + HALO)
+                        for x in range(first - left + HALO):
+                            row[x] = row[first - left + HALO]  # the border is replicated
+                        for x in range(last - left + HALO + 1, columns + 2 * HALO):
+                            row[x] = row[last - left + HALO]
+                        own = image[y + HALO, left:]
+                        for x in range(columns + 2 * HALO):
+                            squares[x] = row[x] * row[x]
+                            products[x] = row[x] * own[x]
+                        s0, s1, s2 = sums[0, slot], sums[1, slot], sums[2, slot]
+                        for x in range(columns):
+                            s0[x] = sum_of_seven(row, x)
+                            s1[x] = sum_of_seven(squares, x)
+                            s2[x] = sum_of_seven(products, x)
+                        middle = y - HALO
+                        if middle < top:
+                            continue
+                        low = limits[0].max()
+                        high = limits[1].min()
+                        low = low + HALO if low > 0 else 0
+                        high = high - HALO if high < width - 1 else width - 1
+                        highest = best[middle - top, p]
+                        other = second[middle - top, p]
+                        own_mean = mean[middle, left:]
+                        own_variance = variance[middle, left:]
+                        for x in range(columns):
+                            warped_mean = sum_of_rows(sums[0], x) * share
+                            spread = sum_of_rows(sums[1], x) * share - warped_mean * warped_mean
+                            spread = spread if spread > ZERO else ZERO
+                            product = sum_of_rows(sums[2], x) * share - own_mean[x] * warped_mean
+                            score = product / np.sqrt((own_variance[x] + flat) * (spread + flat))
+                            column = np.int32(left) + np.int32(x)
+                            score = score if np.int32(low) <= column <= np.int32(high) else ZERO
+                            lower = score if score < highest[x] else highest[x]
+                            highest[x] = highest[x] if score < highest[x] else score
+                            other[x] = lower if lower > other[x] else other[x]
+            if len(others) > 1:
+                best *= f32(0.75)
+                second *= f32(0.25)
+                best += second
+            for y in range(top, bottom):
+                for x in range(columns):
+                    out = cost[y, left + x]
+                    for p in range(lanes):
+                        out[plane + p] = ONE - best[y - top, p, x]
 
 
 @exact

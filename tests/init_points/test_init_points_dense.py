@@ -17,7 +17,7 @@ from kgs.init_points import _sweep_range, initial_points
 from kgs.init_points.agreement import AGREEMENT
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points
 from kgs.init_points.plane_sweep import FARTHEST, _neighbours, planes_wanted, sweep_depths
-from kgs.init_points.sweep_costs import _semi_global, warp
+from kgs.init_points.sweep_costs import _semi_global
 
 
 @pytest.fixture(scope="module")
@@ -132,20 +132,6 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
     line = ViewGeometry.of(camera)
     assert sorted(_neighbours(line, 0, 3.0)) == [3, 4, 5, 6]
     assert _neighbours(line, 7, 3.0)[0] == 6
-
-
-def test_a_warp_is_that_of_grid_sample_and_empty_behind_the_camera() -> None:
-    image = torch.rand(20, 30, generator=generator())
-    homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], [0.002, -0.003, 1.0]], dtype=torch.float64)
-    rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
-    x, y, z = homography.float() @ torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1)
-    grid = torch.stack([2 * x / z / 29 - 1, 2 * y / z / 19 - 1], -1).reshape(1, 20, 30, 2)
-    inner = (grid.abs() < 1).all(-1)[0]
-    expected = torch.nn.functional.grid_sample(image[None, None], grid, align_corners=True)[0, 0]
-    assert float((warp(image, homography) - expected)[inner].abs().max()) < 0.05  # OpenCV may round to 1/32 pixel
-    homography[2] = torch.tensor([-0.1, 0.0, 1.0])
-    assert not warp(torch.ones(20, 30), homography)[:, 10:].any()
-    assert warp(torch.ones(20, 30), homography)[:, :5].any()
 
 
 def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:

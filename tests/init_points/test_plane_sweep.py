@@ -1,13 +1,15 @@
-"""The compiled plane sweep against torch's: costs, scores and depths to the last bits, on any number of threads."""
+"""The plane sweep: scores by their definition, compiled against torch's, the same bits on any number of threads."""
 
 import re
 
 import pytest
 import torch
 from kernel_checks import avx_assembly, check_bits
+from torch.nn.functional import grid_sample, pad
 
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.init_points import plane_sweep
+from kgs.init_points import sweep_costs as sweep_costs_module
 from kgs.init_points.sweep_costs import sweep_costs
 
 nb = pytest.importorskip("numba")
@@ -15,6 +17,7 @@ nb = pytest.importorskip("numba")
 from kgs.init_points import sweep_kernels as kernels  # noqa: E402  # needs numba
 
 VOLUME, IMAGE = nb.float32[:, :, ::1], nb.float32[:, ::1]
+ROUNDING = 5e-5  # of scores: places are float32, so that the images are sampled up to 2e-5 pixels beside them
 PRICES = nb.types.UniTuple(nb.float32, 4)
 
 
@@ -34,12 +37,62 @@ def costs(arguments, backend):
     return sweep_costs(*arguments, backend)
 
 
-@pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 40, 40)])
+def correlations(image, other, homography):
+    """NCC of windows of 7x7 by its definition, `(H, W)` float64; 0 where a window leaves the other image."""
+    height, width = image.shape
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    x, y, z = torch.einsum("ij,jhw->ihw", homography, torch.stack([columns, rows, torch.ones_like(rows)]).double())
+    u, v = x / z, y / z
+    margin = sweep_costs_module.MARGIN
+    inside = (z > 0) & (u >= -margin) & (u <= width - 1 + margin) & (v >= -margin) & (v <= height - 1 + margin)
+    grid = torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1).where(inside[..., None], 0)
+    warped = grid_sample(other[None, None].double(), grid[None], padding_mode="border", align_corners=True)[0, 0]
+    layers = torch.stack([image.double(), warped.where(inside, 0), inside.double()])
+    windows = pad(layers[None], (3, 3, 3, 3), mode="replicate")[0].unfold(1, 7, 1).unfold(2, 7, 1).flatten(3)
+    one, two = (windows - windows.mean(-1, keepdim=True))[:2]
+    variances = [(values * values).mean(-1) + sweep_costs_module.VARIANCE for values in (one, two)]
+    return ((one * two).mean(-1) / (variances[0] * variances[1]).sqrt()).where(windows[2].all(-1), 0)
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+@pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 140, 40)])
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_costs_and_scores_are_torchs(count, height, width, planes):
-    arguments = pictures(count, height, width, planes)
-    for results, expected in zip(costs(arguments, "numba"), costs(arguments, "torch"), strict=True):
-        torch.testing.assert_close(results, expected, rtol=1e-6, atol=2e-6, check_stride=False)
+def test_scores_are_correlations(count, height, width, planes, backend):
+    image, others, turns = pictures(count, height, width, planes)
+    scores = torch.stack(
+        [
+            torch.stack([correlations(image, *pair) for pair in zip(others, plane, strict=True)])
+            for plane in turns.transpose(0, 1)
+        ],
+        1,
+    )
+    best, second = scores.topk(min(count, 2), 0).values[[0, -1]]
+    _, unsmoothed = sweep_costs(image, others, turns, backend)
+    expected = 1 - (0.75 * best + 0.25 * second)
+    torch.testing.assert_close(unsmoothed, expected.float(), rtol=0, atol=ROUNDING, check_stride=False)
+
+
+@pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 40, 40)])
+def test_smoothed_costs_are_torchs(height, width, planes):
+    image, others, turns = pictures(2, height, width, planes)
+    smoothed, unsmoothed = sweep_costs(image, others, turns, "numba")
+    expected = sweep_costs_module._semi_global(unsmoothed.contiguous(), image)
+    torch.testing.assert_close(smoothed, expected, rtol=1e-6, atol=2e-6, check_stride=False)
+
+
+@pytest.mark.parametrize("last_row", [[0.002, -0.003, 1.0], [-0.1, 0.0, 1.0]])
+def test_a_warped_ramp_is_a_ramp_and_empty_behind_the_camera(last_row):
+    """Bilinear interpolation does not change a + b x + c y, so the places can be read from the grey values."""
+    homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], last_row], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(20), torch.arange(30), indexing="ij")
+    ramp = 0.2 + 0.01 * columns + 0.02 * rows
+    x, y, z = torch.einsum("ij,jhw->ihw", homography, torch.stack([columns, rows, torch.ones_like(rows)]).double())
+    u, v = x / z, y / z
+    expected = (z > 0) & (u >= 0) & (u <= 29) & (v >= 0) & (v <= 19)
+    assert expected.any()
+    warped, inside = sweep_costs_module.warp(ramp, homography)
+    assert torch.equal(inside, expected)
+    torch.testing.assert_close(warped, (0.2 + 0.01 * u + 0.02 * v).where(expected, 0).float(), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
@@ -49,7 +102,7 @@ def test_depth_maps_are_torchs(count):
     for results, expected in zip(*maps, strict=True):
         same = (results.depths / expected.depths - 1).abs() < 1e-4
         assert float(same.double().mean()) > 0.999
-        assert float((results.scores - expected.scores)[same].abs().max()) < 1e-5
+        assert float((results.scores - expected.scores)[same].abs().max()) < ROUNDING
 
 
 def test_bits_depend_neither_on_threads_nor_on_repetition():
@@ -61,7 +114,7 @@ def test_bits_depend_neither_on_threads_nor_on_repetition():
 @pytest.mark.parametrize(
     ("name", "arguments", "pattern", "operations"),  # of the loops over columns or planes, in the source
     [
-        ("enter_scores", (*[IMAGE] * 3, nb.float32, nb.float32[:, :, :, ::1], nb.int64, VOLUME, VOLUME), "add|sub", 32),
+        ("compare_tiles", (*[IMAGE] * 3, nb.float32, VOLUME, nb.float64[:, :, :, ::1], VOLUME), "add|sub", 32),
         ("add_paths", (VOLUME, IMAGE, nb.int64, nb.int64, PRICES, VOLUME), "add|sub|min|cmp", 9),
     ],
 )
