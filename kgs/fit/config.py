@@ -66,6 +66,7 @@ class Recipe:
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
+        alpha_threshold: alphas below it are skipped in training, in [0, 1); renders of the fit skip those below 1 / 255.
         near_plane: distance of the near plane, relative to the 1st percentile of the initial points' depths.
     """
 
@@ -91,6 +92,7 @@ class Recipe:
     reset_interval: _Count = 0
     reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
     reset_recovery: _Count = 300
+    alpha_threshold: Annotated[float, _Range(0, 1, "[)")] = 2 / 255
     near_plane: _Positive = 0.05
 
     def __post_init__(self) -> None:
@@ -108,8 +110,8 @@ class FitConfig:
     last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0.
 
     Args:
-        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 1000 for up to three
-            views, 1500 for more.
+        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 800 for up to three
+            views, 1100 for more.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
@@ -231,6 +233,7 @@ PAPER = FitConfig(
         prune_opacity=0.005,
         opacity_decay=1.0,
         reset_interval=3000,
+        alpha_threshold=1 / 255,
     ),
 )
 PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
@@ -246,7 +249,7 @@ class Detail(NamedTuple):
 # low: fewer steps, a third of them on a quarter of the pixels, and fewer points. high: four times the pixels, of which
 # half of the steps use a quarter. docs/recipe.md says what each gains and costs.
 DETAILS = {
-    "low": Detail(378, {"steps": 1000, "coarse": 0.3, "init_points": 12_000}),
+    "low": Detail(378, {"steps": 700, "coarse": 0.3, "init_points": 12_000}),
     "normal": Detail(504, {}),
     "high": Detail(1000, {"coarse": 0.5, "init_points": 80_000}),
 }

@@ -34,8 +34,9 @@ class Pace(NamedTuple):
 
 
 FEW_VIEWS = 3
-FEW = Pace(1000, 0.9925)  # of a fit to so few training views
-MANY = Pace(1500, 0.995)  # of a fit to more
+FEW = Pace(800, 0.9925)  # of a fit to so few training views
+MANY = Pace(1100, 0.995)  # of a fit to more
+FADING_STEPS = 1000  # up to so many the pace of few views may be used: in longer fits too much would fade
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def with_pace(config: FitConfig, views: int) -> FitConfig:
     steps = config.steps or (FEW if few else MANY).steps
     recipe = config.recipe
     if recipe.opacity_decay is None:
-        pace = FEW if few and steps <= FEW.steps else MANY
+        pace = FEW if few and steps <= FADING_STEPS else MANY
         recipe = replace(recipe, opacity_decay=pace.opacity_decay)
     return replace(config, steps=steps, recipe=recipe)
 

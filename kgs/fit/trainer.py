@@ -23,7 +23,7 @@ from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians, Rendering, check_kind
+from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
 from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig
@@ -86,6 +86,7 @@ class Trainer:
         self.renderer = GaussianRenderer(
             state.drop,
             near_plane=state.start.near_plane,
+            alpha_threshold=config.recipe.alpha_threshold,
             max_bytes=config.max_bytes,
             absgrad=config.recipe.absgrad,
             backend=self.plan.backend,
@@ -122,7 +123,7 @@ class Trainer:
         return Fit(
             scene=self.scene,
             model=state.model,
-            options=self.renderer.options,
+            options=replace(self.renderer.options, alpha_threshold=RasterOptions.alpha_threshold),
             backend=self.plan.backend,
             settings=self.plan.config,
             history={
