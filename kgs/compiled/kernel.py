@@ -80,7 +80,8 @@ class _Notice(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """Called before numba compiles any function, of kgs or not."""
-        ours = event.data["dispatcher"].py_func.__module__.startswith("kgs.")
+        module = event.data["dispatcher"].py_func.__module__ or ""  # None for what `exec` made
+        ours = module.startswith("kgs.")
         if ours and not self.said and sys.stderr is not None and sys.stderr.isatty():  # None: closed by `2>&-`
             print("kgs: compiling, once, about 20 s", file=sys.stderr, flush=True)
             self.said = True

@@ -66,7 +66,7 @@ class Recipe:
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
-        alpha_threshold: alphas below it are skipped in training, in [0, 1); renders of the fit skip those below 1 / 255.
+        alpha_threshold: alphas below it are skipped in training, in [0, 1); in all other renders, those below 1 / 255.
         near_plane: distance of the near plane, relative to the 1st percentile of the initial points' depths.
     """
 

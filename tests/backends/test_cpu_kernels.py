@@ -80,13 +80,12 @@ def test_pixels_are_the_lanes(kernel):
         "depths": f[:, :, ::1],
         "grad_transmittance": f[:, :, ::1],
     }
-    types |= {"grads": f[:, :, :, ::1], "needs_moments": nb.boolean, "needs_features": nb.boolean}
+    types |= {"grads": f[:, :, :, ::1], "needs_absolute": nb.boolean}
     types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
     names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
     text = assembly(kernel, *(types.get(name, i8) for name in names))
     packed, scalar = (len(re.findall(pattern, text)) for pattern in (PACKED, SCALAR))
-    # Forward has 44 where LLVM makes AVX2 (haswell to znver3), 92 with AVX-512 (unrolled twice), 0 of a scalar loop.
-    assert packed > max(40, 1.5 * scalar)
+    assert packed > max(24, 1.5 * scalar)  # forward has 33 with AVX-512 and twice as many with AVX2
 
 
 IMAGE, MAPS = nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]

@@ -1,0 +1,70 @@
+"""Memory that is used again."""
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from kgs.memory import array, empty
+
+LARGE = (1000, 100)
+
+
+def place(values):
+    return values.ctypes.data
+
+
+def test_memory_of_an_array_that_is_gone_is_used_again():
+    first = array(LARGE)
+    where = place(first)
+    del first
+    assert place(array((900, 100))) == where
+
+
+@pytest.mark.parametrize("keep", ["view", "tensor", "part of a tensor"])
+def test_memory_that_is_still_seen_is_not_used_again(keep):
+    first = array(LARGE)
+    where = place(first)
+    kept = {"view": first[10:], "tensor": torch.from_numpy(first), "part of a tensor": torch.from_numpy(first)[:, 3]}[
+        keep
+    ]
+    del first
+    assert place(array(LARGE)) != where
+    del kept
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [(LARGE, np.float32), (100_001, np.int32), ((3, 7), np.int64), (0, np.float32)]
+)
+def test_arrays_have_the_shape_and_begin_at_a_cache_line(shape, dtype):
+    values = array(shape, dtype)
+    assert values.shape == np.empty(shape, dtype).shape
+    assert values.dtype == dtype
+    assert values.nbytes < 2**16 or place(values) % 64 == 0
+    values[...] = 1
+
+
+def test_threads_do_not_get_the_same_memory():
+    results = []
+
+    def work(number):
+        for _ in range(50):
+            values = array(LARGE)
+            values[:] = number
+            results.append(bool((values == number).all()))
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(results)
+    assert len(results) == 200
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
+def test_tensors_are_like_the_one_that_is_given(dtype):
+    like = torch.zeros(3, dtype=dtype)
+    values = empty(LARGE, like)
+    assert (values.shape, values.dtype, values.device) == (torch.Size(LARGE), dtype, like.device)
