@@ -110,7 +110,7 @@ class FitConfig:
     last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0.
 
     Args:
-        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 800 for up to three
+        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
             views, 1100 for more.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.

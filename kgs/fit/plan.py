@@ -34,7 +34,7 @@ class Pace(NamedTuple):
 
 
 FEW_VIEWS = 3
-FEW = Pace(800, 0.9925)  # of a fit to so few training views
+FEW = Pace(900, 0.9925)  # of a fit to so few training views
 MANY = Pace(1100, 0.995)  # of a fit to more
 FADING_STEPS = 1000  # up to so many the pace of few views may be used: in longer fits too much would fade
 
