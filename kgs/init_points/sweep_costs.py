@@ -51,10 +51,11 @@ def _compiled_costs(
     from .sweep_kernels import HALO, compare, semi_global
 
     threads = torch.get_num_threads()
-    mean, variance = (moment.numpy() for moment in _moments(image))
+    mean, variance = _moments(image)
+    moments = mean.numpy(), variance.float().numpy()
     padded = cv2.copyMakeBorder(image.numpy(), HALO, HALO, HALO, HALO, cv2.BORDER_REPLICATE)
     neighbours = torch.nn.functional.pad(others, (0, 1, 0, 1)).numpy()
-    compare(threads, padded, mean, variance, np.float32(VARIANCE), neighbours, homographies.numpy(), costs.numpy())
+    compare(threads, padded, *moments, np.float32(VARIANCE), neighbours, homographies.numpy(), costs.numpy())
     prices = tuple(np.float32(price) for price in (STEP, JUMP * EDGE, EDGE, LEAST_JUMP))
     semi_global(threads, costs.numpy(), image.numpy(), prices, smoothed.numpy())
     return smoothed.permute(2, 0, 1), costs.permute(2, 0, 1)
@@ -68,7 +69,7 @@ def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
         warped, inside = warp(target, homography)
         warped_mean, warped_variance = _moments(warped)
         inverse_deviation = ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
-        score = (_box(image * warped) - mean * warped_mean) * inverse_deviation
+        score = (_box(image.double() * warped) - mean * warped_mean) * inverse_deviation
         scores[plane] = torch.where(_box(inside.float()) > 0.99, score, 0.0)
     return scores
 
@@ -95,6 +96,7 @@ def _box(image: Tensor) -> Tensor:
 
 def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance over the window around each pixel."""
+    image = image.double()  # in float32, rounding would be most of the variance of a flat window
     mean = _box(image)
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 

@@ -1,7 +1,7 @@
 """Costs of a plane sweep, by the formulas of `kgs.init_points.sweep_costs`; planes come last, they are the SIMD lanes.
 
     image                   (H + 6, W + 6), its border replicated, minus the mean grey value
-    mean, variance          (H, W), of that image over the window around a pixel
+    mean, variance          (H, W), of that image over the window around a pixel; the mean is float64
     others                  (N, H + 1, W + 1), the neighbours' images minus the same value; the last row and column
                             have no weight
     homographies            (N, D, 3, 3) float64, from pixels of the image to those of a neighbour
@@ -9,8 +9,8 @@
                             of grey values that halves the price of a jump; the least price of a jump
     cost, total             (H, W, D), the costs of planes, and the sum of the costs of paths
 
-Sums over windows are in float32, which suffices because the mean grey value is taken out. All rounds as written, so
-that the bits depend neither on threads nor on the processor.
+Sums over windows are in float64: of a window with little contrast, float32 would lose most of the variance. All rounds
+as written, so that the bits depend neither on threads nor on the processor.
 """
 
 import numpy as np
@@ -49,12 +49,6 @@ def sum_of_seven(a, x):
     return a[x] + a[x + 1] + a[x + 2] + a[x + 3] + a[x + 4] + a[x + 5] + a[x + 6]
 
 
-@inline
-def sum_of_rows(a, x):
-    """The sum of a column of seven numbers."""
-    return a[0, x] + a[1, x] + a[2, x] + a[3, x] + a[4, x] + a[5, x] + a[6, x]
-
-
 @exact
 def columns_inside(turn, y, last_x, last_y, first, last):
     """The first and last of the columns `first` to `last` of row y that a homography maps into an image."""
@@ -88,26 +82,26 @@ def columns_inside(turn, y, last_x, last_y, first, last):
 def warp_row(turn, y, other, begin, end, row, offset):
     """Write an image at the places of columns `begin` to `end` - 1 of row y to `row`, from `offset` on; bilinear."""
     stride = np.int32(other.shape[1])
-    last_x = f32(other.shape[1] - 2)
-    last_y = f32(other.shape[0] - 2)
+    last_x = np.float64(other.shape[1] - 2)
+    last_y = np.float64(other.shape[0] - 2)
     pixels = other.ravel()
-    across_x, across_y, across_z = f32(turn[0, 0]), f32(turn[1, 0]), f32(turn[2, 0])
-    at_x = f32(turn[0, 1] * y + turn[0, 2])
-    at_y = f32(turn[1, 1] * y + turn[1, 2])
-    at_z = f32(turn[2, 1] * y + turn[2, 2])
+    across_x, across_y, across_z = turn[0, 0], turn[1, 0], turn[2, 0]
+    at_x = turn[0, 1] * y + turn[0, 2]
+    at_y = turn[1, 1] * y + turn[1, 2]
+    at_z = turn[2, 1] * y + turn[2, 2]
     for k in range(end - begin):
-        x = f32(np.int32(begin) + np.int32(k))
-        inverse = ONE / (across_z * x + at_z)
+        x = np.float64(np.int32(begin) + np.int32(k))
+        inverse = 1.0 / (across_z * x + at_z)
         u = (across_x * x + at_x) * inverse
         v = (across_y * x + at_y) * inverse
-        u = u if u > ZERO else ZERO
-        v = v if v > ZERO else ZERO
+        u = u if u > 0.0 else 0.0
+        v = v if v > 0.0 else 0.0
         u = u if u < last_x else last_x
         v = v if v < last_y else last_y
         column = np.int32(u)
         line = np.int32(v)
-        right = u - f32(column)
-        down = v - f32(line)
+        right = f32(u - np.float64(column))
+        down = f32(v - np.float64(line))
         i = np.uint32(line * stride + column)
         below = np.uint32(line * stride + column + stride)
         upper = pixels[i] + right * (pixels[i + np.uint32(1)] - pixels[i])
@@ -120,11 +114,11 @@ def compare_tiles(begin, end, image, mean, variance, flat, others, homographies,
     """Normalised cross-correlation of windows, tile by tile; 0 where a window leaves the other image."""
     height, width, planes = cost.shape
     tiles_across = -(-width // TILE_COLUMNS)
-    share = f32(1.0 / SIDE**2)
+    share = 1.0 / SIDE**2
     row = np.zeros(TILE_COLUMNS + 2 * HALO, np.float32)
-    squares = np.zeros_like(row)
-    products = np.zeros_like(row)
-    sums = np.zeros((3, SIDE, TILE_COLUMNS), np.float32)  # over windows' rows: warped, its square, its product
+    rows = np.zeros((SIDE, TILE_COLUMNS + 2 * HALO), np.float32)  # the last ones
+    sums = np.zeros((3, TILE_COLUMNS + 2 * HALO))  # of these rows' columns: warped, its square, its product
+    s0, s1, s2 = sums[0], sums[1], sums[2]
     limits = np.zeros((2, SIDE), np.int64)  # the columns of these rows inside the other image
     best = np.empty((TILE_ROWS, LANES, TILE_COLUMNS), np.float32)
     second = np.empty_like(best)
@@ -142,6 +136,8 @@ def compare_tiles(begin, end, image, mean, variance, flat, others, homographies,
             for n in range(len(others)):
                 for p in range(lanes):
                     turn = homographies[n, plane + p]
+                    rows[:] = ZERO
+                    sums[:] = 0.0
                     for y in range(top - HALO, bottom + HALO):
                         inside = min(max(y, 0), height - 1)
                         slot = (y - top + HALO) % SIDE
@@ -156,14 +152,15 @@ def compare_tiles(begin, end, image, mean, variance, flat, others, homographies,
                         for x in range(last - left + HALO + 1, columns + 2 * HALO):
                             row[x] = row[last - left + HALO]
                         own = image[y + HALO, left:]
+                        own_gone = image[max(y + HALO - SIDE, 0), left:]
+                        oldest = rows[slot]
                         for x in range(columns + 2 * HALO):
-                            squares[x] = row[x] * row[x]
-                            products[x] = row[x] * own[x]
-                        s0, s1, s2 = sums[0, slot], sums[1, slot], sums[2, slot]
-                        for x in range(columns):
-                            s0[x] = sum_of_seven(row, x)
-                            s1[x] = sum_of_seven(squares, x)
-                            s2[x] = sum_of_seven(products, x)
+                            new = np.float64(row[x])
+                            gone = np.float64(oldest[x])
+                            s0[x] += new - gone
+                            s1[x] += new * new - gone * gone
+                            s2[x] += new * np.float64(own[x]) - gone * np.float64(own_gone[x])
+                            oldest[x] = row[x]
                         middle = y - HALO
                         if middle < top:
                             continue
@@ -176,10 +173,10 @@ def compare_tiles(begin, end, image, mean, variance, flat, others, homographies,
                         own_mean = mean[middle, left:]
                         own_variance = variance[middle, left:]
                         for x in range(columns):
-                            warped_mean = sum_of_rows(sums[0], x) * share
-                            spread = sum_of_rows(sums[1], x) * share - warped_mean * warped_mean
+                            warped_mean = sum_of_seven(s0, x) * share
+                            spread = f32(sum_of_seven(s1, x) * share - warped_mean * warped_mean)
                             spread = spread if spread > ZERO else ZERO
-                            product = sum_of_rows(sums[2], x) * share - own_mean[x] * warped_mean
+                            product = f32(sum_of_seven(s2, x) * share - own_mean[x] * warped_mean)
                             score = product / np.sqrt((own_variance[x] + flat) * (spread + flat))
                             column = np.int32(left) + np.int32(x)
                             score = score if np.int32(low) <= column <= np.int32(high) else ZERO

@@ -17,7 +17,6 @@ nb = pytest.importorskip("numba")
 from kgs.init_points import sweep_kernels as kernels  # noqa: E402  # needs numba
 
 VOLUME, IMAGE = nb.float32[:, :, ::1], nb.float32[:, ::1]
-ROUNDING = 5e-5  # of scores: places are float32, so that the images are sampled up to 2e-5 pixels beside them
 PRICES = nb.types.UniTuple(nb.float32, 4)
 
 
@@ -69,7 +68,7 @@ def test_scores_are_correlations(count, height, width, planes, backend):
     best, second = scores.topk(min(count, 2), 0).values[[0, -1]]
     _, unsmoothed = sweep_costs(image, others, turns, backend)
     expected = 1 - (0.75 * best + 0.25 * second)
-    torch.testing.assert_close(unsmoothed, expected.float(), rtol=0, atol=ROUNDING, check_stride=False)
+    torch.testing.assert_close(unsmoothed, expected.float(), rtol=1e-6, atol=2e-6, check_stride=False)
 
 
 @pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 40, 40)])
@@ -102,7 +101,7 @@ def test_depth_maps_are_torchs(count):
     for results, expected in zip(*maps, strict=True):
         same = (results.depths / expected.depths - 1).abs() < 1e-4
         assert float(same.double().mean()) > 0.999
-        assert float((results.scores - expected.scores)[same].abs().max()) < ROUNDING
+        assert float((results.scores - expected.scores)[same].abs().max()) < 1e-5
 
 
 def test_bits_depend_neither_on_threads_nor_on_repetition():
@@ -114,7 +113,12 @@ def test_bits_depend_neither_on_threads_nor_on_repetition():
 @pytest.mark.parametrize(
     ("name", "arguments", "pattern", "operations"),  # of the loops over columns or planes, in the source
     [
-        ("compare_tiles", (*[IMAGE] * 3, nb.float32, VOLUME, nb.float64[:, :, :, ::1], VOLUME), "add|sub", 32),
+        (
+            "compare_tiles",
+            (IMAGE, nb.float64[:, ::1], IMAGE, nb.float32, VOLUME, nb.float64[:, :, :, ::1], VOLUME),
+            "add|sub",
+            32,
+        ),
         ("add_paths", (VOLUME, IMAGE, nb.int64, nb.int64, PRICES, VOLUME), "add|sub|min|cmp", 9),
     ],
 )
