@@ -32,7 +32,7 @@ def array(shape: int | tuple[int, ...], dtype: Any = np.float32) -> np.ndarray[A
         return np.empty(shape, kind)
     block = _block(size + _LINE)
     flat = np.frombuffer(block.data, kind, count, -block.ctypes.data % _LINE)
-    weakref.finalize(flat, _free.append, block).atexit = False
+    weakref.finalize(flat, _give_back, block).atexit = False
     return flat.reshape(shape)
 
 
@@ -44,6 +44,10 @@ def _block(size: int) -> np.ndarray[Any, Any]:
             return _free.pop(i)
         del _free[:-_BLOCKS]
     return np.empty(math.ceil(_MARGIN * size), np.uint8)
+
+
+def _give_back(block: np.ndarray[Any, Any]) -> None:
+    _free.append(block)
 
 
 def empty(shape: tuple[int, ...], like: Tensor) -> Tensor:

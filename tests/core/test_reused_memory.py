@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import kgs.memory
 from kgs.memory import array, empty
 
 LARGE = (1000, 100)
@@ -13,6 +14,11 @@ LARGE = (1000, 100)
 
 def place(values):
     return values.ctypes.data
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_free(monkeypatch):
+    monkeypatch.setattr(kgs.memory, "_free", [])
 
 
 def test_memory_of_an_array_that_is_gone_is_used_again():
