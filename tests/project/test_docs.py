@@ -78,7 +78,6 @@ NUMBERS = [
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
     ("docs/comparison.md", "initial points, of which there are # to #", [FEWEST, MOST]),
     ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
-    ("docs/measured.md", "| fit, # steps |", [FEW.steps]),
     ("docs/measured.md", "the default from # to #, then", [FEWEST, MOST]),
     ("docs/measured.md", "default, for # steps with three views and # with more", STEPS_OF_BOTH),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
