@@ -197,7 +197,8 @@ def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
     colors[v, u] = setup.world.shade(points, faces[v, u])
     total = sum(colors[i::s, j::s] for i in range(s) for j in range(s))
-    return np.asarray(total / np.float32(s * s)).transpose(2, 0, 1)
+    image: NDArray[np.float32] = np.asarray(total / np.float32(s * s), np.float32).transpose(2, 0, 1)
+    return image
 
 
 def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -70,7 +70,8 @@ def received(lights: Lights, points: Array, normals: Array) -> NDArray[np.float3
     column, line = ((x / z + np.float32(0.5)).clip(0, size - 1).astype(np.int32) for x in (u, v))
     nearest = lights.depths.take(first + line * size + column)
     cosines = (normals.astype(np.float32) @ lights.directions.T).clip(0)
-    return AMBIENT + (cosines * (z < nearest + LIFT / 2)) @ lights.colors
+    light: NDArray[np.float32] = AMBIENT + (cosines * (z < nearest + LIFT / 2)) @ lights.colors
+    return light
 
 
 def _cap(axis: Array, count: int, least: float) -> Array:

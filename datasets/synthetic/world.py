@@ -80,18 +80,20 @@ class World:
             local = ((points[rows] - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32)
             colors[rows] = self.textures[owner](local)
         for start in range(0, len(points), CHUNK):
-            rows = slice(start, start + CHUNK)
-            face = faces[rows]
-            light = received(self.lights, points[rows], self._normals_at(points[rows], face))
+            chunk = slice(start, start + CHUNK)
+            face = faces[chunk]
+            light = received(self.lights, points[chunk], self._normals_at(points[chunk], face))
             light[face < self.unlit] = 1.0
-            colors[rows] *= light**GAMMA
+            colors[chunk] *= light**GAMMA
         return colors.clip(0.0, 1.0, out=colors)
 
     def _normals_at(self, points: Array, faces: Index) -> Array:
         """Unit normals `(n, 3)` at points `(n, 3)` on triangles `(n,)`."""
         maps = self.normal_maps[faces]
         normals = np.einsum("nij,nj->ni", maps[..., :3], points) + maps[..., 3]
-        return normals / np.sqrt(np.einsum("ni,ni->n", normals, normals))[:, None]
+        lengths: Array = np.sqrt(np.einsum("ni,ni->n", normals, normals))
+        units: Array = normals / lengths[:, None]
+        return units
 
     def _rows_of_owners(self, faces: Index) -> Iterator[tuple[int, Index]]:
         """The rows of each part that some triangles belong to, at most `CHUNK` at a time."""

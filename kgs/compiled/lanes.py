@@ -13,13 +13,15 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
+from numba import extending
 from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin, lower_cast
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, models, register_model
+from numba.extending import models, register_model
 
 WIDTH = 16
 ROW = 16  # numbers of a row of memory, a cache line
+intrinsic: Any = extending.intrinsic  # it is typed as if kernels passed the typing context
 _FLAGS = ("reassoc", "contract", "nsz", "arcp")
 
 
@@ -28,7 +30,7 @@ _INTS = ir.VectorType(ir.IntType(32), WIDTH)
 _FIRST = ir.Constant(ir.IntType(32), 0)
 
 
-class Lanes(types.Type):  # type: ignore[misc]
+class Lanes(types.Type):
     """The type of sixteen float32."""
 
     def __init__(self) -> None:
@@ -39,12 +41,12 @@ lanes = Lanes()
 
 
 @register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _FLOATS)
 
 
-class _Operation(AbstractTemplate):  # type: ignore[misc]
+class _Operation(AbstractTemplate):
     def generic(self, args: Any, kws: Any) -> Any:
         """Two lanes, or lanes and a number, which is the same in all of them."""
         if kws or lanes not in args or any(x not in (lanes, types.float32) for x in args):
@@ -55,7 +57,7 @@ class _Operation(AbstractTemplate):  # type: ignore[misc]
 def _define(function: Callable[..., Any], name: str) -> None:
     infer_global(function)(type(f"_{name}", (_Operation,), {}))
 
-    @lower_builtin(function, Lanes, Lanes)  # type: ignore[untyped-decorator]
+    @lower_builtin(function, Lanes, Lanes)
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return getattr(builder, name)(*args, flags=_FLAGS)
 
@@ -65,7 +67,7 @@ _define(operator.sub, "fsub")
 _define(operator.mul, "fmul")
 
 
-@lower_cast(types.float32, Lanes)  # type: ignore[untyped-decorator]
+@lower_cast(types.float32, Lanes)
 def _spread(context: Any, builder: Any, fromty: Any, toty: Any, value: Any) -> Any:
     nothing = ir.Constant(_FLOATS, ir.Undefined)
     return _shuffle(builder, builder.insert_element(nothing, value, _FIRST), nothing, [0] * WIDTH)
@@ -93,7 +95,7 @@ def _pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def load(typingctx: Any, array: Any, first: Any) -> Any:
     """Sixteen numbers of a contiguous float32 array `(n,)`, from position `first` on."""
 
@@ -105,7 +107,7 @@ def load(typingctx: Any, array: Any, first: Any) -> Any:
     return lanes(array, first), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def store(typingctx: Any, array: Any, first: Any, value: Any) -> Any:
     """Write lanes to a contiguous float32 array `(n,)`, from position `first` on."""
 
@@ -156,7 +158,7 @@ where_above = _where(">")  # (x, limit, value, other): value where x > limit, el
 where_at_least = _where(">=")
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def total(typingctx: Any, x: Any) -> Any:
     """The sum of the lanes."""
 
@@ -166,7 +168,7 @@ def total(typingctx: Any, x: Any) -> Any:
     return types.float32(lanes), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def totals(typingctx: Any, values: Any) -> Any:
     """Lanes that hold the sums of up to sixteen lanes, a tuple; 0 in the rest."""
 
