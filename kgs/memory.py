@@ -16,7 +16,7 @@ from torch import Tensor
 _LINE = 64  # bytes of a cache line, at which arrays begin
 _LEAST = 2**16  # smaller blocks are quick to get
 _MOST = 2**26  # larger ones are not kept
-_BLOCKS = 32  # free ones that are kept
+_KEPT = 2**28  # bytes of all free blocks
 _WASTE = 1.5  # a block may be so many times larger than what is wanted
 _MARGIN = 1.1  # new blocks are larger than asked for, because the number of Gaussians grows
 _free: list[np.ndarray[Any, Any]] = []
@@ -42,12 +42,15 @@ def _block(size: int) -> np.ndarray[Any, Any]:
         i = next(fitting, None)
         if i is not None:
             return _free.pop(i)
-        del _free[:-_BLOCKS]
+        while sum(map(len, _free)) > _KEPT // 2:  # sizes have changed: what is oldest fits no longer
+            del _free[0]
     return np.empty(math.ceil(_MARGIN * size), np.uint8)
 
 
 def _give_back(block: np.ndarray[Any, Any]) -> None:
-    _free.append(block)
+    """Keep a block where there is room; only append, for garbage collection may call this within `_block`."""
+    if sum(map(len, _free)) + len(block) <= _KEPT:
+        _free.append(block)
 
 
 def empty(shape: tuple[int, ...], like: Tensor) -> Tensor:

@@ -98,7 +98,7 @@ FOLDERS = {  # what is in them, and what is said of it
     ),
 }
 SLOW_FOLDERS = {
-    "one twice, saved anew": (
+    "one twice, saved again": (
         lambda at: save(at, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"]),
         ("1.png and 2.jpg match at the same pixels", "remove one of them"),
     ),

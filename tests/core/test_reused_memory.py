@@ -74,3 +74,10 @@ def test_tensors_are_like_the_one_that_is_given(dtype):
     like = torch.zeros(3, dtype=dtype)
     values = empty(LARGE, like)
     assert (values.shape, values.dtype, values.device) == (torch.Size(LARGE), dtype, like.device)
+
+
+def test_what_is_kept_is_bounded(monkeypatch):
+    monkeypatch.setattr(kgs.memory, "_KEPT", 2**20)
+    arrays = [array(LARGE) for _ in range(10)]
+    del arrays
+    assert 0 < sum(map(len, kgs.memory._free)) <= 2**20

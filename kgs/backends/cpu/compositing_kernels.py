@@ -144,6 +144,7 @@ def composite_forward(
                 y = load(pixels, P + p)
                 before = load(s, p)
                 depth = load(s, (1 + F) * P + p)
+                # a name for each feature, because an array would be memory; what lies beyond F is compiled to nothing
                 c0 = load(s, (1 + min(0, F)) * P + p)
                 c1 = load(s, (1 + min(1, F)) * P + p)
                 c2 = load(s, (1 + min(2, F)) * P + p)
