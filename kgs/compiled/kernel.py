@@ -16,7 +16,7 @@ from .lanes import floor, power_of_two
 
 f32 = np.float32
 ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
-_LARGEST = np.finfo(np.float32).max
+LARGEST = np.finfo(np.float32).max
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # without nnan and ninf: see `is_finite`
 
@@ -62,7 +62,7 @@ def exp2(x):
 @inline
 def is_finite(x):
     """Of a float32; numba's `isfinite` looks at x - x, which `reassoc` makes 0 where x is a sum."""
-    return abs(x) <= _LARGEST
+    return abs(x) <= LARGEST
 
 
 @inline

@@ -5,7 +5,8 @@ memory what runs through the loop, and adds up each sum by itself. Kernels that 
 want. `Lanes` are one register with AVX-512, two with AVX2 and four with NEON, and `totals` adds up sixteen of them in
 the operations of four.
 
-Lanes have +, - and * with each other and with float32; numbers may be rounded together, as in all kernels (`_FLAGS`).
+Lanes have +, -, * and / with each other and with float32; numbers may be rounded together, as in all kernels (`_FLAGS`).
+The functions take lanes, numbers, or both, so that a formula may be written once for one Gaussian and for sixteen.
 """
 
 import operator
@@ -59,12 +60,13 @@ def _define(function: Callable[..., Any], name: str) -> None:
 
     @lower_builtin(function, Lanes, Lanes)
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, name)(*args, flags=_FLAGS)
+        return getattr(builder, name)(*args, flags=_FLAGS if name != "fdiv" else ())  # 1 / y may overflow where x / y is 1
 
 
 _define(operator.add, "fadd")
 _define(operator.sub, "fsub")
 _define(operator.mul, "fmul")
+_define(operator.truediv, "fdiv")
 
 
 @lower_cast(types.float32, Lanes)
@@ -79,9 +81,11 @@ def _shuffle(builder: Any, x: Any, y: Any, order: list[int]) -> Any:
 
 
 def _llvm(builder: Any, name: str, *args: Any) -> Any:
-    """Call a function of LLVM on lanes."""
-    kind = ir.FunctionType(_FLOATS, [_FLOATS] * len(args))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{WIDTH}f32"), args)
+    """Call a function of LLVM on lanes, or on numbers."""
+    kind = args[0].type
+    suffix = f"v{WIDTH}f32" if kind == _FLOATS else "f32"
+    function = ir.FunctionType(kind, [kind] * len(args))
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{suffix}"), args)
 
 
 def _compare(comparison: str, builder: Any, x: Any, y: Any) -> Any:
@@ -120,13 +124,14 @@ def store(typingctx: Any, array: Any, first: Any, value: Any) -> Any:
 
 
 def _function(generate: Callable[..., Any]) -> Any:
-    """A function of up to four lanes, or numbers that become lanes; `generate` gets the builder and the values."""
+    """A function of up to four lanes or numbers: lanes where one is; `generate` gets the builder and the values."""
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return generate(builder, *args)
 
     def typed(*args: Any) -> Any:
-        return lanes(*[lanes] * len(args)), lower
+        kind = lanes if lanes in args else types.float32
+        return kind(*[kind] * len(args)), lower
 
     count = generate.__code__.co_argcount - 1
     kinds = {
@@ -143,19 +148,38 @@ def _power_of_two(builder: Any, n: Any) -> Any:
     return builder.bitcast(builder.shl(biased, ir.Constant(_INTS, [23] * WIDTH)), _FLOATS)
 
 
+def _exponent(builder: Any, x: Any) -> Any:
+    shifted = builder.lshr(builder.bitcast(x, _INTS), ir.Constant(_INTS, [23] * WIDTH))
+    return builder.sitofp(builder.sub(shifted, ir.Constant(_INTS, [127] * WIDTH)), _FLOATS)
+
+
+def _mantissa(builder: Any, x: Any) -> Any:
+    fraction = builder.and_(builder.bitcast(x, _INTS), ir.Constant(_INTS, [0x7FFFFF] * WIDTH))
+    return builder.bitcast(builder.or_(fraction, ir.Constant(_INTS, [127 << 23] * WIDTH)), _FLOATS)
+
+
 def _where(comparison: str) -> Any:
     return _function(lambda b, x, limit, value, other: b.select(_compare(comparison, b, x, limit), value, other))
 
 
-spread = _function(lambda b, x: x)  # the same number in all lanes
 floor = _function(lambda b, x: _llvm(b, "floor", x))
+ceil = _function(lambda b, x: _llvm(b, "ceil", x))
 magnitude = _function(lambda b, x: _llvm(b, "fabs", x))
-power_of_two = _function(_power_of_two)  # of whole numbers from -126 to 128; 2^128 is infinite
+root = _function(lambda b, x: _llvm(b, "sqrt", x))
+power_of_two = _function(_power_of_two)  # of whole numbers from -126 to 128; 2^128 is infinite; of lanes only, as the next
+exponent = _function(_exponent)  # x = 2^exponent mantissa, for x > 0 that is not denormal; 128 for infinity
+mantissa = _function(_mantissa)  # in [1, 2)
 maximum = _function(lambda b, x, y: b.select(_compare(">", b, x, y), x, y))  # y where x is not a number
 minimum = _function(lambda b, x, y: b.select(_compare("<", b, x, y), x, y))
 multiply_add = _function(lambda b, x, y, z: _llvm(b, "fmuladd", x, y, z))  # x y + z, whether x y is needed or not
 where_above = _where(">")  # (x, limit, value, other): value where x > limit, else other
 where_at_least = _where(">=")
+
+
+@intrinsic
+def spread(typingctx: Any, x: Any) -> Any:
+    """The same number in all lanes."""
+    return lanes(lanes), lambda context, builder, sig, args: args[0]
 
 
 @intrinsic

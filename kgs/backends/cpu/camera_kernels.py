@@ -20,12 +20,12 @@ def camera_gradients(begin, end, means, quats, scales, colors, camera, ids, grad
     b, h, none = np.empty(16, np.float32), np.empty(16, np.float32), np.empty((0, 0), np.float32)
     for m in range(begin, end):
         g, out = ids[m], outs[m]
-        x, y, z = local = camera_point(means, g, v)
+        x, y, z = local = camera_point(means[g, 0], means[g, 1], means[g, 2], v)
         world, inverse = (means[g, 0], means[g, 1], means[g, 2]), ONE / z
         j, _, tx, ty = rows(x, y, inverse, v, k, limits)
         s, f = scales[g], g_factors[m]
         t = (f[0] * s[0], f[1] * s[1], f[2] * s[2], f[3] * s[0], f[4] * s[1], f[5] * s[2])
-        u = turned_back(t, rotation(quats, g)[2])
+        u = turned_back(t, rotation(quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3])[2])
         g_mean = g_means2d[m, 0], g_means2d[m, 1]
         gx, gy, gz, by_j = point_gradient(x, y, z, v, k, limits, u, g_mean, g_depths[m])
         moved, w = (gx, gy, gz), (ZERO, ZERO, ZERO)

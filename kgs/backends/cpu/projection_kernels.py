@@ -9,32 +9,65 @@ import math
 
 import numpy as np
 
-from kgs.compiled.kernel import HALF, ONE, TWO, ZERO, f32, inline, is_finite, jit
+from kgs.compiled.kernel import HALF, LARGEST, ONE, TWO, ZERO, f32, inline, is_finite, jit, scratch
+from kgs.compiled.lanes import (
+    WIDTH,
+    load,
+    magnitude,
+    maximum,
+    minimum,
+    root,
+    store,
+    where_above,
+    where_at_least,
+)
 
-from .harmonics_kernels import THREE, basis_gradient, evaluate_harmonics, harmonics_basis
+from .harmonics_kernels import BAND_0, THREE, basis_gradient, evaluate_harmonics, harmonics_basis
 
 SMALLEST_SQUARE, LARGEST_SQUARE = f32(1e-30), f32(1e36)
 BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
+PART = 64  # Gaussians whose numbers are turned into columns in one go
 
 
 @inline
-def rotation(quats, g):
+def read(values, g, count, columns, first, i):
+    """Put `count` numbers of row g into place i of columns, `(columns PART,)`."""
+    for j in range(count):
+        columns[(first + j) * PART + i] = values[g, j]
+
+
+@inline
+def column(columns, j, p):
+    """Lanes of column j."""
+    return load(columns, j * PART + p)
+
+
+@inline
+def write(columns, j, p, value):
+    """Fill lanes of column j."""
+    store(columns, j * PART + p, value)
+
+
+@inline
+def rotation(w, x, y, z):
     """Unit quaternion, 1 / norm, rotation matrix by rows; the zero quaternion turns nothing and gets no gradient."""
-    qw, qx, qy, qz = np.float64(quats[g, 0]), np.float64(quats[g, 1]), np.float64(quats[g, 2]), np.float64(quats[g, 3])
-    norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)  # in float64 no square overflows or vanishes
-    inverse = 1.0 / norm if norm > 0.0 else 0.0
-    w = f32(qw * inverse) if norm > 0.0 else ONE
-    x, y, z = f32(qx * inverse), f32(qy * inverse), f32(qz * inverse)
+    largest = maximum(maximum(magnitude(w), magnitude(x)), maximum(magnitude(y), magnitude(z)))
+    divisor = where_above(largest, ZERO, largest, ONE)  # no square overflows or vanishes
+    w, x, y, z = w / divisor, x / divisor, y / divisor, z / divisor
+    norm = root(w * w + x * x + y * y + z * z)
+    divisor = where_above(largest, ZERO, norm, ONE)
+    w = where_above(largest, ZERO, w / divisor, ONE)
+    x, y, z = x / divisor, y / divisor, z / divisor
+    inverse = where_above(largest, ZERO, ONE / norm / largest, ZERO)
     xx, yy, zz = TWO * x * x, TWO * y * y, TWO * z * z
     xy, xz, yz, wx, wy, wz = TWO * x * y, TWO * x * z, TWO * y * z, TWO * w * x, TWO * w * y, TWO * w * z
     r = (ONE - yy - zz, xy - wz, xz + wy, xy + wz, ONE - xx - zz, yz - wx, xz - wy, yz + wx, ONE - xx - yy)
-    return (w, x, y, z), f32(inverse), r
+    return (w, x, y, z), inverse, r
 
 
 @inline
-def camera_point(means, g, v):
+def camera_point(x, y, z, v):
     """The centre in camera axes."""
-    x, y, z = means[g, 0], means[g, 1], means[g, 2]
     return (
         v[0, 0] * x + v[0, 1] * y + v[0, 2] * z + v[0, 3],
         v[1, 0] * x + v[1, 1] * y + v[1, 2] * z + v[1, 3],
@@ -45,16 +78,15 @@ def camera_point(means, g, v):
 @inline
 def rows(x, y, inverse, v, k, limits):
     """J and J W, each by rows, and the clamped tangents."""
-    tx, ty = x * inverse, y * inverse
-    tx = limits[0, 0] if tx < limits[0, 0] else limits[0, 1] if tx > limits[0, 1] else tx
-    ty = limits[1, 0] if ty < limits[1, 0] else limits[1, 1] if ty > limits[1, 1] else ty
+    tx = minimum(maximum(x * inverse, limits[0, 0]), limits[0, 1])
+    ty = minimum(maximum(y * inverse, limits[1, 0]), limits[1, 1])
     j = (
         k[0, 0] * inverse,
         k[0, 1] * inverse,
-        -(k[0, 0] * tx + k[0, 1] * ty) * inverse,
+        ZERO - (k[0, 0] * tx + k[0, 1] * ty) * inverse,
         k[1, 0] * inverse,
         k[1, 1] * inverse,
-        -(k[1, 0] * tx + k[1, 1] * ty) * inverse,
+        ZERO - (k[1, 0] * tx + k[1, 1] * ty) * inverse,
     )
     a = (
         j[0] * v[0, 0] + j[1] * v[1, 0] + j[2] * v[2, 0],
@@ -137,45 +169,46 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, f
     depths, opacities, colours of harmonics `(N, 3)` (`(N, 0)` where none are wanted), radii and numbers of the
     Gaussians, and in `counts` how many of each block are visible and how many are not finite, `(blocks, 2)`.
     """
-    v, k, limits, _, centre = camera
-    height, width, near, eps2d, cutoff = frustum
-    means2d, factors, depths, alphas, rgb, radii, ids = lists
-    bands = colors.shape[1] // 3 if rgb.shape[1] else 0
+    bands = colors.shape[1] // 3 if lists[4].shape[1] else 0
     b = np.empty(16, np.float32)
+    columns = scratch(_READ * PART)
+    columns[:] = ZERO
     row = min(c, opacities.shape[0] - 1)
     for block in range(begin, end):
         m, broken = block * BLOCK, 0
-        for g in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
-            if not _is_finite(g, means, quats, scales, opacities, colors):
-                broken += 1
-                continue
-            x, y, z = camera_point(means, g, v)
-            if not z > near:
-                continue
-            inverse = ONE / z
-            _, a, _, _ = rows(x, y, inverse, v, k, limits)
-            f = _turned(a, rotation(quats, g)[2])
-            s0, s1, s2 = scales[g, 0], scales[g, 1], scales[g, 2]
-            a0, a1, a2, b0, b1, b2 = f[0] * s0, f[1] * s1, f[2] * s2, f[3] * s0, f[4] * s1, f[5] * s2
-            px, py = (k[0, 0] * x + k[0, 1] * y) * inverse + k[0, 2], (k[1, 0] * x + k[1, 1] * y) * inverse + k[1, 2]
-            xx, xy, yy = a0 * a0 + a1 * a1 + a2 * a2, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2
-            c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-            det = c0 * c0 + c1 * c1 + c2 * c2 + eps2d * (xx + yy) + eps2d * eps2d
-            xx, yy = xx + eps2d, yy + eps2d
-            difference, across = np.float64(HALF * (xx - yy)), np.float64(xy)
-            largest = HALF * (xx + yy) + f32(math.sqrt(difference * difference + across * across))
-            if not (det > ZERO and is_finite(det + largest + px + py)):
-                continue
-            rx, ry = cutoff * math.sqrt(xx), cutoff * math.sqrt(yy)
-            if px + rx > -HALF and px - rx < width - HALF and py + ry > -HALF and py - ry < height - HALF:
-                ids[m], depths[m], alphas[m], radii[m] = g, z, opacities[row, g], np.ceil(THREE * math.sqrt(largest))
-                means2d[m, 0], means2d[m, 1] = px, py
-                factors[m, 0], factors[m, 1], factors[m, 2] = a0, a1, a2
-                factors[m, 3], factors[m, 4], factors[m, 5] = b0, b1, b2
-                if bands:
-                    dx, dy, dz, _ = _direction(means, g, centre)
+        block_end = min((block + 1) * BLOCK, len(means))
+        for part in range(block * BLOCK, block_end, PART):
+            n = min(PART, block_end - part)
+            for i in range(n):
+                g = part + i
+                read(means, g, 3, columns, 0, i)
+                read(quats, g, 4, columns, 3, i)
+                read(scales, g, 3, columns, 7, i)
+                others = ZERO
+                for j in range(opacities.shape[0]):
+                    others += opacities[j, g]
+                for j in range(colors.shape[1]):
+                    others += colors[g, j]
+                columns[10 * PART + i] = others
+            for p in range(0, n, WIDTH):
+                _footprint(p, camera, frustum, columns)
+            for i in range(n):
+                g = part + i
+                if columns[11 * PART + i] == ZERO and not _is_finite(g, means, quats, scales, opacities, colors):
+                    broken += 1
+                    continue
+                if columns[12 * PART + i] == ZERO:
+                    continue
+                _list(m, g, i, columns, opacities[row, g], lists)
+                if bands == 1:
+                    for j in range(3):
+                        color = HALF + BAND_0 * colors[g, j]
+                        lists[4][m, j] = ZERO if color < ZERO else color
+                elif bands:
+                    dx, dy, dz, _ = _direction(means, g, camera[4])
                     harmonics_basis(dx, dy, dz, bands, b)
                     red, green, blue = evaluate_harmonics(colors, g, bands, b)
+                    rgb = lists[4]
                     rgb[m, 0] = ZERO if red < ZERO else red
                     rgb[m, 1] = ZERO if green < ZERO else green
                     rgb[m, 2] = ZERO if blue < ZERO else blue
@@ -183,9 +216,83 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, f
         counts[block, 0], counts[block, 1] = m - block * BLOCK, broken
 
 
+_READ = 23  # columns of `footprints`: see `_footprint`
+
+
+@inline
+def _footprint(p, camera, frustum, columns):
+    """From columns 0 to 10, mean, quaternion, scales, the sum of other numbers, to 11 to 22 of some Gaussians.
+
+    These are 1 where all numbers are finite (0 also where only their sum is not), 1 where it is visible; the centre in
+    pixels, the six factors, the depth, the squared radius of one standard deviation.
+    """
+    v, k, limits, _, _ = camera
+    height, width, near, eps2d, cutoff = frustum
+    x0, y0, z0 = column(columns, 0, p), column(columns, 1, p), column(columns, 2, p)
+    qw, qx, qy, qz = column(columns, 3, p), column(columns, 4, p), column(columns, 5, p), column(columns, 6, p)
+    s0, s1, s2 = column(columns, 7, p), column(columns, 8, p), column(columns, 9, p)
+    total = x0 + y0 + z0 + qw + qx + qy + qz + s0 + s1 + s2 + column(columns, 10, p)
+    finite = where_at_least(LARGEST, magnitude(total), ONE, ZERO)  # a finite sum has finite terms
+    x, y, z = camera_point(x0, y0, z0, v)
+    inverse = ONE / z
+    _, a, _, _ = rows(x, y, inverse, v, k, limits)
+    _, _, r = rotation(qw, qx, qy, qz)
+    f = _turned(a, r)
+    a0, a1, a2, b0, b1, b2 = f[0] * s0, f[1] * s1, f[2] * s2, f[3] * s0, f[4] * s1, f[5] * s2
+    px, py = (k[0, 0] * x + k[0, 1] * y) * inverse + k[0, 2], (k[1, 0] * x + k[1, 1] * y) * inverse + k[1, 2]
+    xx, xy, yy = a0 * a0 + a1 * a1 + a2 * a2, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2
+    c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    det = c0 * c0 + c1 * c1 + c2 * c2 + eps2d * (xx + yy) + eps2d * eps2d
+    xx, yy = xx + eps2d, yy + eps2d
+    largest = HALF * (xx + yy) + _hypotenuse(HALF * (xx - yy), xy)
+    rx, ry = cutoff * root(xx), cutoff * root(yy)
+    seen = where_above(z, near, ONE, ZERO)
+    seen = where_above(det, ZERO, seen, ZERO)
+    seen = where_at_least(LARGEST, magnitude(det + largest + px + py), seen, ZERO)
+    seen = where_above(px + rx, ZERO - HALF, seen, ZERO)
+    seen = where_above(width - HALF, px - rx, seen, ZERO)
+    seen = where_above(py + ry, ZERO - HALF, seen, ZERO)
+    seen = where_above(height - HALF, py - ry, seen, ZERO)
+    write(columns, 11, p, finite)
+    write(columns, 12, p, seen)
+    write(columns, 13, p, px)
+    write(columns, 14, p, py)
+    write(columns, 15, p, a0)
+    write(columns, 16, p, a1)
+    write(columns, 17, p, a2)
+    write(columns, 18, p, b0)
+    write(columns, 19, p, b1)
+    write(columns, 20, p, b2)
+    write(columns, 21, p, z)
+    write(columns, 22, p, largest)
+
+
+@inline
+def _hypotenuse(x, y):
+    """The root of the sum of squares, which may overflow."""
+    largest = maximum(magnitude(x), magnitude(y))
+    divisor = where_above(largest, ZERO, largest, ONE)
+    x, y = x / divisor, y / divisor
+    return largest * root(x * x + y * y)
+
+
+@inline
+def _list(m, g, i, columns, opacity, lists):
+    """Write what `_footprint` has computed of Gaussian g to row m of the lists."""
+    means2d, factors, depths, alphas, _, radii, ids = lists
+    means2d[m, 0] = columns[13 * PART + i]
+    means2d[m, 1] = columns[14 * PART + i]
+    for j in range(6):
+        factors[m, j] = columns[(15 + j) * PART + i]
+    depths[m] = columns[21 * PART + i]
+    alphas[m] = opacity
+    radii[m] = np.ceil(THREE * math.sqrt(columns[22 * PART + i]))
+    ids[m] = g
+
+
 @inline
 def color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors):
-    """Add to the harmonics' gradients; returns the colour's contribution to the gradient of the centre."""
+    """Add to the gradients of harmonics of more than one band; returns the colour's part of the centre's gradient."""
     x, y, z, inverse = _direction(means, g, centre)
     harmonics_basis(x, y, z, bands, b)
     red, green, blue = evaluate_harmonics(colors, g, bands, b)
@@ -197,14 +304,11 @@ def color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors):
             d_colors[g, 3 * k] += b[k] * red
             d_colors[g, 3 * k + 1] += b[k] * green
             d_colors[g, 3 * k + 2] += b[k] * blue
-    gx = gy = gz = ZERO
-    if bands > 1:
-        for k in range(bands):
-            h[k] = red * colors[g, 3 * k] + green * colors[g, 3 * k + 1] + blue * colors[g, 3 * k + 2]
-        gx, gy, gz = basis_gradient(x, y, z, bands, h)
-        along = gx * x + gy * y + gz * z
-        gx, gy, gz = (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
-    return gx, gy, gz
+    for k in range(bands):
+        h[k] = red * colors[g, 3 * k] + green * colors[g, 3 * k + 1] + blue * colors[g, 3 * k + 2]
+    gx, gy, gz = basis_gradient(x, y, z, bands, h)
+    along = gx * x + gy * y + gz * z
+    return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
 
 
 @inline
@@ -240,15 +344,17 @@ def point_gradient(x, y, z, v, k, limits, u, g_mean, g_depth):
         (k[0, 0] * g_mean[0] + k[1, 0] * g_mean[1]) * inverse,
         (k[0, 1] * g_mean[0] + k[1, 1] * g_mean[1]) * inverse,
     )
-    gx, gy, gz = px, py, g_depth - (px * x + py * y) * inverse
-    gz -= (j00 * j[0] + j01 * j[1] + j02 * j[2] + j10 * j[3] + j11 * j[4] + j12 * j[5]) * inverse
-    if limits[0, 0] <= x * inverse <= limits[0, 1]:
-        t = -(k[0, 0] * j02 + k[1, 0] * j12) * inverse * inverse
-        gx, gz = gx + t, gz - t * tx
-    if limits[1, 0] <= y * inverse <= limits[1, 1]:
-        t = -(k[0, 1] * j02 + k[1, 1] * j12) * inverse * inverse
-        gy, gz = gy + t, gz - t * ty
-    return gx, gy, gz, (j00, j01, j02, j10, j11, j12)
+    gz = g_depth - (px * x + py * y) * inverse
+    gz = gz - (j00 * j[0] + j01 * j[1] + j02 * j[2] + j10 * j[3] + j11 * j[4] + j12 * j[5]) * inverse
+    across = within(x * inverse, limits[0, 0], limits[0, 1], (k[0, 0] * j02 + k[1, 0] * j12) * inverse * inverse)
+    up = within(y * inverse, limits[1, 0], limits[1, 1], (k[0, 1] * j02 + k[1, 1] * j12) * inverse * inverse)
+    return px - across, py - up, gz + across * tx + up * ty, (j00, j01, j02, j10, j11, j12)
+
+
+@inline
+def within(x, low, high, value):
+    """The value where x is in the range, else 0."""
+    return where_at_least(x, low, where_at_least(high, x, value, ZERO), ZERO)
 
 
 @jit
@@ -259,44 +365,82 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
     opacities and colours `(M, 3)` or `(M, 0)`. Added to are `outs`, of means, quats, scales, opacities `(1, N)` or
     `(C, N)`, and colours `(N, F)`, or `(N, 0)` where that is not wanted.
     """
-    v, k, limits, _, centre = camera
     g_means2d, g_factors, g_depths, g_opacities, g_rgb = gradients
     d_means, d_quats, d_scales, d_opacities, d_colors = outs
     bands = colors.shape[1] // 3 if g_rgb.shape[1] else 0
     b, h = np.empty(16, np.float32), np.empty(16, np.float32)
     row = min(c, d_opacities.shape[0] - 1)
-    m = np.searchsorted(ids, begin)
-    for g in range(begin, end):
-        if c == 0:
-            for i in range(3):
-                d_means[g, i] = d_quats[g, i] = d_scales[g, i] = ZERO
-            d_quats[g, 3] = ZERO
-            for i in range(d_opacities.shape[0]):
-                d_opacities[i, g] = ZERO
-            for i in range(d_colors.shape[1]):
-                d_colors[g, i] = ZERO
-        if m == len(ids) or ids[m] != g:
-            continue
-        d_opacities[row, g] += g_opacities[m]
-        x, y, z = camera_point(means, g, v)
-        _, a, _, _ = rows(x, y, ONE / z, v, k, limits)
-        q, inverse, r = rotation(quats, g)
-        s, f = (scales[g, 0], scales[g, 1], scales[g, 2]), _turned(a, r)
-        t = (g_factors[m, 0], g_factors[m, 1], g_factors[m, 2], g_factors[m, 3], g_factors[m, 4], g_factors[m, 5])
-        d_scales[g, 0] += t[0] * f[0] + t[3] * f[3]
-        d_scales[g, 1] += t[1] * f[1] + t[4] * f[4]
-        d_scales[g, 2] += t[2] * f[2] + t[5] * f[5]
-        t = (t[0] * s[0], t[1] * s[1], t[2] * s[2], t[3] * s[0], t[4] * s[1], t[5] * s[2])
-        dw, dx, dy, dz = _quaternion_gradient(q, inverse, a, t)
-        d_quats[g, 0], d_quats[g, 1] = d_quats[g, 0] + dw, d_quats[g, 1] + dx
-        d_quats[g, 2], d_quats[g, 3] = d_quats[g, 2] + dy, d_quats[g, 3] + dz
-        u = turned_back(t, r)
-        x, y, z, _ = point_gradient(x, y, z, v, k, limits, u, (g_means2d[m, 0], g_means2d[m, 1]), g_depths[m])
-        gx, gy = v[0, 0] * x + v[1, 0] * y + v[2, 0] * z, v[0, 1] * x + v[1, 1] * y + v[2, 1] * z
-        gz = v[0, 2] * x + v[1, 2] * y + v[2, 2] * z
-        if bands:
-            gradient = g_rgb[m, 0], g_rgb[m, 1], g_rgb[m, 2]
-            wx, wy, wz = color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors)
-            gx, gy, gz = gx + wx, gy + wy, gz + wz
-        d_means[g, 0], d_means[g, 1], d_means[g, 2] = d_means[g, 0] + gx, d_means[g, 1] + gy, d_means[g, 2] + gz
-        m += 1
+    if c == 0:
+        d_means[begin:end] = ZERO
+        d_quats[begin:end] = ZERO
+        d_scales[begin:end] = ZERO
+        d_opacities[:, begin:end] = ZERO
+        d_colors[begin:end] = ZERO
+    columns = scratch(_COLUMNS * PART)
+    columns[:] = ZERO
+    last = np.searchsorted(ids, end)
+    for first in range(np.searchsorted(ids, begin), last, PART):
+        n = min(PART, last - first)
+        for i in range(n):
+            m, g = first + i, ids[first + i]
+            read(means, g, 3, columns, 0, i)
+            read(quats, g, 4, columns, 3, i)
+            read(scales, g, 3, columns, 7, i)
+            read(g_factors, m, 6, columns, 10, i)
+            read(g_means2d, m, 2, columns, 16, i)
+            columns[18 * PART + i] = g_depths[m]
+        for p in range(0, n, WIDTH):
+            _gradient(p, camera, columns)
+        for i in range(n):
+            m, g = first + i, ids[first + i]
+            d_opacities[row, g] += g_opacities[m]
+            for j in range(3):
+                d_means[g, j] += columns[j * PART + i]
+                d_scales[g, j] += columns[(7 + j) * PART + i]
+            for j in range(4):
+                d_quats[g, j] += columns[(3 + j) * PART + i]
+            if bands == 1:
+                if d_colors.shape[1]:
+                    for j in range(3):
+                        d_colors[g, j] += ZERO if HALF + BAND_0 * colors[g, j] < ZERO else BAND_0 * g_rgb[m, j]
+            elif bands:
+                gradient = g_rgb[m, 0], g_rgb[m, 1], g_rgb[m, 2]
+                wx, wy, wz = color_gradients(g, means, colors, camera[4], bands, gradient, b, h, d_colors)
+                d_means[g, 0] += wx
+                d_means[g, 1] += wy
+                d_means[g, 2] += wz
+
+
+_COLUMNS = 19  # of `footprint_gradients`: see `_gradient`
+
+
+@inline
+def _gradient(p, camera, columns):
+    """In columns 0 to 9, mean, quaternion, scales, put their gradients.
+
+    Columns 10 to 18 are the gradients of factors, the centre in pixels, and the depth.
+    """
+    v, k, limits, _, _ = camera
+    x0, y0, z0 = column(columns, 0, p), column(columns, 1, p), column(columns, 2, p)
+    qw, qx, qy, qz = column(columns, 3, p), column(columns, 4, p), column(columns, 5, p), column(columns, 6, p)
+    s0, s1, s2 = column(columns, 7, p), column(columns, 8, p), column(columns, 9, p)
+    t0, t1, t2 = column(columns, 10, p), column(columns, 11, p), column(columns, 12, p)
+    t3, t4, t5 = column(columns, 13, p), column(columns, 14, p), column(columns, 15, p)
+    x, y, z = camera_point(x0, y0, z0, v)
+    _, a, _, _ = rows(x, y, ONE / z, v, k, limits)
+    q, inverse, r = rotation(qw, qx, qy, qz)
+    f = _turned(a, r)
+    write(columns, 7, p, t0 * f[0] + t3 * f[3])
+    write(columns, 8, p, t1 * f[1] + t4 * f[4])
+    write(columns, 9, p, t2 * f[2] + t5 * f[5])
+    t = (t0 * s0, t1 * s1, t2 * s2, t3 * s0, t4 * s1, t5 * s2)
+    dw, dx, dy, dz = _quaternion_gradient(q, inverse, a, t)
+    write(columns, 3, p, dw)
+    write(columns, 4, p, dx)
+    write(columns, 5, p, dy)
+    write(columns, 6, p, dz)
+    g_mean = (column(columns, 16, p), column(columns, 17, p))
+    gx, gy, gz, _ = point_gradient(x, y, z, v, k, limits, turned_back(t, r), g_mean, column(columns, 18, p))
+    write(columns, 0, p, v[0, 0] * gx + v[1, 0] * gy + v[2, 0] * gz)
+    write(columns, 1, p, v[0, 1] * gx + v[1, 1] * gy + v[2, 1] * gz)
+    write(columns, 2, p, v[0, 2] * gx + v[1, 2] * gy + v[2, 2] * gz)
