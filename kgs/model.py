@@ -155,7 +155,10 @@ class GaussianModel(nn.Module):
             colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
         # A Gaussian whose scale overflows is not rendered. The gradient of exp would be 0 times infinity there.
         too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
-        scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
+        if self.log_scales.device.type == "cpu" and not torch.compiler.is_compiling() and not bool(too_large.any()):
+            scales = self.log_scales.exp()
+        else:  # on a GPU the answer would be waited for
+            scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
         return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)
 
     def __len__(self) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from .backends import check_backend
 from .camera import Cameras
+from .memory import empty
 from .projection import normals
 from .stages import composite, project
 from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor, raster_options
@@ -154,4 +155,24 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
     if background.device.type != "cpu" or bool(background.isinf().any()):  # elsewhere the answer would be waited for
         # 0 where nothing shines through: 0 times an infinite background would be NaN
         background = torch.where(background.isinf() & (transmittance == 0), 0.0, background)
+    one_color = background.ndim == 3 and background.shape[1:] == (1, 1)
+    if one_color and not background.requires_grad and not torch.compiler.is_compiling():
+        blended: Tensor = _OverColor.apply(image, transmittance, background[:, 0, 0])
+        return blended
     return torch.addcmul(image, transmittance, background)
+
+
+class _OverColor(torch.autograd.Function):
+    """`addcmul` with one colour `(D,)`, in memory of `kgs.memory`, and without a product image in the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, transmittance: Tensor, color: Tensor) -> Tensor:
+        ctx.save_for_backward(color)
+        blended = empty(tuple(image.shape), image)
+        return torch.addcmul(image, transmittance, color[:, None, None], out=blended)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (color,) = ctx.saved_tensors
+        by_transmittance = (color @ grad.flatten(2))[:, None].unflatten(2, grad.shape[2:])
+        return grad, by_transmittance if ctx.needs_input_grad[1] else None, None

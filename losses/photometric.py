@@ -186,7 +186,9 @@ class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None]:
         _refuse_second_derivative()
-        return grad * ctx.saved_tensors[0], None, None, None, None, None
+        (by_image,) = ctx.saved_tensors
+        is_one = grad.device.type == "cpu" and float(grad) == 1.0  # `loss.backward()`
+        return by_image if is_one else grad * by_image, None, None, None, None, None
 
 
 def _refuse_second_derivative() -> None:

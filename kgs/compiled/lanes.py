@@ -148,16 +148,6 @@ def _power_of_two(builder: Any, n: Any) -> Any:
     return builder.bitcast(builder.shl(biased, ir.Constant(_INTS, [23] * WIDTH)), _FLOATS)
 
 
-def _exponent(builder: Any, x: Any) -> Any:
-    shifted = builder.lshr(builder.bitcast(x, _INTS), ir.Constant(_INTS, [23] * WIDTH))
-    return builder.sitofp(builder.sub(shifted, ir.Constant(_INTS, [127] * WIDTH)), _FLOATS)
-
-
-def _mantissa(builder: Any, x: Any) -> Any:
-    fraction = builder.and_(builder.bitcast(x, _INTS), ir.Constant(_INTS, [0x7FFFFF] * WIDTH))
-    return builder.bitcast(builder.or_(fraction, ir.Constant(_INTS, [127 << 23] * WIDTH)), _FLOATS)
-
-
 def _where(comparison: str) -> Any:
     return _function(lambda b, x, limit, value, other: b.select(_compare(comparison, b, x, limit), value, other))
 
@@ -166,9 +156,7 @@ floor = _function(lambda b, x: _llvm(b, "floor", x))
 ceil = _function(lambda b, x: _llvm(b, "ceil", x))
 magnitude = _function(lambda b, x: _llvm(b, "fabs", x))
 root = _function(lambda b, x: _llvm(b, "sqrt", x))
-power_of_two = _function(_power_of_two)  # of whole numbers from -126 to 128; 2^128 is infinite; of lanes only, as the next
-exponent = _function(_exponent)  # x = 2^exponent mantissa, for x > 0 that is not denormal; 128 for infinity
-mantissa = _function(_mantissa)  # in [1, 2)
+power_of_two = _function(_power_of_two)  # of whole numbers from -126 to 128, of lanes only; 2^128 is infinite
 maximum = _function(lambda b, x, y: b.select(_compare(">", b, x, y), x, y))  # y where x is not a number
 minimum = _function(lambda b, x, y: b.select(_compare("<", b, x, y), x, y))
 multiply_add = _function(lambda b, x, y, z: _llvm(b, "fmuladd", x, y, z))  # x y + z, whether x y is needed or not

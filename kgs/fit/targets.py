@@ -1,6 +1,7 @@
 """What a training step compares its render with: an image, its SSIM statistics, its transparency and its border."""
 
-from typing import NamedTuple, Self
+import math
+from typing import Any, NamedTuple, Self
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -9,6 +10,9 @@ from torch import Tensor
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.losses import TargetMoments, target_moments
+from kgs.memory import empty
+
+_ABOVE_ONE = 1.0 + 2.0**-23  # the next float32: the gradient passes at 1, as it does in torch
 
 
 class Target(NamedTuple):
@@ -23,7 +27,7 @@ class Target(NamedTuple):
 
     def seen(self, render: Tensor) -> Tensor:
         """A render as the photo would show it: clamped to 1, and darkened by the border."""
-        image = render.clamp(max=1.0)  # it is never below 0
+        image: Tensor = _AtMostOne.apply(render)  # it is never below 0
         return image if self.light is None else image * self.light
 
     def over(self, background: Tensor) -> Self:
@@ -32,6 +36,22 @@ class Target(NamedTuple):
             return self
         image = self.image + self.clear * (background - self.background)[:, None, None]
         return self._replace(image=image, moments=target_moments(image), background=background)
+
+
+class _AtMostOne(torch.autograd.Function):
+    """`clamp(max=1)`, in memory of `kgs.memory`; torch makes two more images in the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor) -> Tensor:
+        ctx.save_for_backward(image)
+        return torch.clamp(image, max=1.0, out=empty(tuple(image.shape), image))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (image,) = ctx.saved_tensors
+        result = empty(tuple(image.shape), image)
+        torch.ops.aten.hardtanh_backward(grad, image, -math.inf, _ABOVE_ONE, grad_input=result)
+        return result
 
 
 def background_of(scene: Scene, device: torch.device) -> Tensor | None:

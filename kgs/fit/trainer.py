@@ -7,6 +7,7 @@ the same views in the same order.
 import math
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -17,6 +18,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.backends import BACKENDS, resolve
+from kgs.compiled.threads import torch_on_one_thread
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError, TrainingDiverged
 from kgs.init_points import InitialPoints
@@ -151,19 +153,25 @@ class Trainer:
         if state.step >= times.steps:
             raise ValueError(f"steps: expected a step of {times.steps} to be left, got none")
         start = time.perf_counter()
-        loss = self._descend()
+        with self._threads():
+            loss = self._descend()
         state.seconds += time.perf_counter() - start
         if state.step in times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
             self._measure_curve()
         start = time.perf_counter()
         if state.step in times.densify:
-            self._densify()
+            with self._threads():
+                self._densify()
         if state.step in times.reset:
             state.densifier.reset_opacity(self.plan.config.recipe.reset_opacity)
         if state.step % _LOOK == 0:
             bound_scales(state.model, state.start.extent)
         state.seconds += time.perf_counter() - start
         return loss
+
+    def _threads(self) -> AbstractContextManager[None]:
+        """Where kernels do the work, torch's own operators run on one thread."""
+        return torch_on_one_thread() if self.plan.backend == "numba" else nullcontext()
 
     def render_view(self, gaussians: Gaussians, camera: PinholeCamera, background: Tensor | None) -> Rendering:
         """The render of a training step."""

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import row_slices
 from kgs.compiled.arrays import arrays
-from kgs.compiled.threads import over
+from kgs.compiled.threads import over, thread_count
 from kgs.memory import array, empty
 
 from . import compositing_kernels as kernels
@@ -58,7 +57,7 @@ class CpuCompositor(Compositor):
             channels,
             self._median_depth,
             max_spans=max(2**12, options.max_bytes // (2 * per_span)),
-            threads=torch.get_num_threads(),
+            threads=thread_count(),
         )
         row_bytes = self._coverage.spans_per_row * per_span + self._coverage.entries_per_row * per_entry
         self._row_slices = row_slices(row_bytes.tolist(), options.max_bytes)
@@ -108,7 +107,7 @@ class CpuCompositor(Compositor):
         ]
         factors, opacities = arrays(inputs.factors, inputs.opacities)
         moments = (self._coverage.ranks, totals, factors, opacities, self._eps2d)
-        over(torch.get_num_threads(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))
+        over(thread_count(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))
         gradients = tuple(x if need else None for x, need in zip(results[:4], needs, strict=True))
         return gradients, results[4] if needs_absolute else None
 
@@ -133,7 +132,7 @@ class CpuCompositor(Compositor):
                 if keep:
                     done[b] = _Done(band, starts, reached)
 
-        over(torch.get_num_threads(), count, work, pieces=count)
+        over(thread_count(), count, work, pieces=count)
         return part, done
 
     def _backward(
@@ -158,7 +157,7 @@ class CpuCompositor(Compositor):
                     block = (self._threshold, self._stop, first, (0,) * width)
                     kernels.composite_backward(*lists, *block, *of_band, rows[band.members])
 
-        threads = torch.get_num_threads()
+        threads = thread_count()
         over(threads, len(done), work, pieces=len(done))
         over(threads, len(totals), kernels.add_members, part.offsets, part.members, sums, totals)
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from kgs.compiled.arrays import arrays
-from kgs.compiled.threads import over
+from kgs.compiled.threads import over, thread_count
 from kgs.memory import array
 
 from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
@@ -25,7 +25,7 @@ def loss_and_gradient(
     """See `LossStage`."""
     x, y, mean_y, variance_y = arrays(*(x.flatten(0, 1) for x in (image, target, mean, variance)))
     half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
-    threads = torch.get_num_threads()
+    threads = thread_count()
     channels, height, width = x.shape
     bands = channels * -(-height // BAND)
     pieces = min(PIECES, -(-x.size // LEAST))
