@@ -111,8 +111,10 @@ def photometric_loss(
     chosen = choose(backend, "loss", image.device, lambda candidate: candidate.covers(image))
     if not chosen.has_loss or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
         return _torch_loss(image, target, moments, dssim_weight, outside, fast)
-    moments = target_moments(target) if moments is None else moments
-    loss: Tensor = _PhotometricLoss.apply(image, target, moments.mean, moments.variance, dssim_weight, chosen)
+    if moments is None and not chosen.finds_moments:
+        moments = target_moments(target)
+    mean, variance = (None, None) if moments is None else (moments.mean, moments.variance)
+    loss: Tensor = _PhotometricLoss.apply(image, target, mean, variance, dssim_weight, chosen)
     return loss
 
 
@@ -176,7 +178,13 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, mean: Tensor, variance: Tensor, weight: float, backend: Backend
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        mean: Tensor | None,
+        variance: Tensor | None,
+        weight: float,
+        backend: Backend,
     ) -> Tensor:
         taps = window_taps(image.dtype)
         loss, grad = backend.loss_and_gradient(image, target, mean, variance, taps, weight, ctx.needs_input_grad[0])

@@ -35,6 +35,7 @@ class CpuBackend(Backend):
     tile_size = 8  # a constant of the kernels
     package = ("numba", 'run pip install "kgs-splat[fast]"')
     has_loss = True
+    finds_moments = True
 
     def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""

@@ -8,7 +8,7 @@ from kgs.compiled.arrays import arrays
 from kgs.compiled.threads import over, thread_count
 from kgs.memory import array
 
-from .loss_kernels import BAND, RADIUS, ssim_gradient, ssim_maps, total_gradient
+from .loss_kernels import BAND, RADIUS, local_moments, ssim_gradient, ssim_maps, total_gradient
 
 PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 
@@ -16,19 +16,24 @@ PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 def loss_and_gradient(
     image: Tensor,
     target: Tensor,
-    mean: Tensor,
-    variance: Tensor,
+    mean: Tensor | None,
+    variance: Tensor | None,
     taps: list[float],
     dssim_weight: float,
     gradient: bool,
 ) -> tuple[Tensor, Tensor | None]:
     """See `LossStage`."""
-    x, y, mean_y, variance_y = arrays(*(x.flatten(0, 1) for x in (image, target, mean, variance)))
+    x, y = arrays(image.flatten(0, 1), target.flatten(0, 1))
     half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
     threads = thread_count()
     channels, height, width = x.shape
     bands = channels * -(-height // BAND)
     pieces = min(PIECES, -(-x.size // LEAST))
+    if mean is None or variance is None:
+        mean_y, variance_y = array((2, *x.shape))
+        over(threads, bands, local_moments, half, y, mean_y, variance_y, pieces=pieces)
+    else:
+        mean_y, variance_y = arrays(mean.flatten(0, 1), variance.flatten(0, 1))
     maps = array((3, *x.shape))
     sums = np.zeros((bands, 2))
     over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)

@@ -52,6 +52,32 @@ def padded_row(image, c, y, row):
 
 
 @jit
+def local_moments(begin, end, taps, target, mean_y, variance_y):
+    """Mean and variance of the target under the window around each pixel."""
+    height, width = target.shape[1], target.shape[2]
+    per_channel = (height + BAND - 1) // BAND
+    row, squares = scratch(width + 10), scratch(width + 10)
+    h = np.empty((2, BAND + 10, width), np.float32)
+    h0, h1 = h[0], h[1]
+    for u in range(begin, end):
+        c, top = u // per_channel, u % per_channel * BAND
+        n = min(BAND, height - top)
+        for r in range(n + 10):
+            padded_row(target, c, top + r - RADIUS, row)
+            for x in range(width + 10):
+                squares[x] = row[x] * row[x]
+            for x in range(width):
+                h0[r, x] = across(taps, row, x)
+            for x in range(width):
+                h1[r, x] = across(taps, squares, x)
+        for r in range(n):
+            for x in range(width):
+                mean = down(taps, h0, r, x)
+                mean_y[c, top + r, x] = mean
+                variance_y[c, top + r, x] = down(taps, h1, r, x) - mean * mean
+
+
+@jit
 def ssim_maps(begin, end, taps, image, target, mean_y, variance_y, maps, sums):
     """Derivatives of the SSIM; sums of both terms of the loss."""
     height, width = image.shape[1], image.shape[2]
