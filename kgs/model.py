@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .compiled.threads import torch_on_all_threads
 from .geometry import log_spacing
 from .harmonics import SH_C0
 from .memory import empty
@@ -204,8 +205,9 @@ class _JoinedBands(torch.autograd.Function):
         ctx.rest_shape = sh_rest.shape
         ctx.bands = bands
         joined = empty((len(sh_dc), bands, 3), sh_dc)
-        joined[:, :1] = sh_dc
-        joined[:, 1:] = sh_rest[:, : bands - 1]
+        with torch_on_all_threads():
+            joined[:, :1] = sh_dc
+            joined[:, 1:] = sh_rest[:, : bands - 1]
         return joined
 
     @staticmethod
@@ -213,8 +215,9 @@ class _JoinedBands(torch.autograd.Function):
         grad_rest = None
         if ctx.needs_input_grad[1]:
             grad_rest = empty(ctx.rest_shape, grad)
-            grad_rest[:, : ctx.bands - 1] = grad[:, 1:]
-            grad_rest[:, ctx.bands - 1 :] = 0.0
+            with torch_on_all_threads():
+                grad_rest[:, : ctx.bands - 1] = grad[:, 1:]
+                grad_rest[:, ctx.bands - 1 :] = 0.0
         return grad[:, :1], grad_rest, None
 
 

@@ -98,8 +98,8 @@ class LossStage(Protocol):
         self,
         image: Tensor,
         target: Tensor,
-        mean: Tensor | None,
-        variance: Tensor | None,
+        mean: Tensor,
+        variance: Tensor,
         taps: list[float],
         dssim_weight: float,
         gradient: bool,
@@ -107,8 +107,15 @@ class LossStage(Protocol):
         """L1 + `dssim_weight` (1 - SSIM), 0-d, and its gradient with respect to the image, or None if not wanted.
 
         Images are `(B, C, H, W)`, H and W at least the window; `mean` and `variance` `(1, B C, H, W)` those of the
-        target under the window with these taps; a backend that `finds_moments` also takes None. See `kgs.losses.photometric`, which has all of it in torch.
+        target under the window with these taps. See `kgs.losses.photometric`, which has all of it in torch.
         """
+
+
+class MomentsStage(Protocol):
+    """The stage of :func:`kgs.losses.target_moments`."""
+
+    def __call__(self, target: Tensor, taps: list[float]) -> tuple[Tensor, Tensor]:
+        """Mean and variance under the window with these taps, each `(1, B C, H, W)`, of `(B, C, H, W)`."""
 
 
 class Backend(ABC):
@@ -123,7 +130,7 @@ class Backend(ABC):
         tile_size: side of its tiles in pixels, where `RasterOptions.tile_size` is None.
         package: what must be installed beside torch, and how to install it; None for nothing.
         has_loss: whether it has `loss_and_gradient`.
-        finds_moments: whether that is as fast without the moments of the target, for targets that are used once.
+        has_moments: whether it has `local_moments`.
     """
 
     name: str
@@ -132,7 +139,7 @@ class Backend(ABC):
     tile_size: int = 8
     package: tuple[str, str] | None = None
     has_loss = False
-    finds_moments = False
+    has_moments = False
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there; does not import it."""
@@ -170,6 +177,11 @@ class Backend(ABC):
     def loss_and_gradient(self) -> LossStage:
         """Its photometric loss, where it has one."""
         raise NotImplementedError(f"{self.name} has no photometric loss")
+
+    @property
+    def local_moments(self) -> MomentsStage:
+        """Its moments of a target, where it has them."""
+        raise NotImplementedError(f"{self.name} has no local moments")
 
 
 @functools.cache

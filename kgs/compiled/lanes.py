@@ -5,8 +5,8 @@ memory what runs through the loop, and adds up each sum by itself. Kernels that 
 want. `Lanes` are one register with AVX-512, two with AVX2 and four with NEON, and `totals` adds up sixteen of them in
 the operations of four.
 
-Lanes have +, -, * and / with each other and with float32; numbers may be rounded together, as in all kernels (`_FLAGS`).
-The functions take lanes, numbers, or both, so that a formula may be written once for one Gaussian and for sixteen.
+Lanes have +, -, * and / with each other and with float32. As in all kernels numbers may be rounded together, and x / y
+may be x times 1 / y (`_FLAGS`). The functions take lanes, numbers, or both, so that a formula may be written once for one Gaussian and for sixteen.
 """
 
 import operator
@@ -60,7 +60,9 @@ def _define(function: Callable[..., Any], name: str) -> None:
 
     @lower_builtin(function, Lanes, Lanes)
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, name)(*args, flags=_FLAGS if name != "fdiv" else ())  # 1 / y may overflow where x / y is 1
+        return getattr(builder, name)(
+            *args, flags=_FLAGS if name != "fdiv" else ()
+        )  # 1 / y may overflow where x / y is 1
 
 
 _define(operator.add, "fadd")

@@ -65,6 +65,17 @@ def torch_on_one_thread() -> Iterator[None]:
         _limits.kernels = outer
 
 
+@contextmanager
+def torch_on_all_threads() -> Iterator[None]:
+    """Within :func:`torch_on_one_thread`: torch on all threads again, for what gives the same bits on any number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(thread_count())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 _helpers: list[SimpleQueue[_Work]] = []  # a queue of each thread
 
 

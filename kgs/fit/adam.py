@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs.compiled.threads import torch_on_all_threads
+
 
 class Adam:
     """Adam with a name and a learning rate for each group of one parameter.
@@ -42,21 +44,22 @@ class Adam:
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
             state["step"] += 1
-            torch._fused_adam_(
-                [parameter],
-                [parameter.grad],
-                [state["exp_avg"]],
-                [state["exp_avg_sq"]],
-                [],
-                [state["step"]],
-                lr=group["lr"],
-                beta1=0.9,
-                beta2=0.999,
-                weight_decay=0.0,
-                eps=self.eps,
-                amsgrad=False,
-                maximize=False,
-            )
+            with torch_on_all_threads():
+                torch._fused_adam_(
+                    [parameter],
+                    [parameter.grad],
+                    [state["exp_avg"]],
+                    [state["exp_avg_sq"]],
+                    [],
+                    [state["step"]],
+                    lr=group["lr"],
+                    beta1=0.9,
+                    beta2=0.999,
+                    weight_decay=0.0,
+                    eps=self.eps,
+                    amsgrad=False,
+                    maximize=False,
+                )
 
     def zero_grad(self) -> None:
         """Set all gradients to None."""

@@ -20,7 +20,7 @@ class Target(NamedTuple):
 
     camera: PinholeCamera
     image: Tensor  # (1, 3, H, W)
-    moments: TargetMoments | None  # None where the image is used once
+    moments: TargetMoments
     clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
     background: Tensor  # (3,), the background that `image` has
     light: Tensor | None  # (H, W), the transmittance of a dark border; None: 1 everywhere
@@ -35,7 +35,7 @@ class Target(NamedTuple):
         if self.clear is None:
             return self
         image = self.image + self.clear * (background - self.background)[:, None, None]
-        return self._replace(image=image, moments=None, background=background)
+        return self._replace(image=image, moments=target_moments(image, backend="auto"), background=background)
 
 
 class _AtMostOne(torch.autograd.Function):

@@ -23,7 +23,7 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 
 import torch
 
-from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
+from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, MomentsStage, ProjectionStage
 
 
 class CpuBackend(Backend):
@@ -35,7 +35,7 @@ class CpuBackend(Backend):
     tile_size = 8  # a constant of the kernels
     package = ("numba", 'run pip install "kgs-splat[fast]"')
     has_loss = True
-    finds_moments = True
+    has_moments = True
 
     def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
@@ -63,3 +63,10 @@ class CpuBackend(Backend):
         from .loss import loss_and_gradient
 
         return loss_and_gradient
+
+    @property
+    def local_moments(self) -> MomentsStage:
+        """See `Backend.local_moments`."""
+        from .loss import local_moments
+
+        return local_moments

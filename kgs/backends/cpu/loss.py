@@ -6,9 +6,9 @@ from torch import Tensor
 
 from kgs.compiled.arrays import arrays
 from kgs.compiled.threads import over, thread_count
-from kgs.memory import array
+from kgs.memory import array, empty
 
-from .loss_kernels import BAND, RADIUS, local_moments, ssim_gradient, ssim_maps, total_gradient
+from .loss_kernels import BAND, RADIUS, fill_moments, ssim_gradient, ssim_maps, total_gradient
 
 PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 
@@ -16,24 +16,19 @@ PIECES, LEAST = 16, 8192  # for the threads; pixels of one
 def loss_and_gradient(
     image: Tensor,
     target: Tensor,
-    mean: Tensor | None,
-    variance: Tensor | None,
+    mean: Tensor,
+    variance: Tensor,
     taps: list[float],
     dssim_weight: float,
     gradient: bool,
 ) -> tuple[Tensor, Tensor | None]:
     """See `LossStage`."""
-    x, y = arrays(image.flatten(0, 1), target.flatten(0, 1))
+    x, y, mean_y, variance_y = arrays(*(x.flatten(0, 1) for x in (image, target, mean, variance)))
     half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
     threads = thread_count()
     channels, height, width = x.shape
     bands = channels * -(-height // BAND)
     pieces = min(PIECES, -(-x.size // LEAST))
-    if mean is None or variance is None:
-        mean_y, variance_y = array((2, *x.shape))
-        over(threads, bands, local_moments, half, y, mean_y, variance_y, pieces=pieces)
-    else:
-        mean_y, variance_y = arrays(mean.flatten(0, 1), variance.flatten(0, 1))
     maps = array((3, *x.shape))
     sums = np.zeros((bands, 2))
     over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
@@ -50,3 +45,14 @@ def loss_and_gradient(
     out = image_gradient.flatten(0, 1).numpy()
     over(threads, channels * height, total_gradient, x, y, padded, by_ssim, by_l1, out, pieces=pieces)
     return loss, image_gradient
+
+
+def local_moments(target: Tensor, taps: list[float]) -> tuple[Tensor, Tensor]:
+    """See `MomentsStage`."""
+    [y] = arrays(target.flatten(0, 1))
+    half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
+    mean, variance = (empty((1, *y.shape), target) for _ in range(2))
+    bands = y.shape[0] * -(-y.shape[1] // BAND)
+    pieces = min(PIECES, -(-y.size // LEAST))
+    over(thread_count(), bands, fill_moments, half, y, mean[0].numpy(), variance[0].numpy(), pieces=pieces)
+    return mean, variance

@@ -52,8 +52,8 @@ def padded_row(image, c, y, row):
 
 
 @jit
-def local_moments(begin, end, taps, target, mean_y, variance_y):
-    """Mean and variance of the target under the window around each pixel."""
+def fill_moments(begin, end, taps, target, mean_y, variance_y):
+    """Mean and variance of the target under the window around each pixel, from differences to a pixel of the band."""
     height, width = target.shape[1], target.shape[2]
     per_channel = (height + BAND - 1) // BAND
     row, squares = scratch(width + 10), scratch(width + 10)
@@ -62,9 +62,11 @@ def local_moments(begin, end, taps, target, mean_y, variance_y):
     for u in range(begin, end):
         c, top = u // per_channel, u % per_channel * BAND
         n = min(BAND, height - top)
+        pivot = target[c, top, 0]
         for r in range(n + 10):
             padded_row(target, c, top + r - RADIUS, row)
             for x in range(width + 10):
+                row[x] -= pivot
                 squares[x] = row[x] * row[x]
             for x in range(width):
                 h0[r, x] = across(taps, row, x)
@@ -73,7 +75,7 @@ def local_moments(begin, end, taps, target, mean_y, variance_y):
         for r in range(n):
             for x in range(width):
                 mean = down(taps, h0, r, x)
-                mean_y[c, top + r, x] = mean
+                mean_y[c, top + r, x] = pivot + mean
                 variance_y[c, top + r, x] = down(taps, h1, r, x) - mean * mean
 
 

@@ -26,6 +26,8 @@ from .harmonics_kernels import BAND_0, THREE, basis_gradient, evaluate_harmonics
 
 SMALLEST_SQUARE, LARGEST_SQUARE = f32(1e-30), f32(1e36)
 BLOCK = 2048  # Gaussians that are listed in one go; rows of the lists of a block begin where its Gaussians do
+_SMALL, _UP = f32(1e-18), f32(2.0**96)
+_LARGE, _DOWN = f32(1e18), f32(2.0**-96)
 PART = 64  # Gaussians whose numbers are turned into columns in one go
 
 
@@ -52,17 +54,16 @@ def write(columns, j, p, value):
 def rotation(w, x, y, z):
     """Unit quaternion, 1 / norm, rotation matrix by rows; the zero quaternion turns nothing and gets no gradient."""
     largest = maximum(maximum(magnitude(w), magnitude(x)), maximum(magnitude(y), magnitude(z)))
-    divisor = where_above(largest, ZERO, largest, ONE)  # no square overflows or vanishes
-    w, x, y, z = w / divisor, x / divisor, y / divisor, z / divisor
-    norm = root(w * w + x * x + y * y + z * z)
-    divisor = where_above(largest, ZERO, norm, ONE)
-    w = where_above(largest, ZERO, w / divisor, ONE)
-    x, y, z = x / divisor, y / divisor, z / divisor
-    inverse = where_above(largest, ZERO, ONE / norm / largest, ZERO)
+    scale = where_above(_SMALL, largest, _UP, where_above(largest, _LARGE, _DOWN, ONE))  # no square over- or underflows
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    square = w * w + x * x + y * y + z * z
+    inverse = where_above(square, ZERO, ONE / root(square), ZERO)
+    w = where_above(square, ZERO, w * inverse, ONE)
+    x, y, z = x * inverse, y * inverse, z * inverse
     xx, yy, zz = TWO * x * x, TWO * y * y, TWO * z * z
     xy, xz, yz, wx, wy, wz = TWO * x * y, TWO * x * z, TWO * y * z, TWO * w * x, TWO * w * y, TWO * w * z
     r = (ONE - yy - zz, xy - wz, xz + wy, xy + wz, ONE - xx - zz, yz - wx, xz - wy, yz + wx, ONE - xx - yy)
-    return (w, x, y, z), inverse, r
+    return (w, x, y, z), inverse * scale, r
 
 
 @inline
@@ -202,8 +203,8 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, f
                 _list(m, g, i, columns, opacities[row, g], lists)
                 if bands == 1:
                     for j in range(3):
-                        color = HALF + BAND_0 * colors[g, j]
-                        lists[4][m, j] = ZERO if color < ZERO else color
+                        color = BAND_0 * colors[g, j]
+                        lists[4][m, j] = ZERO if color < -HALF else color + HALF
                 elif bands:
                     dx, dy, dz, _ = _direction(means, g, camera[4])
                     harmonics_basis(dx, dy, dz, bands, b)
@@ -271,8 +272,8 @@ def _footprint(p, camera, frustum, columns):
 def _hypotenuse(x, y):
     """The root of the sum of squares, which may overflow."""
     largest = maximum(magnitude(x), magnitude(y))
-    divisor = where_above(largest, ZERO, largest, ONE)
-    x, y = x / divisor, y / divisor
+    inverse = ONE / maximum(largest, SMALLEST_SQUARE)
+    x, y = x * inverse, y * inverse
     return largest * root(x * x + y * y)
 
 
@@ -402,7 +403,7 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
             if bands == 1:
                 if d_colors.shape[1]:
                     for j in range(3):
-                        d_colors[g, j] += ZERO if HALF + BAND_0 * colors[g, j] < ZERO else BAND_0 * g_rgb[m, j]
+                        d_colors[g, j] += ZERO if BAND_0 * colors[g, j] < -HALF else BAND_0 * g_rgb[m, j]
             elif bands:
                 gradient = g_rgb[m, 0], g_rgb[m, 1], g_rgb[m, 2]
                 wx, wy, wz = color_gradients(g, means, colors, camera[4], bands, gradient, b, h, d_colors)
