@@ -6,7 +6,8 @@ want. `Lanes` are one register with AVX-512, two with AVX2 and four with NEON, a
 the operations of four.
 
 Lanes have +, -, * and / with each other and with float32. As in all kernels numbers may be rounded together, and x / y
-may be x times 1 / y (`_FLAGS`). The functions take lanes, numbers, or both, so that a formula may be written once for one Gaussian and for sixteen.
+may be x times 1 / y (`_FLAGS`). The functions take lanes, numbers, or both, so that a formula may be written once for
+one Gaussian and for sixteen.
 """
 
 import operator
