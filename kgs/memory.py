@@ -41,11 +41,11 @@ def array(shape: int | tuple[int, ...], dtype: Any = np.float32) -> np.ndarray[A
 
 
 def _block(size: int) -> np.ndarray[Any, Any]:
-    most = _WASTE * size
     with _lock:
-        for i, block in enumerate(_free):
-            if size <= block.size <= most:
-                return _free.pop(i)
+        fitting = (i for i, block in enumerate(_free) if size <= len(block) <= _WASTE * size)
+        i = next(fitting, None)
+        if i is not None:
+            return _free.pop(i)
         while sum(map(len, _free)) > _KEPT // 2:  # sizes have changed: what is oldest fits no longer
             del _free[0]
     return np.empty(math.ceil(_MARGIN * size), np.uint8)

@@ -112,11 +112,9 @@ class TileCoverage:
     def _count(self, max_spans: int) -> None:
         """Count spans and entries, some Gaussians at a time; keep the spans where there is room for all."""
         n = len(self.ids)
-        total = int(self.heads[:, 1].sum())
-        inner: set[int] = set()
-        if total > max_spans:
-            inner = {*np.searchsorted(np.cumsum(self.heads[:, 1]), range(max_spans, total, max_spans)).tolist()}
-        bounds = [0, *sorted(inner), n]
+        ends = np.cumsum(self.heads[:, 1])
+        total = int(ends[-1]) if n else 0
+        bounds = [0, *sorted({*np.searchsorted(ends, range(max_spans, total, max_spans)).tolist()}), n]
         self.spans_per_row, self.entries_per_row = np.zeros((2, self.total_rows), np.int64)
         self._all_spans = None
         for low, high in pairwise(bounds):

@@ -58,7 +58,6 @@ def sort_by_depth(depths, rows, ids, ranks):
     A radix sort. `depths` are the bits of float32; `ranks` is the inverse, -1 for the others.
     """
     keys, spare_keys, spare_ids = np.empty_like(depths), np.empty_like(depths), np.empty_like(ids)
-    histogram = np.zeros((3, _BUCKETS), np.int64)
     sign, infinity = np.uint32(0x80000000), np.uint32(0x7F800000)
     n = 0
     for g in range(len(depths)):
@@ -72,36 +71,26 @@ def sort_by_depth(depths, rows, ids, ranks):
                 key = ~bits
             else:  # -0 is 0
                 key = magnitude | sign
-            spare_ids[n], spare_keys[n] = g, key
-            for d in range(3):
-                histogram[d, digit(key, d)] += 1
+            ids[n], keys[n] = g, key
             n += 1
+    histogram = np.zeros((3, _BUCKETS), np.int64)
+    for i in range(n):
+        for d in range(3):
+            histogram[d, (keys[i] >> np.uint32(_BITS * d)) & np.uint32(_BUCKETS - 1)] += 1
     for d in range(3):
         total = 0
         for b in range(_BUCKETS):
             histogram[d, b], total = total, total + histogram[d, b]
-    sort_by_digit(0, n, histogram, spare_keys, spare_ids, keys, ids)
-    sort_by_digit(1, n, histogram, keys, ids, spare_keys, spare_ids)
-    sort_by_digit(2, n, histogram, spare_keys, spare_ids, keys, ids)
+        for i in range(n):
+            b = (keys[i] >> np.uint32(_BITS * d)) & np.uint32(_BUCKETS - 1)
+            at = histogram[d, b]
+            histogram[d, b] += 1
+            spare_keys[at], spare_ids[at] = keys[i], ids[i]
+        keys, spare_keys, ids, spare_ids = spare_keys, keys, spare_ids, ids
     for i in range(n):
+        spare_ids[i] = ids[i]  # three passes: the result is in what was spare
         ranks[ids[i]] = i
     return n
-
-
-@inline
-def digit(key, d):
-    """Digit d of a key, the lowest first; the last has fewer bits."""
-    return (key >> np.uint32(_BITS * d)) & np.uint32(_BUCKETS - 1)
-
-
-@inline
-def sort_by_digit(d, n, histogram, keys, ids, sorted_keys, sorted_ids):
-    """A pass of the sort; in the histogram is where each bucket begins."""
-    for i in range(n):
-        b = digit(keys[i], d)
-        at = histogram[d, b]
-        histogram[d, b] += 1
-        sorted_keys[at], sorted_ids[at] = keys[i], ids[i]
 
 
 @jit

@@ -18,7 +18,7 @@ from kgs.projection import finite_gaussians, visibility_cutoff
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from .camera_kernels import camera_gradients
-from .projection_kernels import BLOCK, close_up, footprint_gradients, footprints
+from .projection_kernels import BLOCK, footprint_gradients, footprints
 
 
 def project(
@@ -71,10 +71,8 @@ class _Projection(torch.autograd.Function):
             out = tuple(x.numpy() for x in lists)
             threads = thread_count()
             over(threads, len(counts), footprints, *values, c, view, frustum, out, counts, pieces=16)
-            starts = np.concatenate([[0], np.cumsum(counts[:, 0])])
-            closed = [empty((int(starts[-1]), *x.shape[1:]), x) for x in lists]
-            over(threads, len(counts), close_up, starts, out, tuple(x.numpy() for x in closed), pieces=16)
-            parts.append(closed)
+            visible = _close_up(out, counts[:, 0])
+            parts.append([x[:visible] for x in lists])
         joined = [x[0] if len(parts) == 1 else torch.cat(x) for x in zip(*parts, strict=True)]
         means2d, factors, depths, alphas, rgb, radii, ids = joined
         factors = factors.view(-1, 2, 3)
@@ -159,3 +157,15 @@ def _fields(tensors: Sequence[Tensor]) -> tuple[Array, ...]:
     """The memory of the fields of Gaussians, opacities as `(1, N)` or `(C, N)`, colours as `(N, F)`."""
     *first, opacities, colors = arrays(*tensors)
     return *first, np.atleast_2d(opacities), colors.reshape(len(colors), math.prod(colors.shape[1:]))
+
+
+def _close_up(lists: tuple[Array, ...], counts: Array) -> int:
+    """Move the rows of each block to the end of those before it; returns how many there are in all."""
+    end = 0
+    for block, count in enumerate(counts.tolist()):
+        begin = block * BLOCK
+        if begin != end:
+            for x in lists:
+                x[end : end + count] = x[begin : begin + count]
+        end += count
+    return end

@@ -291,22 +291,6 @@ def _list(m, g, i, columns, opacity, lists):
     ids[m] = g
 
 
-@jit
-def close_up(begin, end, starts, lists, closed):
-    """Copy what `footprints` listed of some blocks to where these begin without gaps, `starts`."""
-    for block in range(begin, end):
-        for m in range(starts[block + 1] - starts[block]):
-            i, at = block * BLOCK + m, starts[block] + m
-            for j in range(2):
-                closed[0][at, j] = lists[0][i, j]
-            for j in range(6):
-                closed[1][at, j] = lists[1][i, j]
-            closed[2][at], closed[3][at] = lists[2][i], lists[3][i]
-            for j in range(closed[4].shape[1]):
-                closed[4][at, j] = lists[4][i, j]
-            closed[5][at], closed[6][at] = lists[5][i], lists[6][i]
-
-
 @inline
 def color_gradients(g, means, colors, centre, bands, gradient, b, h, d_colors):
     """Add to the gradients of harmonics of more than one band; returns the colour's part of the centre's gradient."""
