@@ -4,8 +4,6 @@ Fresh memory is mapped page by page when it is first touched, which took a quart
 did it at once. A block is free again when the last array in it is gone.
 """
 
-import contextlib
-import ctypes
 import math
 import weakref
 from threading import Lock
@@ -21,8 +19,6 @@ _MOST = 2**26  # larger ones are not kept
 _KEPT = 2**28  # bytes of all free blocks
 _WASTE = 1.5  # a block may be so many times larger than what is wanted
 _MARGIN = 1.1  # new blocks are larger than asked for, because the number of Gaussians grows
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt
-_LARGEST_THRESHOLD = 2**25  # bytes, the most that it takes
 _free: list[np.ndarray[Any, Any]] = []
 _lock = Lock()
 
@@ -62,14 +58,3 @@ def empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
     if like.device.type != "cpu" or torch.compiler.is_compiling():
         return like.new_empty(shape)
     return torch.from_numpy(array(shape, str(like.dtype).removeprefix("torch.")))
-
-
-def keep_freed_memory() -> None:
-    """Tell the C library to keep memory that is freed, for programs whose steps use as much again; only for glibc.
-
-    Else it gives large blocks back to the system, and torch's operators pay for fresh pages at each call.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        mallopt(_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
-        mallopt(_TRIM_THRESHOLD, _KEPT)

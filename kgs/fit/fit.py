@@ -1,5 +1,6 @@
 """A fit that is done, or as far as it is: a splat with what is needed to render, measure and show it."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -9,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.camera import move_camera
+from kgs.compiled.threads import torch_on_one_thread
 from kgs.datasets.scene import Scene, Views
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
@@ -61,7 +63,8 @@ class Fit:
     @torch.no_grad()
     def render(self, camera: PinholeCamera) -> Tensor:
         """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`."""
-        image: Tensor = self._renderer(self.model(), move_camera(camera, self.device), self._background).image
+        with torch_on_one_thread() if self.backend == "numba" else nullcontext():
+            image: Tensor = self._renderer(self.model(), move_camera(camera, self.device), self._background).image
         return image
 
     @torch.no_grad()

@@ -32,6 +32,15 @@ PART = 64  # Gaussians whose numbers are turned into columns in one go
 
 
 @inline
+def empty_columns(count):
+    """Columns of zeros."""
+    columns = scratch(count * PART)
+    for i in range(count * PART):
+        columns[i] = ZERO
+    return columns
+
+
+@inline
 def read(values, g, count, columns, first, i):
     """Put `count` numbers of row g into place i of columns, `(columns PART,)`."""
     for j in range(count):
@@ -172,8 +181,7 @@ def footprints(begin, end, means, quats, scales, opacities, colors, c, camera, f
     """
     bands = colors.shape[1] // 3 if lists[4].shape[1] else 0
     b = np.empty(16, np.float32)
-    columns = scratch(_READ * PART)
-    columns[:] = ZERO
+    columns = empty_columns(_READ)
     row = min(c, opacities.shape[0] - 1)
     for block in range(begin, end):
         m, broken = block * BLOCK, 0
@@ -372,13 +380,16 @@ def footprint_gradients(begin, end, means, quats, scales, colors, c, camera, ids
     b, h = np.empty(16, np.float32), np.empty(16, np.float32)
     row = min(c, d_opacities.shape[0] - 1)
     if c == 0:
-        d_means[begin:end] = ZERO
-        d_quats[begin:end] = ZERO
-        d_scales[begin:end] = ZERO
-        d_opacities[:, begin:end] = ZERO
-        d_colors[begin:end] = ZERO
-    columns = scratch(_COLUMNS * PART)
-    columns[:] = ZERO
+        for g in range(begin, end):
+            for i in range(3):
+                d_means[g, i] = d_scales[g, i] = ZERO
+            for i in range(4):
+                d_quats[g, i] = ZERO
+            for i in range(d_opacities.shape[0]):
+                d_opacities[i, g] = ZERO
+            for i in range(d_colors.shape[1]):
+                d_colors[g, i] = ZERO
+    columns = empty_columns(_COLUMNS)
     last = np.searchsorted(ids, end)
     for first in range(np.searchsorted(ids, begin), last, PART):
         n = min(PART, last - first)
