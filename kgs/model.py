@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .compiled.threads import torch_on_all_threads
 from .geometry import log_spacing
 from .harmonics import SH_C0
 from .memory import empty
+from .torch_threads import torch_on_all_threads
 from .types import SH_SIZES, Gaussians, check_tensor
 
 INITIAL_OPACITY = 0.1

@@ -10,11 +10,11 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.camera import move_camera
-from kgs.compiled.threads import torch_on_one_thread
 from kgs.datasets.scene import Scene, Views
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.torch_threads import torch_on_one_thread
 from kgs.types import RasterOptions
 
 from .config import FitConfig

@@ -18,13 +18,13 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.backends import BACKENDS, resolve
-from kgs.compiled.threads import torch_on_one_thread
 from kgs.datasets.scene import Scene, Views
 from kgs.errors import DataError, TrainingDiverged
 from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.torch_threads import torch_on_one_thread
 from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
 from .checkpoint import newest_checkpoint, save_checkpoint

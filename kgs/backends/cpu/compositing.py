@@ -10,8 +10,9 @@ from torch import Tensor
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import row_slices
 from kgs.compiled.arrays import arrays
-from kgs.compiled.threads import over, thread_count
+from kgs.compiled.threads import over
 from kgs.memory import array, empty
+from kgs.torch_threads import thread_count
 
 from . import compositing_kernels as kernels
 from .binning import Band, RowSlice, TileCoverage, table_width

@@ -5,8 +5,9 @@ import torch
 from torch import Tensor
 
 from kgs.compiled.arrays import arrays
-from kgs.compiled.threads import over, thread_count
+from kgs.compiled.threads import over
 from kgs.memory import array, empty
+from kgs.torch_threads import thread_count
 
 from .loss_kernels import BAND, RADIUS, fill_moments, ssim_gradient, ssim_maps, total_gradient
 

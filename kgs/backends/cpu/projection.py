@@ -12,9 +12,10 @@ from torch import Tensor
 from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, Frame, whole_frame
 from kgs.compiled.arrays import Array, arrays
-from kgs.compiled.threads import over, thread_count
+from kgs.compiled.threads import over
 from kgs.memory import array, empty
 from kgs.projection import finite_gaussians, visibility_cutoff
+from kgs.torch_threads import thread_count
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from .camera_kernels import camera_gradients
