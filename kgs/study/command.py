@@ -4,7 +4,9 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from kgs.app.cli.options import Existing, Out
 from kgs.errors import DataError
@@ -18,12 +20,18 @@ def study(
     scheduler: str | None = None,
     lpips_weights: Existing | None = None,
     report_only: bool = False,
+    scenes: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] | None = None,
+    views: tuple[int, ...] | None = None,
+    seeds: tuple[int, ...] | None = None,
+    list_cells: Annotated[bool, tyro.conf.arg(name="list")] = False,
 ) -> int:
     """Compare fits with and without DropGaussian, its schedules and rivals, over scenes and seeds.
 
     For example:
       kgs study -o study
       KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
+      KGS_DATA=SCENES kgs study -o study-field --preset field --scenes llff/fern --seeds 0 --list
 
     Writes sparse.jsonl (beyond.jsonl), a line per finished fit, and the report, also when it is interrupted; the same
     command goes on where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on
@@ -41,9 +49,16 @@ def study(
         lpips_weights: folder with VGG16 and LPIPS weights (npz); without it LPIPS is left out, also of fits that are
             done.
         report_only: fit nothing; write the report of the fits that are done.
+        scenes: only the fits of these scenes, as --list names them. The report is of all that are done, as with the
+            next three.
+        methods: only these methods, as "auto" or "progressive 0.2".
+        views: only fits of so many views.
+        seeds: only these seeds.
+        list_cells: fit nothing and write nothing; say which fits the preset has, and which of them are done.
 
     Raises:
         DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
+        ValueError: the preset has no such fits.
     """
     from . import beyond, beyond_report, presets
     from .cells import sparse_cell
@@ -61,6 +76,10 @@ def study(
         path = out / "sparse.jsonl"
         do_cell = sparse_cell
         write = write_report
+    chosen = presets.select(cells, scenes=scenes, methods=methods, views=views, seeds=seeds)
+    if list_cells:
+        _list(chosen, finished_rows(chosen, path))
+        return 0
     if (report_only or read_rows(path)) and not finished_rows(cells, path):
         raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
     work = partial(
@@ -70,14 +89,24 @@ def study(
     )
     try:
         if not report_only:
-            run_grid(cells, work, path, scheduler=scheduler, processes=processes)
+            run_grid(chosen, work, path, scheduler=scheduler, processes=processes)
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
             scenes = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
             options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
             write(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
-    return int(len(rows) < len(cells))
+    return int(len(finished_rows(chosen, path)) < len(chosen))
+
+
+def _list(cells: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
+    """Print a line for each cell."""
+    done = [row["cell"] for row in rows]
+    for cell in cells:
+        words = [f"{cell['scene']}, {cell['views']} views", cell.get("start", ""), cell.get("method", "")]
+        state = "done" if cell in done else "to do"
+        print(f"{state:>5}: {', '.join(word for word in words if word)}, seed {cell['seed']}")
+    print(f"{len(done)} of {len(cells)} are done")
 
 
 def check_study(lpips_weights: Path | None, **_: Any) -> None:

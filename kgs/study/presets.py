@@ -1,6 +1,6 @@
 """The methods that the study compares, and which cells each preset has."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,36 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
         for block in blocks
         for seed, (scene, views), start, method in product(*block)
     ]
+
+
+def select(
+    cells: list[Cell],
+    *,
+    scenes: Collection[str] | None = None,
+    methods: Collection[str] | None = None,
+    views: Collection[int] | None = None,
+    seeds: Collection[int] | None = None,
+) -> list[Cell]:
+    """The cells with one of these values, in their order; None: with any.
+
+    Raises:
+        ValueError: no cell has one of the values, or none has them together.
+    """
+    wanted = {"scenes": scenes, "methods": methods, "views": views, "seeds": seeds}
+    chosen = cells
+    for name, values in wanted.items():
+        if values is None:
+            continue
+        key = name if name == "views" else name.removesuffix("s")
+        there = list(dict.fromkeys(cell[key] for cell in cells))
+        for value in values:
+            if value not in there:
+                raise ValueError(f"{name}: expected some of {there}, got {value!r}")
+        chosen = [cell for cell in chosen if cell[key] in values]
+    if not chosen:
+        given = {name: list(values) for name, values in wanted.items() if values is not None}
+        raise ValueError(f"cells: expected one with {given}, got none; --list shows all of them")
+    return chosen
 
 
 def _cpu(data: Path) -> list[Block]:

@@ -14,6 +14,7 @@ from kgs.compiled.lanes import WIDTH, load, store  # noqa: E402
 LIMIT = f32(0.5)
 ONES = {
     "floor": np.floor,
+    "ceil": np.ceil,
     "magnitude": np.abs,
     "exp2": np.exp2,
 }
@@ -21,6 +22,7 @@ TWOS = {
     "add": (operator.add, np.add),
     "sub": (operator.sub, np.subtract),
     "mul": (operator.mul, np.multiply),
+    "truediv": (operator.truediv, np.divide),
     "maximum": (lanes.maximum, np.fmax),
     "minimum": (lanes.minimum, np.fmin),
 }
@@ -59,6 +61,29 @@ def test_operations_on_lanes_are_numpys(name):
 
     run(x, y, out)
     np.testing.assert_array_equal(out, expected(x, y))
+
+
+def test_a_formula_of_lanes_is_one_of_numbers_too():
+    def formula(x, y):
+        return lanes.where_above(x, LIMIT, lanes.root(lanes.magnitude(x)) / y, lanes.maximum(x, y))
+
+    formula = nb.njit(formula)
+
+    @nb.njit(error_model="numpy")
+    def run(x, y, wide, single):
+        for i in range(0, len(x), WIDTH):
+            store(wide, i, formula(load(x, i), load(y, i)))
+        for i in range(len(x)):
+            single[i] = formula(x[i], y[i])
+
+    x = numbers(2)
+    y = numbers(2, seed=1)
+    wide, single = np.empty((2, len(x)), np.float32)
+    run(x, y, wide, single)
+    with np.errstate(all="ignore"):
+        expected = np.where(x > LIMIT, np.sqrt(np.abs(x)) / y, np.maximum(x, y))
+    np.testing.assert_allclose(wide, expected, rtol=1e-6)
+    np.testing.assert_allclose(single, expected, rtol=1e-6)
 
 
 def test_what_is_not_a_number_becomes_the_other():

@@ -184,3 +184,14 @@ def test_moments_made_in_inference_mode_serve_a_training_step():
     found = value_and_gradient(lambda x: photometric_loss(x, there, moments=moments), image)
     assert torch.equal(found[0], expected[0])
     assert torch.equal(found[1], expected[1])
+
+
+@pytest.mark.parametrize("kind", ["noise", "bright", "dark", "edges"])
+@pytest.mark.parametrize("shape", [(1, 3, 11, 11), (2, 3, 45, 67)])
+def test_moments_of_any_backend_are_as_exact_as_torchs(shape, kind):
+    target = make_pair(shape, kind)[1]
+    exact = target_moments(target.double())
+    found, of_torch = (target_moments(target, backend=name) for name in ("auto", "torch"))
+    for name in ("mean", "variance", "padded"):
+        bound = 2 * float((getattr(of_torch, name) - getattr(exact, name)).abs().max()) + 1e-9
+        assert float((getattr(found, name) - getattr(exact, name)).abs().max()) <= bound

@@ -10,6 +10,7 @@ from kornia.sensors.camera import CameraModelType
 
 import kgs.reference
 from kgs import GaussianRenderer
+from kgs.renderer import blend
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -108,3 +109,18 @@ def test_an_infinite_background_shows_only_where_light_is_left(shape):
     assert not background.grad.any()
     nothing = kgs.Gaussians(*(x.detach()[:0] for x in inputs))
     assert (GaussianRenderer()(nothing, camera, background).image == math.inf).all()
+
+
+def test_one_color_behind_an_image_is_added_as_torch_adds_it():
+    image, transmittance = torch.rand(2, 3, 5, 7, requires_grad=True), torch.rand(2, 1, 5, 7, requires_grad=True)
+    color = torch.rand(3)
+    weights = torch.rand(2, 3, 5, 7)
+    found = blend(image, transmittance, color)
+    expected = torch.addcmul(image, transmittance, color[:, None, None])
+    assert torch.equal(found, expected)
+    for mine, same in zip(
+        torch.autograd.grad((found * weights).sum(), (image, transmittance)),
+        torch.autograd.grad((expected * weights).sum(), (image, transmittance)),
+        strict=True,
+    ):
+        torch.testing.assert_close(mine, same)

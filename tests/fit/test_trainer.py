@@ -15,6 +15,7 @@ from kgs.densify import Densifier
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
+from kgs.init_points import InitialPoints
 from kgs.renderer import GaussianRenderer
 
 CONFIG = FitConfig(steps=30, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
@@ -51,6 +52,18 @@ def test_it_learns(whole, scene, points):
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"]
     assert curve[-1]["train_psnr"] > begun(scene, points).psnr(scene.train) + 1
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
+
+
+def test_a_fit_has_the_same_bits_on_any_number_of_threads(set_threads, scene):
+    count = 40_000  # torch divides nothing smaller than 32768
+    points = InitialPoints(torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 2.0]), torch.rand(count, 3), "random")
+    trainers = [begun(scene, points) for _ in range(2)]
+    for threads, trainer in zip((1, 3), trainers, strict=True):
+        set_threads(threads)
+        for _ in range(4):
+            trainer.train_step()
+        assert torch.get_num_threads() == threads
+    assert_same_bits(*trainers)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from kgs.study.cells import sparse_cell
 from kgs.study.grid import read_rows, run_grid
 from kgs.study.overfitting import coadaptation
 from kgs.study.pairs import cells_frame
-from kgs.study.presets import sparse_cells
+from kgs.study.presets import select, sparse_cells
 from kgs.study.report import write_report
 from kgs.study.rivals import SelectiveDrop
 
@@ -35,6 +35,9 @@ def scores_of_shape(*shape):
 
 CASES = [
     ("preset", ValueError, lambda folder: sparse_cells("fast", folder)),
+    ("scenes", ValueError, lambda folder: select(sparse_cells("quick", folder), scenes=["fern"])),
+    ("views", ValueError, lambda folder: select(sparse_cells("quick", folder), views=[4])),
+    ("cells", ValueError, lambda folder: select(sparse_cells("quick", folder), methods=["far"], seeds=[1])),
     ("KGS_DATA", DataError, lambda _: sparse_cells("cpu", None)),
     ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("cpu", folder)),
     ("FOLDER", DataError, lambda folder: sparse_cells("paper", folder)),

@@ -46,6 +46,33 @@ def test_a_study_of_one_cell_is_fitted_measured_and_reported(studied):
     assert f"PSNR {psnr:.2f} dB" in page  # the built-in scene is shown
 
 
+def test_a_part_of_a_preset_has_the_same_cells():
+    cells = presets.sparse_cells("quick", None)
+    part = presets.select(cells, methods=["off", "far"], seeds=[0])
+    assert part == [cell for cell in cells if cell["method"] in ("off", "far") and cell["seed"] == 0]
+    assert {cell["method"] for cell in part} == {"off", "far"}
+    assert presets.select(cells) == cells
+
+
+def test_the_list_says_what_is_done_and_writes_nothing(folder, tmp_path, capsys):
+    assert study(out=folder, list_cells=True) == 0
+    assert study(out=tmp_path / "nothing", list_cells=True) == 0
+    first, _, second, _ = capsys.readouterr().out.splitlines()
+    assert first.strip().startswith("done: synthetic")
+    assert second.strip().startswith("to do: synthetic")
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_part_is_run_and_the_report_is_of_all_that_is_done(folder, monkeypatch, threads):
+    other = tiny_cell() | {"seed": 1}
+    monkeypatch.setattr(presets, "sparse_cells", lambda *_: [tiny_cell(), other])
+    assert study(out=folder, scheduler=threads, seeds=(0,)) == 0
+    assert len(grid.read_rows(folder / "sparse.jsonl")) == 1
+    assert study(out=folder, scheduler=threads, seeds=(1,)) == 0
+    assert [row["cell"]["seed"] for row in grid.read_rows(folder / "sparse.jsonl")] == [0, 1]
+    assert "2 of 2 cells" in (folder / "sparse.md").read_text(encoding="utf-8")
+
+
 def test_a_report_of_what_is_there_fits_nothing(folder, tmp_path, monkeypatch):
     with pytest.raises(DataError, match="expected cells of --preset quick, got none"):
         study(out=tmp_path / "new", report_only=True)
