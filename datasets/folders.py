@@ -46,12 +46,18 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> lis
     return sorted(files, key=lambda p: p.name)
 
 
-def image_folder(root: Path) -> Path | None:
-    """The folder of photos beside a model: `images`, else the `images_k` of the largest photos, or None."""
-    if (root / "images").is_dir():
-        return root / "images"
+def image_folder(root: Path, name: str = "") -> Path | None:
+    """The folder of photos beside a model: that of this name, else `images`, else the largest `images_k`, or None."""
+    if name:
+        return root / name
+    return next(iter(image_folders(root)), None)
+
+
+def image_folders(root: Path) -> list[Path]:
+    """The folders of photos of a scene, `images` and `images_k`, those of the largest photos first."""
     reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
-    return min(reduced, key=lambda p: int(p.name.removeprefix("images_")), default=None)
+    reduced.sort(key=lambda p: int(p.name.removeprefix("images_")))
+    return [*([root / "images"] if (root / "images").is_dir() else []), *reduced]
 
 
 def find_models(root: Path) -> list[Path]:

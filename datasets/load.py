@@ -39,6 +39,7 @@ def load_scene(
     background: str = "black",
     points: str = "none",
     photos: bool = True,
+    photo_folder: str = "",
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
@@ -65,6 +66,8 @@ def load_scene(
             Their positions were refined with the test views too.
         photos: False reads only the sizes of the photos: cameras, names and sizes are the same, `images` have no pixels
             (they are on torch's "meta" device), `masks` and `finer` are None.
+        photo_folder: where a scene (LLFF, COLMAP) has its photos in several sizes, the name of the folder to take, as
+            "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
 
     Raises:
         DataError: the folder is not a scene, or its files are missing, damaged or contradict each other.
@@ -81,7 +84,7 @@ def load_scene(
     root = Path(path)
     # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
-        frame_set = find_layout(root)
+        frame_set = find_layout(root, photo_folder)
         train, test = _split(root, frame_set, train_views, hold_out)
         cloud = frame_set.points
         if points == "model-points":

@@ -20,7 +20,7 @@ from .colmap_model import ColmapCamera, ColmapImage, model_file, read_cameras, r
 _LISTED = 20
 
 
-def load_colmap(root: Path) -> FrameSet:
+def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
     """Read the COLMAP model of a scene, of several the largest one.
 
     Photos that are gone are left out with a note, unless more than half of them are.
@@ -32,14 +32,16 @@ def load_colmap(root: Path) -> FrameSet:
     cameras_file = model_file(folder, "cameras")
     images_file = model_file(folder, "images")
     cameras = read_cameras(cameras_file)
-    photos = image_folder(root)
+    photos = image_folder(root, photo_folder)
+    if photo_folder and not (root / photo_folder).is_dir():
+        raise DataError(root, "", f"expected the photos in {photo_folder}/, found no such folder")
     frames = []
     ids = {}
     for image_id, image in read_images(images_file).items():
         if image.camera_id not in cameras:
             raise DataError(images_file, image.name, f"has camera {image.camera_id}, which {cameras_file.name} lacks")
         path = find_file(images_file, root, image.name, photos)
-        if not path.is_file():
+        if not path.is_file() and not photo_folder:
             beside = find_file(images_file, root, image.name)
             path = beside if beside.is_file() else path
         lens = _intrinsics(cameras[image.camera_id])

@@ -18,7 +18,7 @@ from .colmap import camera_to_world, largest_model, track_points
 from .colmap_model import model_file, read_images
 
 
-def load_llff(root: Path) -> FrameSet:
+def load_llff(root: Path, photo_folder: str = "") -> FrameSet:
     """Read `poses_bounds.npy`, one row per image in the order of the names in `images/` or else `images_k/`.
 
     Convention:
@@ -27,10 +27,11 @@ def load_llff(root: Path) -> FrameSet:
         is the image's centre. The focal length is scaled to the images that are read.
     """
     source = root / "poses_bounds.npy"
-    folder = image_folder(root)
+    folder = image_folder(root, photo_folder)
     rows = _read_rows(source)
-    if folder is None:
-        raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")
+    if folder is None or not folder.is_dir():
+        expected = f"{photo_folder}/" if photo_folder else "images/ or images_k/"
+        raise DataError(root, "", f"expected the photos in {expected}, found no such folder")
     paths = [path_inside(source, root, path.name, folder) for path in list_images(folder)]
     if len(paths) != len(rows):
         raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")

@@ -1,5 +1,6 @@
 """What a command needs to load the scene of a fit again."""
 
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ class SceneRequest:
         photos: whether the page shows photos.
         roll: degrees by which page and film are turned clockwise.
         title: of the page; "": the name of the folder.
+        photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
     """
 
     scene: str
@@ -36,6 +38,7 @@ class SceneRequest:
     photos: bool = True
     roll: float = 0.0
     title: str = ""
+    photo_folder: str = ""
 
     def load(self, base: Path, say: Callable[[str], None] | None = None) -> Scene:
         """Load the scene; `base` is the folder that a relative path starts from, `say` gets the loader's notes."""
@@ -46,6 +49,7 @@ class SceneRequest:
             hold_out=self.hold_out,
             background=self.background,
             points=self.points,
+            photo_folder=self.photo_folder,
         )
         if say is not None:
             for note in scene.notes:
@@ -86,4 +90,8 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "photos": ("true or false", lambda v: isinstance(v, bool)),
     "roll": ("a number", lambda v: is_number(v)),
     "title": ("a text", lambda v: isinstance(v, str)),
+    "photo_folder": (
+        "images, images_ and a number, or nothing",
+        lambda v: isinstance(v, str) and re.fullmatch(r"(images(_\d+)?)?", v) is not None,
+    ),
 }

@@ -14,6 +14,7 @@ import kgs.version
 from kgs.app.page.pictures import Picture, encoded
 from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.field import field_size
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import PRESETS, FitConfig
@@ -117,13 +118,16 @@ def _pictures(fit: Fit) -> list[str]:
 def _start(
     data: str | None, name: str, views: int, downscale: float | None, start: str, seed: int, preset: str
 ) -> tuple[Scene, InitialPoints, float]:
-    """A scene, its initial points, and the processor's seconds that they took."""
+    """A scene, in the size of published tables or `downscale` times smaller, its initial points, and their seconds."""
     if name == SYNTHETIC:
         scene = synthetic_scene(train_views=views, size=(72, 96))
     elif data is None:
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
-        scene = load_scene(Path(data) / name, views, downscale, points=start if start == "model-points" else "none")
+        points_of = start if start == "model-points" else "none"
+        photo_folder, factor, _ = field_size(Path(data) / name)
+        shrink = None if downscale is None and factor is None else (downscale or 1.0) * (factor or 1.0)
+        scene = load_scene(Path(data) / name, views, shrink, points=points_of, photo_folder=photo_folder)
     config = fit_config(start, seed, {"preset": preset})
     begin = time.process_time()
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback

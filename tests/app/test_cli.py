@@ -125,6 +125,8 @@ def small(tmp_path_factory):
         ("fit {scene} -o {scene}/transforms_train.json", "expected a folder for results"),
         ("fit {scene} -o {out} --size 48 --downscale 2", "--size: expected either"),
         ("fit {scene} -o {out} --size 31", "--size: expected at least 32 pixels"),
+        ("fit {scene} -o {out} --size small", "--size: expected pixels, field"),
+        ("fit {scene} -o {out} --size images_9", "images_9"),
         ("fit {scene} -o {out} --roll 400", "--roll: expected"),
         ("fit {scene} -o {out} --downscale 2", "--downscale: expected at least 32 pixels, got photos"),
         ("fit {scene} --views 3", "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o "),

@@ -1,6 +1,7 @@
 """`kgs fit`: from a folder of photos to a splat."""
 
 import os
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -36,7 +37,7 @@ def fit(
     out: Out,
     views: int | None = None,
     hold_out: int | None = None,
-    size: int | None = None,
+    size: int | str | None = None,
     downscale: float | None = None,
     background: Background = "black",
     preset: Literal["auto", "paper", "plain"] = "auto",
@@ -61,7 +62,8 @@ def fit(
         hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the scene's files say, or every
             eighth photo; of photos without poses none.
         size: reduce the photos to this many pixels on their longer side. Unless given: 504 for photos without poses on
-            a CPU, else their own size.
+            a CPU, else their own size. Or field: the size of published tables (an eighth, for LLFF and Mip-NeRF 360).
+            Or a folder of a scene, as images_4: its photos as they are.
         downscale: reduce the photos by this factor instead.
         background: the colour behind photos with transparency.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
@@ -74,12 +76,12 @@ def fit(
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
         config: every number of the fit.
     """
-    del preset  # `defaults` reads it
     from kgs.app.files.ownership import is_own
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
+    from kgs.datasets.field import field_size
     from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.machine import check_packages
@@ -106,11 +108,20 @@ def fit(
     stages = Stages(say, unposed)
     if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
+    if preset == "paper" and size is None and downscale is None and not unposed:
+        size = "field"
     if unposed:
         stages.begin("cameras")
+        assert not isinstance(size, str)  # refused before
         request, base = find_scene(scene, out, request, config.seed, size)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
+    elif size == "field":
+        photo_folder, factor, why = field_size(scene)
+        say(why)
+        request = replace(request, photo_folder=photo_folder, downscale=factor)
+    elif isinstance(size, str):
+        request = replace(request, photo_folder=size)
     elif size is not None:
         height, width = load_scene(scene, photos=False, hold_out=hold_out).train.images.shape[-2:]
         request = replace(request, downscale=max(1.0, max(height, width) / size))
@@ -129,7 +140,10 @@ def fit(
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"
     renders = out / "renders"
-    shrunk = ("--downscale", f"{request.downscale:g}") if request.downscale else ()
+    shrink = request.downscale or 1.0
+    if request.photo_folder:
+        shrink *= load_scene(scene, photos=False, hold_out=0).train.images.shape[-1] / width
+    shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if needless := left_out(metrics["needs"]):
         say(f"left out: {needless}")
@@ -150,7 +164,7 @@ def check_fit(
     out: Path,
     views: int | None,
     hold_out: int | None,
-    size: int | None,
+    size: int | str | None,
     downscale: float | None,
     roll: float,
     lpips_weights: Path | None,
@@ -169,12 +183,16 @@ def check_fit(
     check_roll(roll)
     if size is not None and downscale is not None:
         raise ValueError("size: expected either a size or a downscale factor, got both")
-    if size is not None and size < SMALLEST:
+    if isinstance(size, str) and re.fullmatch(r"field|images(_\d+)?", size) is None:
+        raise ValueError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
+    if isinstance(size, int) and size < SMALLEST:
         raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
     if views is not None and views < 1:
         raise ValueError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
     unposed = is_unposed(scene)
+    if unposed and isinstance(size, str):
+        raise ValueError(f"size: expected pixels for photos without camera poses, got {size!r}")
     solver = ["pycolmap"] if unposed else []
     check_installed(config.device, config.backend, "safetensors", "jinja2", *solver)
     if lpips_weights is not None:

@@ -1,0 +1,44 @@
+"""The size in which a standard download is compared in the literature, where it holds its photos in several sizes."""
+
+from pathlib import Path
+
+from .folders import layout_of
+from .layouts import find_layout
+
+_FOLDER = "images_8"  # of LLFF and of Mip-NeRF 360, with three to 24 views
+_FACTOR = 8
+_LARGE = 2000  # pixels: photos that were made for cameras of fewer have been reduced already
+_BLENDER = 800  # pixels of the download's images, which are halved
+
+
+def field_size(root: Path) -> tuple[str, float | None, str]:
+    """Which photos of a scene are those of published tables with few views, and by how much they are to be reduced.
+
+    LLFF and COLMAP scenes: an eighth of the photos that the cameras are for, in `images_8` or made from what is there.
+    Blender scenes: 400 pixels. All others, and what is as small already: as it is.
+
+    Args:
+        root: the folder of a scene.
+
+    Returns:
+        `photo_folder` and `downscale` for :func:`kgs.datasets.load_scene`, and a sentence about them.
+
+    Raises:
+        DataError: it is not a scene.
+    """
+    if (root / _FOLDER).is_dir() and layout_of(root) in ("LLFF", "COLMAP"):
+        return _FOLDER, None, f"photos of {_FOLDER}/, the size of published tables"
+    frame = find_layout(root).frames[0]
+    width, height = frame.image.size
+    wanted = max(width, height)
+    if layout_of(root) == "Blender" and wanted == _BLENDER:
+        wanted //= 2
+    elif layout_of(root) in ("LLFF", "COLMAP"):
+        full = max(frame.intrinsics.width, frame.intrinsics.height)
+        wanted = round(full / _FACTOR) if full >= _LARGE else wanted
+    factor = max(width, height) / wanted
+    if factor <= 1.05:
+        return "", None, f"photos of {width}x{height}, as they are: published tables have no smaller ones"
+    reduced = f"{round(width / factor)}x{round(height / factor)}"
+    why = "by averages over areas; published tables use files that were made otherwise"
+    return "", factor, f"photos of {width}x{height} reduced to {reduced}, the size of published tables, {why}"
