@@ -30,7 +30,6 @@ def study(
 
     For example:
       kgs study -o study
-      KGS_DATA=SCENES kgs study -o study-cpu --preset cpu
       KGS_DATA=SCENES kgs study -o study-field --preset field --scenes llff/fern --seeds 0 --list
 
     Writes sparse.jsonl (beyond.jsonl), a line per finished fit, and the report, also when it is interrupted; the same
@@ -93,9 +92,9 @@ def study(
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
-            scenes = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
+            folder = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
             options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
-            write(rows, out, f"{scenes}kgs study --preset {options} -o OUT", len(cells))
+            write(rows, out, f"{folder}kgs study --preset {options} -o OUT", len(cells))
     return int(len(finished_rows(chosen, path)) < len(chosen))
 
 
