@@ -195,7 +195,7 @@ def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
     """It is moved into the frame of the few views, and drawn by the seed."""
     cloud = torch.rand(12_000, 3, dtype=torch.float64) * 4 - 2  # in the world of the files
 
-    def with_points(path, views=None, downscale=None, points="none"):
+    def with_points(path, views=None, downscale=None, points="none", photo_folder=""):
         loaded = load_scene(path, views, downscale)
         if views is not None:
             return loaded
