@@ -75,6 +75,9 @@ def study(
         path = out / "sparse.jsonl"
         do_cell = sparse_cell
         write = write_report
+        if preset == "paper" and data is not None:
+            for setting in presets.too_few_photos(data):
+                print(f"left out: {setting}")
     chosen = presets.select(cells, scenes=scenes, methods=methods, views=views, seeds=seeds)
     if list_cells:
         _list(chosen, finished_rows(chosen, path))

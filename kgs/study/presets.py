@@ -1,11 +1,13 @@
 """The methods that the study compares, and which cells each preset has."""
 
 from collections.abc import Collection, Iterable
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from kgs.bench.scenes import SYNTHETIC, check_scenes
+from kgs.datasets import load_scene
 from kgs.errors import DataError
 
 from .cells import FULL
@@ -165,8 +167,32 @@ def _field_long(data: Path) -> list[Block]:
     return [([0], [scene], ["dense"], (OFF, PAPER, AUTO)) for scene in FORWARD.items()]
 
 
+def too_few_photos(data: Path) -> list[str]:
+    """The settings of the preset "paper" that it leaves out, since a scene has fewer photos to train on; sentences."""
+    sentences = []
+    for path in _scenes_of_paper(data):
+        count = _training_photos(path)
+        for views in VIEWS[path.parent.name]:
+            if views > count:
+                sentences.append(f"{path.relative_to(data)} with {views} views: it has {count} photos to train on")
+    return sentences
+
+
+def _scenes_of_paper(data: Path) -> list[Path]:
+    return [path for path in sorted(data.glob("*/*")) if path.is_dir() and path.parent.name in VIEWS]
+
+
+@cache
+def _training_photos(path: Path) -> int:
+    """How many photos of a scene are not held out; for a scene that cannot be read so many that its cells say why."""
+    try:
+        return len(load_scene(path, photos=False).train)
+    except DataError:
+        return max(map(max, VIEWS.values()))
+
+
 def _paper(data: Path) -> list[Block]:
-    folders = [path for path in sorted(data.glob("*/*")) if path.is_dir() and path.parent.name in VIEWS]
+    folders = _scenes_of_paper(data)
     if not folders:
         raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
     blocks: list[Block] = []
@@ -176,6 +202,8 @@ def _paper(data: Path) -> list[Block]:
             # Blender scenes also from the layout's random points, as published.
             starts = ["dense", "scene"] if layout == "blender" else ["dense"]
             for views in VIEWS[layout]:
+                if views > _training_photos(path):
+                    continue  # `too_few_photos` names it
                 methods = METHODS if layout == "llff" and views == 3 else MAIN
                 blocks.append(([seed], [(str(path.relative_to(data)), views)], starts, methods))
     return blocks

@@ -6,8 +6,10 @@ import shutil
 
 import pytest
 from study_rows import tiny_cell
+from tiny_scenes import write_llff
 
 from kgs import DataError
+from kgs.datasets import load_scene
 from kgs.study import grid, presets
 from kgs.study.command import study
 
@@ -52,6 +54,18 @@ def test_a_part_of_a_preset_has_the_same_cells():
     assert part == [cell for cell in cells if cell["method"] in ("off", "far") and cell["seed"] == 0]
     assert {cell["method"] for cell in part} == {"off", "far"}
     assert presets.select(cells) == cells
+
+
+def test_settings_that_a_scene_has_too_few_photos_for_are_left_out_by_name(tmp_path):
+    scene = tmp_path / "llff" / "small"
+    scene.mkdir(parents=True)
+    write_llff(scene)
+    count = len(load_scene(scene, photos=False).train)
+    said = presets.too_few_photos(tmp_path)
+    assert said == [
+        f"{scene.relative_to(tmp_path)} with {n} views: it has {count} photos to train on" for n in (3, 6, 9)
+    ]
+    assert presets.sparse_cells("paper", tmp_path) == []
 
 
 def test_the_list_says_what_is_done_and_writes_nothing(folder, tmp_path, capsys):
