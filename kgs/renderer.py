@@ -174,5 +174,9 @@ class _OverColor(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (color,) = ctx.saved_tensors
-        by_transmittance = (color @ grad.flatten(2))[:, None].unflatten(2, grad.shape[2:])
-        return grad, by_transmittance if ctx.needs_input_grad[1] else None, None
+        by_transmittance = None
+        if ctx.needs_input_grad[1]:
+            by_transmittance = grad[:, :1] * color[0]  # no matrix product: torch may round these
+            for channel in range(1, len(color)):
+                by_transmittance = torch.addcmul(by_transmittance, grad[:, channel : channel + 1], color[channel])
+        return grad, by_transmittance, None

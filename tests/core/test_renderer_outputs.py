@@ -1,5 +1,6 @@
 """Normals, features and backgrounds of the renderer."""
 
+import contextlib
 import math
 
 import pytest
@@ -111,16 +112,15 @@ def test_an_infinite_background_shows_only_where_light_is_left(shape):
     assert (GaussianRenderer()(nothing, camera, background).image == math.inf).all()
 
 
-def test_one_color_behind_an_image_is_added_as_torch_adds_it():
+@pytest.mark.parametrize("rounding", [contextlib.nullcontext(), torch.autocast("cpu", torch.bfloat16)])
+def test_one_color_behind_an_image_is_added_as_torch_adds_it(rounding):
     image, transmittance = torch.rand(2, 3, 5, 7, requires_grad=True), torch.rand(2, 1, 5, 7, requires_grad=True)
     color = torch.rand(3)
     weights = torch.rand(2, 3, 5, 7)
     found = blend(image, transmittance, color)
     expected = torch.addcmul(image, transmittance, color[:, None, None])
     assert torch.equal(found, expected)
-    for mine, same in zip(
-        torch.autograd.grad((found * weights).sum(), (image, transmittance)),
-        torch.autograd.grad((expected * weights).sum(), (image, transmittance)),
-        strict=True,
-    ):
-        torch.testing.assert_close(mine, same)
+    with rounding:
+        mine = torch.autograd.grad((found * weights).sum(), (image, transmittance))
+        same = torch.autograd.grad((expected * weights).sum(), (image, transmittance))
+    torch.testing.assert_close(mine, same)
