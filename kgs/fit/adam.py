@@ -31,6 +31,7 @@ class Adam:
         self.state: defaultdict[Tensor, Any] = defaultdict(dict)
         self.eps = eps
 
+    @torch_on_all_threads()
     @torch.no_grad()
     def step(self) -> None:
         """Change each parameter that has a gradient."""
@@ -44,22 +45,21 @@ class Adam:
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
             state["step"] += 1
-            with torch_on_all_threads():
-                torch._fused_adam_(
-                    [parameter],
-                    [parameter.grad],
-                    [state["exp_avg"]],
-                    [state["exp_avg_sq"]],
-                    [],
-                    [state["step"]],
-                    lr=group["lr"],
-                    beta1=0.9,
-                    beta2=0.999,
-                    weight_decay=0.0,
-                    eps=self.eps,
-                    amsgrad=False,
-                    maximize=False,
-                )
+            torch._fused_adam_(
+                [parameter],
+                [parameter.grad],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                lr=group["lr"],
+                beta1=0.9,
+                beta2=0.999,
+                weight_decay=0.0,
+                eps=self.eps,
+                amsgrad=False,
+                maximize=False,
+            )
 
     def zero_grad(self) -> None:
         """Set all gradients to None."""

@@ -1,6 +1,5 @@
 """A fit that is done, or as far as it is: a splat with what is needed to render, measure and show it."""
 
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -14,7 +13,7 @@ from kgs.datasets.scene import Scene, Views
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.torch_threads import torch_on_one_thread
+from kgs.torch_threads import threads_beside
 from kgs.types import RasterOptions
 
 from .config import FitConfig
@@ -63,7 +62,7 @@ class Fit:
     @torch.no_grad()
     def render(self, camera: PinholeCamera) -> Tensor:
         """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`."""
-        with torch_on_one_thread() if self.backend == "numba" else nullcontext():
+        with threads_beside(self.backend):
             image: Tensor = self._renderer(self.model(), move_camera(camera, self.device), self._background).image
         return image
 

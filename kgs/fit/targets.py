@@ -30,12 +30,12 @@ class Target(NamedTuple):
         image: Tensor = _AtMostOne.apply(render)  # it is never below 0
         return image if self.light is None else image * self.light
 
-    def over(self, background: Tensor) -> Self:
-        """The view before another background, `(3,)`."""
+    def over(self, background: Tensor, backend: str) -> Self:
+        """The view before another background, `(3,)`; the backend is that of the loss."""
         if self.clear is None:
             return self
         image = self.image + self.clear * (background - self.background)[:, None, None]
-        return self._replace(image=image, moments=target_moments(image, backend="auto"), background=background)
+        return self._replace(image=image, moments=target_moments(image, backend=backend), background=background)
 
 
 class _AtMostOne(torch.autograd.Function):

@@ -7,7 +7,6 @@ the same views in the same order.
 import math
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -24,7 +23,7 @@ from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.torch_threads import torch_on_one_thread
+from kgs.torch_threads import threads_beside
 from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
 from .checkpoint import newest_checkpoint, save_checkpoint
@@ -153,14 +152,14 @@ class Trainer:
         if state.step >= times.steps:
             raise ValueError(f"steps: expected a step of {times.steps} to be left, got none")
         start = time.perf_counter()
-        with self._threads():
+        with threads_beside(self.plan.backend):
             loss = self._descend()
         state.seconds += time.perf_counter() - start
         if state.step in times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
             self._measure_curve()
         start = time.perf_counter()
         if state.step in times.densify:
-            with self._threads():
+            with threads_beside(self.plan.backend):
                 self._densify()
         if state.step in times.reset:
             state.densifier.reset_opacity(self.plan.config.recipe.reset_opacity)
@@ -168,10 +167,6 @@ class Trainer:
             bound_scales(state.model, state.start.extent)
         state.seconds += time.perf_counter() - start
         return loss
-
-    def _threads(self) -> AbstractContextManager[None]:
-        """Where kernels do the work, torch's own operators run on one thread."""
-        return torch_on_one_thread() if self.plan.backend == "numba" else nullcontext()
 
     def render_view(self, gaussians: Gaussians, camera: PinholeCamera, background: Tensor | None) -> Rendering:
         """The render of a training step."""
@@ -280,7 +275,7 @@ class Trainer:
         background = self._background
         if config.training_background == "random":
             background = torch.rand(3, generator=state.colors, dtype=torch.float32, device=self.plan.device)
-            view = view.over(background)
+            view = view.over(background, self.plan.backend)
         rendering: Any = self.render_view(state.model(), camera, background)
         if rendering.projected.means2d.requires_grad:
             rendering.projected.means2d.retain_grad()  # for the densifier
