@@ -26,14 +26,15 @@ def field_size(root: Path) -> tuple[str, float | None, str]:
     Raises:
         DataError: it is not a scene.
     """
-    if (root / _FOLDER).is_dir() and layout_of(root) in ("LLFF", "COLMAP"):
+    layout = layout_of(root)
+    if (root / _FOLDER).is_dir() and layout in ("LLFF", "COLMAP"):
         return _FOLDER, None, f"photos of {_FOLDER}/, the size of published tables"
     frame = find_layout(root).frames[0]
     width, height = frame.image.size
     wanted = max(width, height)
-    if layout_of(root) == "Blender" and wanted == _BLENDER:
+    if layout == "Blender" and wanted == _BLENDER:
         wanted //= 2
-    elif layout_of(root) in ("LLFF", "COLMAP"):
+    elif layout in ("LLFF", "COLMAP"):
         full = max(frame.intrinsics.width, frame.intrinsics.height)
         wanted = round(full / _FACTOR) if full >= _LARGE else wanted
     factor = max(width, height) / wanted

@@ -8,6 +8,8 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+from kgs.errors import DataError
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
@@ -47,17 +49,16 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> lis
 
 
 def image_folder(root: Path, name: str = "") -> Path | None:
-    """The folder of photos beside a model: that of this name, else `images`, else the largest `images_k`, or None."""
-    if name:
-        return root / name
-    return next(iter(image_folders(root)), None)
+    """The folder of photos beside a model: `images`, else the `images_k` of the largest photos, or None.
 
-
-def image_folders(root: Path) -> list[Path]:
-    """The folders of photos of a scene, `images` and `images_k`, those of the largest photos first."""
+    With a name the folder of that name; a DataError where there is none.
+    """
+    if name and not (root / name).is_dir():
+        raise DataError(root, "", f"expected the photos in {name}/, found no such folder")
+    if name or (root / "images").is_dir():
+        return root / (name or "images")
     reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
-    reduced.sort(key=lambda p: int(p.name.removeprefix("images_")))
-    return [*([root / "images"] if (root / "images").is_dir() else []), *reduced]
+    return min(reduced, key=lambda p: int(p.name.removeprefix("images_")), default=None)
 
 
 def find_models(root: Path) -> list[Path]:

@@ -33,8 +33,6 @@ def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
     images_file = model_file(folder, "images")
     cameras = read_cameras(cameras_file)
     photos = image_folder(root, photo_folder)
-    if photo_folder and not (root / photo_folder).is_dir():
-        raise DataError(root, "", f"expected the photos in {photo_folder}/, found no such folder")
     frames = []
     ids = {}
     for image_id, image in read_images(images_file).items():

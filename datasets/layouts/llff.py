@@ -29,9 +29,8 @@ def load_llff(root: Path, photo_folder: str = "") -> FrameSet:
     source = root / "poses_bounds.npy"
     folder = image_folder(root, photo_folder)
     rows = _read_rows(source)
-    if folder is None or not folder.is_dir():
-        expected = f"{photo_folder}/" if photo_folder else "images/ or images_k/"
-        raise DataError(root, "", f"expected the photos in {expected}, found no such folder")
+    if folder is None:
+        raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")
     paths = [path_inside(source, root, path.name, folder) for path in list_images(folder)]
     if len(paths) != len(rows):
         raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")

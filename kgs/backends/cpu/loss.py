@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.compiled.arrays import arrays
+from kgs.compiled.arrays import Array, arrays
 from kgs.compiled.threads import over
 from kgs.memory import array, empty
 from kgs.torch_threads import thread_count
@@ -25,11 +25,10 @@ def loss_and_gradient(
 ) -> tuple[Tensor, Tensor | None]:
     """See `LossStage`."""
     x, y, mean_y, variance_y = arrays(*(x.flatten(0, 1) for x in (image, target, mean, variance)))
-    half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
+    half = _half(taps)
     threads = thread_count()
     channels, height, width = x.shape
-    bands = channels * -(-height // BAND)
-    pieces = min(PIECES, -(-x.size // LEAST))
+    bands, pieces = _division(x)
     maps = array((3, *x.shape))
     sums = np.zeros((bands, 2))
     over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
@@ -51,9 +50,19 @@ def loss_and_gradient(
 def local_moments(target: Tensor, taps: list[float]) -> tuple[Tensor, Tensor]:
     """See `MomentsStage`."""
     [y] = arrays(target.flatten(0, 1))
-    half = tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
+    half = _half(taps)
     mean, variance = (empty((1, *y.shape), target) for _ in range(2))
-    bands = y.shape[0] * -(-y.shape[1] // BAND)
-    pieces = min(PIECES, -(-y.size // LEAST))
+    bands, pieces = _division(y)
     over(thread_count(), bands, fill_moments, half, y, mean[0].numpy(), variance[0].numpy(), pieces=pieces)
     return mean, variance
+
+
+def _half(taps: list[float]) -> tuple[np.float32, ...]:
+    """The first taps of the window, up to its middle, as the kernels take them."""
+    return tuple(np.float32(tap) for tap in taps[: RADIUS + 1])
+
+
+def _division(image: Array) -> tuple[int, int]:
+    """How many bands of rows all channels have, and into how many pieces they are divided."""
+    channels, height, _ = image.shape
+    return channels * -(-height // BAND), min(PIECES, -(-image.size // LEAST))
