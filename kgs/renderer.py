@@ -163,7 +163,7 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
 
 
 class _OverColor(torch.autograd.Function):
-    """`addcmul` with one colour `(D,)`, in memory of `kgs.memory`, and without a product image in the backward pass."""
+    """`addcmul` with one colour `(D,)`, with the same bits, in memory of `kgs.memory`."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, transmittance: Tensor, color: Tensor) -> Tensor:
@@ -176,7 +176,6 @@ class _OverColor(torch.autograd.Function):
         (color,) = ctx.saved_tensors
         by_transmittance = None
         if ctx.needs_input_grad[1]:
-            by_transmittance = grad[:, :1] * color[0]  # no matrix product: torch may round these
-            for channel in range(1, len(color)):
-                by_transmittance = torch.addcmul(by_transmittance, grad[:, channel : channel + 1], color[channel])
+            product = empty(tuple(grad.shape), grad)  # no matrix product: torch may round these
+            by_transmittance = torch.mul(grad, color[:, None, None], out=product).sum(1, keepdim=True)
         return grad, by_transmittance, None
