@@ -32,6 +32,7 @@ from kgs.metrics.lpips import Lpips
 
 from .overfitting import coadaptation, count_over_threshold
 from .rivals import Rival, RivalTrainer
+from .running import tell_steps
 
 FULL = "full-model"  # initial points that use test views: an upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are not test views, refined with test views; not allowed"
@@ -87,7 +88,7 @@ def fit_and_measure(
     begin = time.process_time()
     plan = decide(make_plan(scene, config), points)
     trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
-    fit = prune(trainer.fit())
+    fit = prune(trainer.fit(tell_steps()))
     cpu_seconds = time.process_time() - begin
     fit = replace(fit, metrics=measure(fit, lpips))
     stored = {

@@ -4,10 +4,12 @@ import asyncio
 import json
 import logging
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from distributed import Client, KilledWorker, LocalCluster, Security, as_complet
 from distributed.core import rpc
 
 from kgs.app.files.results_folder import held
+
+from .running import Running
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
@@ -31,6 +35,7 @@ def run_grid(
     processes: int | None = None,
     scheduler: str | None = None,
     say: Callable[[str], None] = print,
+    name: Callable[[Cell], str] = _key,
 ) -> list[dict[str, Any]]:
     """Do the cells that the file does not have yet; return the lines of those that it has then, in the cells' order.
 
@@ -46,6 +51,7 @@ def run_grid(
         scheduler: address of a Dask scheduler, whose workers do the cells instead; they need the same packages and
             data.
         say: takes a line of text for the user.
+        name: what a cell is called in these lines, and beside its steps while it runs.
 
     Raises:
         ValueError: two cells are equal, `processes` is below 1, another run writes the file, or the scheduler does not
@@ -60,12 +66,25 @@ def run_grid(
         missing = [cell for cell in cells if _key(cell) not in done]
         say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
         if missing:
-            with _client(processes, scheduler) as client:
-                _do(client, work, missing, path, say)
+            with _client(processes, scheduler) as client, Running.of(client) as running:
+                _do(client, work, missing, path, partial(_say_aside, running, say), name, running)
     return finished_rows(cells, path)
 
 
-def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Callable[[str], None]) -> None:
+def _say_aside(running: Running, say: Callable[[str], None], line: str) -> None:
+    with running.aside():
+        say(line)
+
+
+def _do(
+    client: Client,
+    work: Work,
+    cells: Sequence[Cell],
+    path: Path,
+    say: Callable[[str], None],
+    name: Callable[[Cell], str],
+    running: Running,
+) -> None:
     """Do the cells on the client's workers and append each to the file when it is done."""
     cell_of: dict[Any, Cell] = {}  # of the futures that are not done
     waiting = deque(cells)
@@ -74,6 +93,8 @@ def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Call
     finished = 0
     failed = 0
     futures = as_completed()
+    _wait(client, say)
+    begin = time.perf_counter()
 
     def submit() -> None:
         nonlocal alone
@@ -81,20 +102,19 @@ def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Call
             alone = True
             waiting.append(suspects.popleft())
         if not cell_of and waiting:
-            client.wait_for_workers(1)  # at the start, and where the last one died
-        try:
-            free = sum(client.nthreads().values()) - len(cell_of)  # a queued cell would be lost with its worker
-        except OSError:
-            raise ValueError(_LOST) from None
+            _wait(client, say)  # the last one died
+        free = _threads(client) - len(cell_of)  # a queued cell would be lost with its worker
         for _ in range(min(free, len(waiting))):
             cell = waiting.popleft()
             future = client.submit(work, cell, pure=False)
             cell_of[future] = cell
+            running.begin(future.key, name(cell))
             futures.add(future)
 
     submit()
     for future in futures:
         cell = cell_of.pop(future)
+        running.end(future.key)
         if future.status in ("cancelled", "lost"):
             raise ValueError(_LOST)
         error = future.exception()
@@ -102,15 +122,32 @@ def _do(client: Client, work: Work, cells: Sequence[Cell], path: Path, say: Call
             suspects.append(cell)
         elif error:
             failed += 1
-            say(f"failed: {_key(cell)}: {type(error).__name__}: {error}")
+            say(f"failed: {name(cell)}: {type(error).__name__}: {error}")
         else:
             finished += 1
             _append(path, {"cell": cell, "result": future.result()})
-            say(f"{finished + failed} of {len(cells)}: {_key(cell)}")
+            say(f"{finished + failed} of {len(cells)}: {name(cell)}")
         future.release()  # else Dask does the cell again if this worker dies later
         submit()
+    seconds = time.perf_counter() - begin
+    say(f"{finished} cells in {seconds:.0f} s, {60 * finished / seconds:.2f} a minute")
     if failed:
         say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
+
+
+def _wait(client: Client, say: Callable[[str], None]) -> None:
+    """Wait until there is a worker."""
+    if not _threads(client):
+        say("waiting for a worker")
+        client.wait_for_workers(1)
+
+
+def _threads(client: Client) -> int:
+    """Of all workers together: so many cells run at a time."""
+    try:
+        return sum(client.nthreads().values())
+    except OSError:
+        raise ValueError(_LOST) from None
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.datasets import load_scene
 from kgs.errors import DataError
+from kgs.fit.config import FitConfig
 
 from .cells import FULL
 from .grid import Cell
@@ -88,6 +89,18 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
         for block in blocks
         for seed, (scene, views), start, method in product(*block)
     ]
+
+
+def name_of(cell: Cell) -> str:
+    """As "llff/fern, 3 views, dense, off, seed 0"; of one preset each cell has another name."""
+    words = [cell["scene"], f"{cell['views']} views", cell.get("start"), cell["method"], f"seed {cell['seed']}"]
+    return ", ".join(word for word in words if word)
+
+
+def with_steps(cells: Iterable[Cell], steps: int) -> list[Cell]:
+    """The cells with fits of so many steps, in place of their own number; ValueError: fewer than 1, or too many."""
+    FitConfig(steps=steps)  # checks it
+    return [cell | {"fit": cell["fit"] | {"steps": steps}} for cell in cells]
 
 
 def select(
