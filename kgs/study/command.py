@@ -24,6 +24,8 @@ def study(
     methods: tuple[str, ...] | None = None,
     views: tuple[int, ...] | None = None,
     seeds: tuple[int, ...] | None = None,
+    table: int | None = None,
+    steps: int | None = None,
     list_cells: Annotated[bool, tyro.conf.arg(name="list")] = False,
 ) -> int:
     """Compare fits with and without DropGaussian, its schedules and rivals, over scenes and seeds.
@@ -54,13 +56,19 @@ def study(
         methods: only these methods, as "auto" or "progressive 0.2".
         views: only fits of so many views.
         seeds: only these seeds.
+        table: only what a table of the paper has, of --preset paper. 1: LLFF with 3, 6 and 9 views; 2: Mip-NeRF 360
+            with 12 and 24; 3: Blender with 8; 4: rates and schedules; 5: selected Gaussians dropped; 6: an L1 penalty;
+            the last three on LLFF with 3 views.
+        steps: of every fit, in place of the preset's number. Fits of another number are others, and need a folder of
+            their own.
         list_cells: fit nothing and write nothing; say which fits the preset has, and which of them are done.
 
     Raises:
-        DataError: scenes are missing, or `out` holds the study of another preset, whose report would be overwritten.
-        ValueError: the preset has no such fits.
+        DataError: scenes are missing, or `out` holds the study of another preset or number of steps, whose report would
+            be overwritten.
+        ValueError: the preset has no such fits, `table` is not of this preset, or `steps` is out of its range.
     """
-    from . import beyond, beyond_report, presets
+    from . import beyond, beyond_report, paper_tables, presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
     from .report import write_report
@@ -79,12 +87,18 @@ def study(
         if preset == "paper" and data is not None:
             for setting in presets.too_few_photos(data):
                 print(f"left out: {setting}")
-    chosen = presets.select(cells, scenes=scenes, methods=methods, views=views, seeds=seeds)
+    same = f"--preset {preset}"
+    if steps is not None:
+        cells = presets.with_steps(cells, steps)
+        same += f" --steps {steps}"
+    chosen = cells if table is None or data is None else paper_tables.cells_of_table(cells, table, data)
+    chosen = presets.select(chosen, scenes=scenes, methods=methods, views=views, seeds=seeds)
     if list_cells:
         _list(chosen, finished_rows(chosen, path))
         return 0
     if (report_only or read_rows(path)) and not finished_rows(cells, path):
-        raise DataError(path, "", f"expected cells of --preset {preset}, got none; give each preset its own folder")
+        own = "give each preset and number of steps its own folder"
+        raise DataError(path, "", f"expected cells of {same}, got none; {own}")
     work = partial(
         do_cell,
         data=None if data is None else os.path.abspath(data),
@@ -92,31 +106,36 @@ def study(
     )
     try:
         if not report_only:
-            run_grid(chosen, work, path, scheduler=scheduler, processes=processes)
+            run_grid(chosen, work, path, scheduler=scheduler, processes=processes, name=presets.name_of)
     finally:
         rows = finished_rows(cells, path)
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
             folder = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
-            options = preset if lpips_weights is None else f"{preset} --lpips-weights WEIGHTS"
-            write(rows, out, f"{folder}kgs study --preset {options} -o OUT", len(cells))
+            options = same if lpips_weights is None else f"{same} --lpips-weights WEIGHTS"
+            write(rows, out, f"{folder}kgs study {options} -o OUT", len(cells))
     return int(len(finished_rows(chosen, path)) < len(chosen))
 
 
 def _list(cells: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
     """Print a line for each cell."""
+    from .presets import name_of
+
     done = [row["cell"] for row in rows]
     for cell in cells:
-        words = [f"{cell['scene']}, {cell['views']} views", cell.get("start", ""), cell.get("method", "")]
         state = "done" if cell in done else "to do"
-        print(f"{state:>5}: {', '.join(word for word in words if word)}, seed {cell['seed']}")
+        print(f"{state:>5}: {name_of(cell)}")
     print(f"{len(done)} of {len(cells)} are done")
 
 
-def check_study(lpips_weights: Path | None, **_: Any) -> None:
+def check_study(preset: str, table: int | None, steps: int | None, lpips_weights: Path | None, **_: Any) -> None:
     """Check the arguments of `kgs study`."""
     from kgs.app.cli.checks import check_installed
+    from kgs.fit.config import FitConfig
     from kgs.metrics.weights import weight_files
 
     check_installed("cpu", "auto", "pandas", "scipy", "distributed", "matplotlib", "jinja2")
+    if table is not None and preset != "paper":
+        raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
+    FitConfig(steps=steps)
     if lpips_weights is not None:
         weight_files(lpips_weights)

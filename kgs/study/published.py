@@ -9,10 +9,10 @@ import pandas as pd
 
 # Columns benchmark, views, table (the main comparison first), method, psnr, ssim, lpips.
 PUBLISHED = pd.read_csv(Path(__file__).with_name("published.csv"))
-_SCENES = {
-    "LLFF": "fern flower fortress horns leaves orchids room trex",
-    "Mip-NeRF 360": "bicycle bonsai counter garden kitchen room stump",
-    "Blender": "chair drums ficus hotdog lego materials mic ship",
+SCENES_OF = {
+    "LLFF": ("fern", "flower", "fortress", "horns", "leaves", "orchids", "room", "trex"),
+    "Mip-NeRF 360": ("bicycle", "bonsai", "counter", "garden", "kitchen", "room", "stump"),
+    "Blender": ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"),
 }
 
 # PSNR of a public training log of a method that starts from a pretrained matcher and uses monocular depths: 504x378,
@@ -24,7 +24,7 @@ FIELD_WIDTH = 500  # pixels, at least, of images in the field's size
 def benchmark_of(scene: str, views: int) -> str | None:
     """The paper's benchmark that has a scene with so many views, whatever its folder; None: no such."""
     known = set(PUBLISHED.benchmark[PUBLISHED.views == views])
-    return next((name for name in known if scene.rpartition("/")[2] in _SCENES[name].split()), None)
+    return next((name for name in known if scene.rpartition("/")[2] in SCENES_OF[name]), None)
 
 
 def published(benchmark: str | None, views: int, method: str) -> str:
