@@ -1,5 +1,6 @@
 """How far the running cells are: told by the Dask workers that do them, shown where the grid was started."""
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -30,7 +31,7 @@ def tell_steps() -> "Callable[[Trainer, float], bool] | None":
         key = worker.get_current_task()
     except (ValueError, KeyError):  # no worker; or no task of it
         return None
-    last = 0.0
+    last = -math.inf
 
     def tell(trainer: "Trainer", _: float) -> bool:
         nonlocal last

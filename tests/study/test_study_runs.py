@@ -11,7 +11,8 @@ from tiny_scenes import write_llff
 from kgs import DataError
 from kgs.datasets import load_scene
 from kgs.study import grid, presets
-from kgs.study.command import study
+from kgs.study.beyond import beyond_cells
+from kgs.study.command import check_study, study
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +55,33 @@ def test_a_part_of_a_preset_has_the_same_cells():
     assert part == [cell for cell in cells if cell["method"] in ("off", "far") and cell["seed"] == 0]
     assert {cell["method"] for cell in part} == {"off", "far"}
     assert presets.select(cells) == cells
+
+
+@pytest.mark.parametrize("preset", ["quick", "beyond"])
+def test_other_steps_make_other_cells_that_differ_in_nothing_else(preset):
+    cells = beyond_cells(None) if preset == "beyond" else presets.sparse_cells(preset, None)
+    shorter = presets.with_steps(cells, 30)
+    assert not [cell for cell in shorter if cell in cells]
+    assert {cell["fit"]["steps"] for cell in shorter} == {30}
+    assert presets.with_steps(shorter, 5) == presets.with_steps(cells, 5)
+
+
+@pytest.mark.parametrize("steps", [0, -1])
+def test_steps_are_checked_as_those_of_a_fit(steps):
+    for call in (presets.with_steps, lambda _, steps: check_study("quick", None, steps, None)):
+        with pytest.raises(ValueError, match=f"^steps: .*{steps}"):
+            call([tiny_cell()], steps)
+
+
+def test_fits_of_other_steps_have_a_folder_of_their_own(folder, tmp_path, threads):
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(DataError, match="--preset quick --steps 2, got none"):
+        study(out=folder, scheduler=threads, steps=2)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    assert study(out=tmp_path / "short", scheduler=threads, steps=2) == 0
+    (row,) = grid.read_rows(tmp_path / "short" / "sparse.jsonl")
+    assert row["result"]["config"]["steps"] == 2
+    assert "kgs study --preset quick --steps 2 -o OUT" in (tmp_path / "short" / "sparse.md").read_text(encoding="utf-8")
 
 
 def test_settings_that_a_scene_has_too_few_photos_for_are_left_out_by_name(tmp_path):
