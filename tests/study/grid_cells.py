@@ -16,7 +16,7 @@ def cells_in(log, count, kill=None, seconds=0.2):
 
 def do(cell):
     log = Path(cell["log"])
-    (log / f"process {os.getpid()}").touch()
+    (log / f"process {os.getpid()}").write_text(str(cell["x"]))
     time.sleep(cell["seconds"])
     if cell["kill"] == "fail":
         raise ArithmeticError("three")
