@@ -11,11 +11,15 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
+import lpips_package
 import pytest
+import torch
+from tiny_scenes import narrow_lpips
 
 from kgs.fit.config import DETAILS, PRESETS, FitConfig
 from kgs.fit.plan import with_pace
 from kgs.init_points.dense import FEWEST, MOST, PIXELS_OF_A_POINT
+from kgs.metrics.lpips import Lpips
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}
@@ -42,10 +46,27 @@ def test_every_public_name_has_a_place_among_the_api_pages():
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
 def test_its_python_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "lpips", lpips_package)
     names: dict[str, object] = {}
     exec(GIVEN, names)
     for block in re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
         exec(compile(block, path.name, "exec"), names)
+
+
+def test_the_recipe_of_the_weights_of_lpips_makes_files_that_are_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "lpips", lpips_package)
+    text = (ROOT / "docs" / "command.md").read_text(encoding="utf-8")
+    (recipe,) = re.findall(r"^```python\n(.*?import lpips.*?)^```", text, re.M | re.S)
+    names: dict[str, object] = {}
+    with narrow_lpips():
+        exec(recipe, names)
+        read = Lpips.load("WEIGHTS").state_dict()
+    for name, value in names["arrays"].items():
+        if name.startswith("net."):
+            assert torch.equal(torch.from_numpy(value), read[f"features.{name.partition('.')[2].partition('.')[2]}"])
+        elif name.startswith("lin") and name[3].isdigit():
+            assert torch.equal(torch.from_numpy(value).flatten(), read[name[:4]])
 
 
 WITH_EXAMPLES = [
