@@ -24,6 +24,7 @@ Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
 _key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
 PATIENCE = 10  # seconds for a scheduler to answer
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")  # torch takes the second, which Dask sets to 1, before the first
 _LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
 
 
@@ -171,11 +172,11 @@ def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
     before = set(os.environ)  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
     try:
         cluster = LocalCluster(
-            count,
+            n_workers=count,
             threads_per_worker=1,
             processes=True,
             memory_limit=None,  # a cell may need any share of the memory; Dask would kill its process
-            env={"OMP_NUM_THREADS": threads},
+            env=dict.fromkeys(_THREADS, threads),
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
         )

@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from grid_cells import cells_in, do, processes_left, times_done
+from grid_cells import cells_in, do, processes_left, threads_of_torch, times_done
 
 from kgs.study import grid
 from kgs.study.grid import read_rows, run_grid
@@ -34,7 +34,9 @@ def cluster():
     distributed = pytest.importorskip("distributed")
     with (
         mock.patch.dict(os.environ),  # Dask sets OMP_NUM_THREADS, PYTHONHASHSEED and others here for its workers
-        distributed.LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster,
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
     ):
         yield cluster
 
@@ -106,6 +108,17 @@ def test_a_failing_cell_stops_no_other(tmp_path, threads):
     assert failed.endswith("ArithmeticError: three")
     assert said[-1].startswith("1 of 6 cells failed")
     assert len(run_grid(cells, square, path, scheduler=threads, say=quiet)) == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [1, 2])
+def test_so_many_processes_share_the_cores(tmp_path, monkeypatch, processes):
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cells = [{"x": x} for x in range(2 * processes)]
+    rows = run_grid(cells, threads_of_torch, tmp_path / "g.jsonl", processes=processes, say=quiet)
+    assert len({row["result"]["process"] for row in rows}) == processes
+    assert {row["result"]["threads"] for row in rows} == {2 // processes}
 
 
 @pytest.mark.slow
