@@ -36,7 +36,7 @@ def study(
 
     Writes sparse.jsonl (beyond.jsonl), a line per finished fit, and the report, also when it is interrupted; the same
     command goes on where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on
-    each, and --scheduler.
+    each, and --scheduler; docs/paper-tables.md has more on it.
 
     Args:
         out: folder for the results; fits that its JSONL file has are not repeated.
@@ -52,7 +52,7 @@ def study(
             done.
         report_only: fit nothing; write the report of the fits that are done.
         scenes: only the fits of these scenes, as --list names them. The report is of all that are done, as with the
-            next three.
+            next four.
         methods: only these methods, as "auto" or "progressive 0.2".
         views: only fits of so many views.
         seeds: only these seeds.
