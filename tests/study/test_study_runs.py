@@ -73,12 +73,13 @@ def test_steps_are_checked_as_those_of_a_fit(steps):
             call([tiny_cell()], steps)
 
 
-def test_fits_of_other_steps_have_a_folder_of_their_own(folder, tmp_path, threads):
+def test_fits_of_other_steps_have_a_folder_of_their_own(folder, tmp_path, threads, capsys):
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(DataError, match="--preset quick --steps 2, got none"):
         study(out=folder, scheduler=threads, steps=2)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert study(out=tmp_path / "short", scheduler=threads, steps=2) == 0
+    assert capsys.readouterr().err.endswith("off, seed 0: 1 of 2 steps\n")  # while it ran
     (row,) = grid.read_rows(tmp_path / "short" / "sparse.jsonl")
     assert row["result"]["config"]["steps"] == 2
     assert "kgs study --preset quick --steps 2 -o OUT" in (tmp_path / "short" / "sparse.md").read_text(encoding="utf-8")
