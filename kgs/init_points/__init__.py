@@ -5,28 +5,24 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry, log_spacing, meeting_point
+from kgs.geometry import ViewGeometry
 from kgs.progress import Stage, silent
 from kgs.types import check_kind
 
 from .dense import FEWEST, dense_points
+from .depth_limits import MIN_SIFT, certain_points, depth_range, sweep_range
 from .files import read_points
 from .patches import PatchColors
-from .tracks import find_tracks
-from .triangulate import TrackedPoints, triangulate_certain
 
 __all__ = ["InitialPoints", "initial_points"]
 
 KINDS = ("dense", "sift", "random", "file")
 DRAWS = ("uniform", "spread")
 MIN_DENSE = 1000
-MIN_SIFT = 20  # a fit from fewer SIFT points is worse than one from random points
-MAX_SPACING = 4.0  # a point is isolated if its distance to its neighbours is larger than this times the median
 
 
 @dataclass(frozen=True)
@@ -103,17 +99,10 @@ def initial_points(
             raise ValueError("file: expected a path for the kind 'file', got None")
         return InitialPoints(*read_points(Path(file), origin), kind)
     geometry = ViewGeometry.of(views.cameras)
-    tracked = triangulate_certain(find_tracks(views, stage, backend), geometry)
-    tracked = tracked.select(_within_typical_depths(tracked))
-    enough_sift = len(tracked) >= MIN_SIFT
-    if enough_sift:
-        tracked = tracked.select(_has_neighbours(tracked, geometry))
-        enough_sift = len(tracked) >= MIN_SIFT
-    near, far = _depth_range(tracked.depths, geometry)
+    tracked = certain_points(views, geometry, stage, backend)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
-        if enough_sift:
-            near, far = _sweep_range(tracked.pixels, tracked.depths, geometry)
+        near, far = sweep_range(tracked, geometry)
         points, colors, agreed, patches = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
         if agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
             return InitialPoints(points, colors, kind, patches)
@@ -121,54 +110,16 @@ def initial_points(
         warnings.warn(message, stacklevel=2)
     count = FEWEST if count is None else count
     if kind in ("dense", "sift"):
-        if enough_sift:
+        if len(tracked) >= MIN_SIFT:
             colors = _mean_colors(views.images, tracked.tracks.pixels, tracked.tracks.visible)
             return InitialPoints(tracked.points.float(), colors, "sift")
         message = f"initial points: SIFT found {len(tracked)} in {len(views)} training views, fewer than {MIN_SIFT}; "
         warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
+    near, far = depth_range(tracked, geometry)
     points = _random_points(geometry, count, near, far, generator)
     places, depths = geometry.project(points)
     colors = _mean_colors(views.images, places, geometry.inside_images(places, depths, near, far))
     return InitialPoints(points.float(), colors, "random")
-
-
-def _within_typical_depths(tracked: TrackedPoints) -> Tensor:
-    """Whether the depths of a point lie, in all its views, between half the 1st and twice the 99th percentile."""
-    depths = tracked.depths
-    visible = tracked.tracks.visible
-    if not visible.any():
-        return torch.zeros(len(tracked), dtype=torch.bool)
-    least, most = np.quantile(depths[visible], (0.01, 0.99)).tolist()  # torch.quantile takes up to 16 million values
-    typical: Tensor = ((depths > 0.5 * least) & (depths < 2.0 * most)) | ~visible
-    return typical.all(1)
-
-
-def _has_neighbours(tracked: TrackedPoints, geometry: ViewGeometry) -> Tensor:
-    """Whether a point has others near it. Isolated points would get a huge scale, and are usually false matches."""
-    focal = geometry.intrinsics[:, 0, 0]
-    pixels_per_unit = (focal / tracked.depths).masked_fill(~tracked.tracks.visible, 0.0).amax(1)
-    spacing = log_spacing(tracked.points).exp() * pixels_per_unit
-    return spacing < MAX_SPACING * spacing.median()
-
-
-def _depth_range(depths: Tensor, geometry: ViewGeometry) -> tuple[float, float]:
-    """The expected range of depths: from those of points `(P, V)` if P is at least two, else from the cameras."""
-    if len(depths) > 1:
-        least, most = np.quantile(depths[depths > 0], (0.01, 0.99)).tolist()
-        return 0.8 * least, 1.25 * most
-    meeting = meeting_point(geometry.extrinsics)
-    if meeting is not None:
-        axes = geometry.extrinsics[:, 2, :3]
-        to_meeting = ((meeting - geometry.centers) * axes).sum(1)
-        return 0.3 * float(to_meeting.min()), 2.0 * float(to_meeting.max())
-    baseline = float(torch.cdist(geometry.centers, geometry.centers).max()) or 1.0
-    return baseline, 20.0 * baseline
-
-
-def _sweep_range(pixels: Tensor, depths: Tensor, geometry: ViewGeometry) -> tuple[float, float]:
-    """The depths of the plane sweep: wider than those of all points, since cutting off the background costs quality."""
-    inside = depths[geometry.inside_images(pixels, depths)]
-    return 0.85 * float(inside.min()), 1.3 * float(inside.max())
 
 
 def _random_points(geometry: ViewGeometry, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:

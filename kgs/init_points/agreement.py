@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
@@ -25,6 +26,13 @@ AGREEMENT_PIXELS = 0.5
 # chance, but rarely side by side. Of a straight edge, three fifths of the window lie on the pixel's own side.
 WINDOW = 5
 SUPPORT = 13
+# Views also agree by chance on small pieces of surface, far from the others. There a pixel needs two other views.
+LEAST_PIECE = 0.001  # of the image's pixels; smaller pieces are small
+JUMP = 0.01  # difference of inverse depths between neighbours at which a piece ends, of the range of all that agree
+AROUND = 0.1  # of the image's width, the side of the window in which a small piece is compared with large ones
+MARGIN = 0.03  # of the range, by which it may lie before or behind all of these
+LEVELS = 30_000  # of inverse depths, for OpenCV's filter
+NO_LEVEL = -LEVELS
 
 
 def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor]) -> list[DepthMap]:
@@ -53,26 +61,35 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
     return averaged
 
 
-def agreed_points(
-    geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int
-) -> tuple[Tensor, Tensor]:
-    """The points `(P, 3)` of one view's certain pixels that another view and their neighbours confirm, float64.
-
-    Also returns their pixels, as columns and rows `(P, 2)`.
-    """
+def agreed_pixels(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
+    """Which of one view's certain pixels another view and their neighbours confirm, `(H, W)`."""
     rows, columns = certain[view].nonzero().unbind(1)
-    depths = maps[view].depths[rows, columns]
-    agreed = torch.zeros(len(rows), dtype=torch.bool)
+    views = torch.zeros_like(maps[view].depths)  # that confirm a pixel
     for _, _, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
-        agreed |= agrees
-    agreeing = torch.zeros_like(maps[view].depths)
-    agreeing[rows, columns] = agreed.float()
+        views[rows, columns] += agrees
+    confirmed = views > 0
     window = (WINDOW, WINDOW)
-    counts = cv2.boxFilter(agreeing.numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
-    agreed &= torch.from_numpy(counts)[rows, columns] >= SUPPORT
-    pixels = torch.stack([columns, rows], 1)[agreed]
-    points = geometry.unproject(pixels, depths[agreed].double(), torch.full((len(pixels),), view))
-    return points, pixels
+    counts = cv2.boxFilter(confirmed.float().numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
+    agreed = confirmed & (torch.from_numpy(counts) >= SUPPORT)
+    return agreed & (~_strays(maps[view].depths, agreed) | (views >= min(2, len(maps) - 1)))
+
+
+def _strays(depths: Tensor, mask: Tensor) -> Tensor:
+    """The pixels of a mask in small pieces of surface that lie before or behind all large pieces around them."""
+    if not mask.any():
+        return mask
+    inverse = torch.where(mask, 1 / depths, 0.0)
+    least = inverse[mask].min()
+    shares = ((inverse - least) / (inverse.max() - least).clamp_min(1e-30)).numpy()
+    levels = np.where(mask, np.rint(LEVELS * shares), NO_LEVEL).astype(np.int16)
+    cv2.filterSpeckles(levels, NO_LEVEL, int(LEAST_PIECE * mask.numel()), JUMP * LEVELS)
+    is_large = levels != NO_LEVEL
+    side = int(AROUND * mask.shape[1]) // 2 * 2 + 1
+    kernel = np.ones((side, side), np.uint8)
+    nearest = cv2.dilate(np.where(is_large, shares, -np.inf), kernel)
+    farthest = cv2.erode(np.where(is_large, shares, np.inf), kernel)
+    is_around = (shares >= farthest - MARGIN) & (shares <= nearest + MARGIN)
+    return mask & torch.from_numpy(~is_large & ~is_around)
 
 
 def agreeing_views(

@@ -14,7 +14,7 @@ from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 from kgs.progress import Stage, silent
 
-from .agreement import agreed_points, average_depths
+from .agreement import agreed_pixels, average_depths
 from .patches import PatchColors, patch_colors
 from .plane_sweep import MOST_PLANES, DepthMap, planes_wanted, sweep_depths
 
@@ -52,20 +52,12 @@ def dense_points(
     `MOST`, in images that have together `pixels` pixels, or those of the views.
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
-    where the pixels of both views are usable. To bound time and memory, images are halved until they are not too large
-    together, and move by no more pixels than a sweep has planes.
+    where the pixels of both views are usable.
     """
     pixels = pixels or views.images[:, 0].numel()
-    while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
-        views = views.halved()
-    while planes_wanted(views, near, far) > MOST_PLANES and min(views.images.shape[-2:]) >= 2 * SMALLEST:
-        views = views.halved()
-    maps = sweep_depths(views, near, far, stage, backend, to_infinity=True)
-    certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
-    if views.usable is not None:
-        certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]
+    views = small_enough(views, near, far)
+    maps, certain = agreed_depths(views, near, far, stage, backend)
     geometry = ViewGeometry.of(views.cameras)
-    maps = average_depths(geometry, maps, certain)
     parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
     points, colors, places = map(torch.cat, zip(*parts, strict=True))
     if count is None:
@@ -76,9 +68,29 @@ def dense_points(
     chosen = torch.randperm(len(points), generator=generator)
     chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     chosen = chosen[_with_less_sky(is_sky[chosen])]
-    agreed_pixels = [places[view == i, 1:] for i in range(len(views))]
-    patches = patch_colors(views, geometry, maps, certain, agreed_pixels)
+    of_view = [places[view == i, 1:] for i in range(len(views))]
+    patches = patch_colors(views, geometry, maps, certain, of_view)
     return points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches
+
+
+def small_enough(views: Views, near: float, far: float) -> Views:
+    """The views, halved until a sweep between two depths takes neither too much memory nor too many planes."""
+    while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
+        views = views.halved()
+    while planes_wanted(views, near, far) > MOST_PLANES and min(views.images.shape[-2:]) >= 2 * SMALLEST:
+        views = views.halved()
+    return views
+
+
+def agreed_depths(
+    views: Views, near: float, far: float, stage: Stage = silent, backend: str = "auto"
+) -> tuple[list[DepthMap], list[Tensor]]:
+    """The depth maps of the views, averaged, and the pixels that count: inside, usable and well matched."""
+    maps = sweep_depths(views, near, far, stage, backend, to_infinity=True)
+    certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
+    if views.usable is not None:
+        certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]
+    return average_depths(ViewGeometry.of(views.cameras), maps, certain), certain
 
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:
@@ -107,7 +119,9 @@ def _agreed(
     views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
-    points, pixels = agreed_points(geometry, maps, certain, view)
-    columns, rows = pixels.unbind(1)
+    rows, columns = agreed_pixels(geometry, maps, certain, view).nonzero().unbind(1)
+    pixels = torch.stack([columns, rows], 1)
+    depths = maps[view].depths[rows, columns].double()
+    points = geometry.unproject(pixels, depths, torch.full_like(rows, view))
     places = torch.stack([torch.full_like(rows, view), columns, rows], 1)
     return points, views.images[view].cpu()[:, rows, columns].mT, places

@@ -18,6 +18,9 @@ STEP = 0.1
 JUMP = 2.0
 EDGE = 0.02  # the difference of grey values that halves the price of a jump
 LEAST_JUMP = 1.5 * STEP
+# A plane may lie outside a neighbour's image. Without a score there, chance matches inside beat the true plane.
+UNSEEN = 0.3  # the score where no neighbour shows the patch; noise reaches as much
+ALONE = 0.6  # the second best score where one neighbour shows it, over that one's
 MARGIN = 1e-3  # pixels by which a place may lie outside an image: rounding of the homography
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
 
@@ -55,14 +58,15 @@ def _compiled_costs(
     moments = mean.numpy(), variance.float().numpy()
     padded = cv2.copyMakeBorder(image.numpy(), HALO, HALO, HALO, HALO, cv2.BORDER_REPLICATE)
     neighbours = torch.nn.functional.pad(others, (0, 1, 0, 1)).numpy()
-    compare(threads, padded, *moments, np.float32(VARIANCE), neighbours, homographies.numpy(), costs.numpy())
+    constants = tuple(np.float32(constant) for constant in (VARIANCE, UNSEEN, ALONE))
+    compare(threads, padded, *moments, constants, neighbours, homographies.numpy(), costs.numpy())
     prices = tuple(np.float32(price) for price in (STEP, JUMP * EDGE, EDGE, LEAST_JUMP))
     semi_global(threads, costs.numpy(), image.numpy(), prices, smoothed.numpy())
     return smoothed.permute(2, 0, 1), costs.permute(2, 0, 1)
 
 
 def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
-    """NCC of the patches of each plane and pixel, `(D, H, W)`; 0 where the patch leaves the other image."""
+    """NCC of the patches of each plane and pixel, `(D, H, W)`; -inf where the patch leaves the other image."""
     mean, variance = _moments(image)
     scores = torch.empty(len(homographies), *image.shape)
     for plane, homography in enumerate(homographies):
@@ -70,7 +74,7 @@ def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
         warped_mean, warped_variance = _moments(warped)
         inverse_deviation = ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
         score = (_box(image.double() * warped) - mean * warped_mean) * inverse_deviation
-        scores[plane] = torch.where(_box(inside.float()) > 0.99, score, 0.0)
+        scores[plane] = torch.where(_box(inside.float()) > 0.99, score, -torch.inf)
     return scores
 
 
@@ -109,7 +113,9 @@ def _combine(scores: Iterator[Tensor]) -> Tensor:
         lower = torch.minimum(best, score)
         best = torch.maximum(best, score)
         second = lower if second is None else torch.maximum(second, lower)
-    return best if second is None else 0.75 * best + 0.25 * second
+    if second is not None:
+        best = 0.75 * best + 0.25 * torch.where(second > -torch.inf, second, ALONE * best)
+    return torch.where(best > -torch.inf, best, UNSEEN)
 
 
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:

@@ -4,6 +4,8 @@
     mean, variance          (H, W), of that image over the window around a pixel; the mean is float64
     others                  (N, H + 1, W + 1), the neighbours' images minus the same value; the last row and column
                             have no weight
+    constants               float32: added to variances; the score of a plane on which no neighbour shows the window;
+                            the second best score where one neighbour shows it, over that one's
     homographies            (N, D, 3, 3) float64, from pixels of the image to those of a neighbour
     prices                  float32: of a step by one plane; of a jump without an edge, times the next; the difference
                             of grey values that halves the price of a jump; the least price of a jump
@@ -28,11 +30,11 @@ INFINITY = f32(np.inf)
 DIRECTIONS = [(dy, dx) for dy in (1, -1) for dx in (-1, 0, 1)] + [(0, 1), (0, -1)]  # rows and columns of a step
 
 
-def compare(threads, image, mean, variance, flat, others, homographies, cost):
-    """Write 1 minus the scores of all planes to `cost`; `flat` is added to variances."""
+def compare(threads, image, mean, variance, constants, others, homographies, cost):
+    """Write 1 minus the scores of all planes to `cost`."""
     height, width = mean.shape
     tiles = -(-height // TILE_ROWS) * -(-width // TILE_COLUMNS)
-    over(threads, tiles, compare_tiles, image, mean, variance, flat, others, homographies, cost, pieces=tiles)
+    over(threads, tiles, compare_tiles, image, mean, variance, constants, others, homographies, cost, pieces=tiles)
 
 
 def semi_global(threads, cost, grey, prices, total):
@@ -110,8 +112,9 @@ def warp_row(turn, y, other, begin, end, row, offset):
 
 
 @exact
-def compare_tiles(begin, end, image, mean, variance, flat, others, homographies, cost):
-    """Normalised cross-correlation of windows, tile by tile; 0 where a window leaves the other image."""
+def compare_tiles(begin, end, image, mean, variance, constants, others, homographies, cost):
+    """Normalised cross-correlation of windows, tile by tile, in the images that show the whole window."""
+    flat, unseen, alone = constants
     height, width, planes = cost.shape
     tiles_across = -(-width // TILE_COLUMNS)
     share = 1.0 / SIDE**2
@@ -179,15 +182,20 @@ def compare_tiles(begin, end, image, mean, variance, flat, others, homographies,
                             product = f32(sum_of_seven(s2, x) * share - own_mean[x] * warped_mean)
                             score = product / np.sqrt((own_variance[x] + flat) * (spread + flat))
                             column = np.int32(left) + np.int32(x)
-                            score = score if np.int32(low) <= column <= np.int32(high) else ZERO
+                            score = score if np.int32(low) <= column <= np.int32(high) else -INFINITY
                             lower = score if score < highest[x] else highest[x]
                             highest[x] = highest[x] if score < highest[x] else score
                             other[x] = lower if lower > other[x] else other[x]
-            if len(others) > 1:
-                best *= f32(0.75)
-                second *= f32(0.25)
-                best += second
             for y in range(top, bottom):
+                for p in range(lanes):
+                    highest = best[y - top, p]
+                    other = second[y - top, p]
+                    for x in range(columns):
+                        score = highest[x]
+                        if len(others) > 1:
+                            lower = other[x] if other[x] > -INFINITY else alone * score
+                            score = f32(0.75) * score + f32(0.25) * lower
+                        highest[x] = score if score > -INFINITY else unseen
                 for x in range(columns):
                     out = cost[y, left + x]
                     for p in range(lanes):

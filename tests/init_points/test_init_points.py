@@ -214,7 +214,7 @@ def test_cameras_are_converted_once(planes: Views, monkeypatch: pytest.MonkeyPat
 def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = torch.rand(80, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 5.0])
     alone = torch.tensor([[0.2, 0.1, 3.2]])
-    monkeypatch.setattr("kgs.init_points.find_tracks", lambda *_: exact_tracks(torch.cat([wall, alone])))
+    monkeypatch.setattr("kgs.init_points.depth_limits.find_tracks", lambda *_: exact_tracks(torch.cat([wall, alone])))
     posed = cameras()
     result = initial_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
     assert result.kind == "sift"

@@ -8,7 +8,8 @@ import torch
 from init_point_scenes import cameras
 
 from kgs.geometry import ViewGeometry
-from kgs.init_points.agreement import agreed_points, average_depths
+from kgs.init_points import agreement
+from kgs.init_points.agreement import agreed_pixels, average_depths
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 30, 4.0
@@ -18,16 +19,16 @@ EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 SHARED = (slice(None), slice(5, None))  # of the first view: the second camera sees it 3.5 pixels further left
 
 
+SQUARE = 6  # pixels, the side of a small piece of surface
+
+
 def wall(depth: float) -> DepthMap:
     return DepthMap(torch.full((HEIGHT, WIDTH), depth), torch.ones(HEIGHT, WIDTH), EVERYWHERE)
 
 
 def agreed(maps: list[DepthMap], certain: list[torch.Tensor]) -> torch.Tensor:
     """Which pixels of the first view are kept."""
-    _, pixels = agreed_points(GEOMETRY, maps, certain, 0)
-    kept = torch.zeros_like(EVERYWHERE)
-    kept[pixels[:, 1], pixels[:, 0]] = True
-    return kept
+    return agreed_pixels(GEOMETRY, maps, certain, 0)
 
 
 def test_similar_depths_are_averaged_and_agree_then() -> None:
@@ -60,3 +61,33 @@ def test_depths_that_differ_by_chance_do_not_agree() -> None:
     generator = torch.Generator().manual_seed(0)
     noisy = [DepthMap(2 + 8 * torch.rand(HEIGHT, WIDTH, generator=generator), torch.ones(HEIGHT, WIDTH), EVERYWHERE)]
     assert not agreed([*noisy, wall(DEPTH)], [EVERYWHERE, EVERYWHERE]).any()
+
+
+@pytest.mark.parametrize("confirming", [1, 2])
+def test_a_small_piece_before_its_surroundings_needs_two_other_views(
+    confirming: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agreement, "LEAST_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
+    monkeypatch.setattr(agreement, "AROUND", 3 * SQUARE / WIDTH)
+    beside = cameras(np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]]), turn=0.0, size=(WIDTH, HEIGHT))
+    maps = [wall(DEPTH) for _ in range(3)]
+    for view, shift in enumerate([0, -7, 7][: 1 + confirming]):  # at half the depth twice as far
+        left = 17 + shift
+        maps[view].depths[12 : 12 + SQUARE, left : left + SQUARE] = DEPTH / 2
+    kept = agreed_pixels(ViewGeometry.of(beside), maps, 3 * [EVERYWHERE], 0)
+    inside = kept[13 : 11 + SQUARE, 18 : 16 + SQUARE]
+    assert bool(inside.any()) == bool(inside.all()) == (confirming == 2)
+    assert bool(kept[:8, 8:-8].all())  # the wall
+
+
+def test_small_pieces_at_the_depths_around_them_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(agreement, "LEAST_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
+    monkeypatch.setattr(agreement, "AROUND", 0.5)
+    certain = torch.zeros_like(EVERYWHERE)
+    certain[:10] = True
+    certain[14 : 14 + SQUARE, 20 : 20 + SQUARE] = True
+    depths = torch.ones(HEIGHT, WIDTH) * DEPTH
+    depths[:, 30:] = 3 * DEPTH  # a large piece
+    assert not agreement._strays(depths, certain).any()
+    depths[14:] = DEPTH / 2
+    assert torch.equal(agreement._strays(depths, certain), certain & (torch.arange(HEIGHT) >= 14)[:, None])

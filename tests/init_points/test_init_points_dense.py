@@ -13,11 +13,14 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
-from kgs.init_points import _sweep_range, initial_points
+from kgs.init_points import initial_points
 from kgs.init_points.agreement import AGREEMENT
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points
+from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
 from kgs.init_points.plane_sweep import FARTHEST, _neighbours, planes_wanted, sweep_depths
 from kgs.init_points.sweep_costs import _semi_global
+from kgs.init_points.tracks import Tracks
+from kgs.init_points.triangulate import TrackedPoints
 
 
 @pytest.fixture(scope="module")
@@ -137,9 +140,14 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
 def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:
     geometry = ViewGeometry.of(views.cameras)
     near_camera = torch.linalg.inv(geometry.extrinsics[0]) @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
-    scene = torch.tensor([[0.0, 0.0, 4.0], [0.2, 0.1, 6.0]], dtype=torch.float64)
-    more = torch.cat([scene, near_camera[None, :3]])
-    assert _sweep_range(*geometry.project(more), geometry) == _sweep_range(*geometry.project(scene), geometry)
+    scene = torch.rand(MIN_SIFT, 3, generator=generator(), dtype=torch.float64) + torch.tensor([-0.5, -0.5, 4.0])
+
+    def swept(points: torch.Tensor) -> tuple[float, float]:
+        pixels, depths = geometry.project(points)
+        everywhere = torch.ones(depths.shape, dtype=torch.bool)
+        return sweep_range(TrackedPoints(points, pixels, depths, Tracks(pixels, everywhere)), geometry)
+
+    assert swept(torch.cat([scene, near_camera[None, :3]])) == swept(scene)
 
 
 def test_views_from_one_place_have_no_depth(views: Views) -> None:
