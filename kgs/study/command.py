@@ -41,10 +41,10 @@ def study(
     Args:
         out: folder for the results; fits that its JSONL file has are not repeated.
         preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
-            field hours on the same in full size, field-long on three of them with 10 000 steps; paper is the paper's
-            10 000 steps on every scene there in the size of published tables, for a large machine; beyond measures the
-            default from cameras farther out than the photos', on two built-in scenes in minutes, with KGS_DATA on three
-            more.
+            field hours on the same and more in full size, field-long on three of them with 10 000 steps; paper is the
+            paper's 10 000 steps on every scene there in the size of published tables, for a large machine; beyond
+            measures the default from cameras farther out than the photos', on two built-in scenes in minutes, with
+            KGS_DATA on three more.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the fits instead; they find scenes and weights under
             the same paths.
@@ -84,8 +84,8 @@ def study(
         path = out / "sparse.jsonl"
         do_cell = sparse_cell
         write = write_report
-        if preset == "paper" and data is not None:
-            for setting in presets.too_few_photos(data):
+        if data is not None:
+            for setting in presets.too_few_photos(preset, data):
                 print(f"left out: {setting}")
     same = f"--preset {preset}"
     if steps is not None:

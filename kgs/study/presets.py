@@ -43,6 +43,8 @@ FAMILIES = {
 FORWARD = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3}
 OBJECTS = {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/monstree": 8}
 SCENES = FORWARD | OBJECTS
+# Scenes that the preset "field" has, too, where they are there, each with as many views as it has photos for.
+JOINED = {"colmap/fortress": (3,), "colmap/kitchen": (12, 24), "colmap/fountain": (3, 6)}
 MORE_VIEWS = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
 _FITS: dict[str, dict[str, Any]] = {
@@ -61,8 +63,9 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     Args:
         preset: "quick": the synthetic scene, minutes. "cpu": the six scenes of `SCENES` in a quarter of the pixels of
             504x378, 2000 steps, and the synthetic one to be shown; hours. "field": the six scenes in full size, 2000
-            steps, the default with its own number; hours. "field-long": the first three of them with 10 000 steps, one
-            seed; hours. "paper": 10 000 steps in full size on every scene below `data`; days on a CPU.
+            steps, the default with its own number, more views, and what is there of `JOINED`; hours. "field-long": the
+            first three of them with 10 000 steps; hours. "paper": 10 000 steps in full size on every scene below
+            `data`; days on a CPU.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -170,24 +173,37 @@ def _field(data: Path) -> list[Block]:
     for seed in seeds:
         blocks += [([seed], [scene], ["dense"], auto) for scene in SCENES.items()]
     for seed in seeds:
-        for setting in product(FORWARD, (6, 9)):
+        for setting in (*product(FORWARD, (6, 9)), *_joined(data)):
             blocks += [([seed], [setting], ["dense"], methods) for methods in ((OFF, PAPER), auto)]
     return blocks
 
 
+def _joined(data: Path) -> list[tuple[str, int]]:
+    return [
+        (scene, views)
+        for scene, counts in JOINED.items()
+        for views in counts
+        if (data / scene).is_dir() and views <= _training_photos(data / scene)
+    ]
+
+
 def _field_long(data: Path) -> list[Block]:
     check_scenes(data, FORWARD)
-    return [([0], [scene], ["dense"], (OFF, PAPER, AUTO)) for scene in FORWARD.items()]
+    return [([seed], [scene], ["dense"], (OFF, PAPER, AUTO)) for seed in range(3) for scene in FORWARD.items()]
 
 
-def too_few_photos(data: Path) -> list[str]:
-    """The settings of the preset "paper" that it leaves out, since a scene has fewer photos to train on; sentences."""
+def too_few_photos(preset: str, data: Path) -> list[str]:
+    """The settings that the presets "field" and "paper" leave out for want of photos to train on, as sentences."""
+    wanted: dict[Path, tuple[int, ...]] = {}
+    if preset == "paper":
+        wanted = {path: VIEWS[path.parent.name] for path in _scenes_of_paper(data)}
+    elif preset == "field":
+        wanted = {data / scene: counts for scene, counts in JOINED.items() if (data / scene).is_dir()}
     sentences = []
-    for path in _scenes_of_paper(data):
-        count = _training_photos(path)
-        for views in VIEWS[path.parent.name]:
-            if views > count:
-                sentences.append(f"{path.relative_to(data)} with {views} views: it has {count} photos to train on")
+    for path, counts in wanted.items():
+        there = _training_photos(path)
+        names = f"{path.relative_to(data)} with {{}} views: it has {there} photos to train on"
+        sentences += [names.format(views) for views in counts if views > there]
     return sentences
 
 

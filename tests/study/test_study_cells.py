@@ -72,8 +72,13 @@ def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
     assert {(cell["scene"], cell["views"]) for cell in objects} == {*[*SCENES.items()][3:]}
     assert {cell["seed"] for cell in forward} == {cell["seed"] for cell in objects} == {0, 1, 2}
     assert {cell["method"] for cell in cells[54:90]} == {AUTO, AUTO_OFF}
+    (data / "colmap/fountain").mkdir()
+    more = sparse_cells("field", data)
+    joined = [cell for cell in more if cell not in cells]
+    assert {(cell["scene"], cell["views"]) for cell in joined} == {("colmap/fountain", 3), ("colmap/fountain", 6)}
+    assert {cell["method"] for cell in joined} == {"off", "progressive 0.2", AUTO, AUTO_OFF}
     long = sparse_cells("field-long", data)
-    assert len(long) == 9
+    assert len(long) == 27
     assert {cell["fit"]["steps"] for cell in long} == {10_000}
 
 

@@ -90,7 +90,7 @@ def test_settings_that_a_scene_has_too_few_photos_for_are_left_out_by_name(tmp_p
     scene.mkdir(parents=True)
     write_llff(scene)
     count = len(load_scene(scene, photos=False).train)
-    said = presets.too_few_photos(tmp_path)
+    said = presets.too_few_photos("paper", tmp_path)
     assert said == [
         f"{scene.relative_to(tmp_path)} with {n} views: it has {count} photos to train on" for n in (3, 6, 9)
     ]
