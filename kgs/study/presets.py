@@ -202,8 +202,8 @@ def too_few_photos(preset: str, data: Path) -> list[str]:
     sentences = []
     for path, counts in wanted.items():
         there = _training_photos(path)
-        names = f"{path.relative_to(data)} with {{}} views: it has {there} photos to train on"
-        sentences += [names.format(views) for views in counts if views > there]
+        name = path.relative_to(data)
+        sentences += [f"{name} with {n} views: it has {there} photos to train on" for n in counts if n > there]
     return sentences
 
 

@@ -165,28 +165,6 @@ def test_methods_of_a_seed_begin_with_the_same_points(monkeypatch):
 
 
 @pytest.mark.slow
-def test_methods_that_differ_in_dropping_decide_alike(monkeypatch):
-    drops, configs = [], []
-
-    def decide(scene, plan, choose):
-        drops.append(plan.config.drop)
-        return plan.with_degree(2, {})
-
-    def trainer(scene, plan, first):
-        configs.append(plan.config)
-        raise InterruptedError  # nothing else of the cell is wanted
-
-    monkeypatch.setattr(cells_module, "decide", decide)
-    monkeypatch.setattr(cells_module, "Trainer", trainer)
-    for method in ("auto", "auto, off"):
-        with pytest.raises(InterruptedError):
-            sparse_cell(tiny_cell(method, start="random"))
-    usual = FitConfig().drop
-    assert drops == [usual, usual]
-    assert [(config.drop, config.sh_degree) for config in configs] == [(usual, 2), (0.0, 2)]
-
-
-@pytest.mark.slow
 def test_a_scene_on_the_disk_and_its_own_points(folder):
     cell = tiny_cell(start="scene") | {"scene": folder.name, "views": 4, "downscale": 2.0}
     result = sparse_cell(cell, data=str(folder.parent))
