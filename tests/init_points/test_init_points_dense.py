@@ -13,9 +13,9 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
-from kgs.init_points import initial_points
+from kgs.init_points import dense, initial_points
 from kgs.init_points.agreement import AGREEMENT
-from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points
+from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
 from kgs.init_points.plane_sweep import FARTHEST, _neighbours, planes_wanted, sweep_depths
 from kgs.init_points.sweep_costs import _semi_global
@@ -283,3 +283,15 @@ def test_a_sweep_to_infinity_finds_the_same_depths_where_there_is_no_sky(views: 
         assert float(to.depths.min()) > 0
     points, *_ = dense_points(small, *span, 2000, generator())
     assert float((project_points(points, views.cameras)[1] > 1.5 * span[1]).double().mean()) < 0.005
+
+
+def test_views_are_halved_until_planes_lie_close_together(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+    width = views.images.shape[-1]
+    shift = planes_wanted(views, 2.0, 10.0)
+    monkeypatch.setattr(dense, "SMALLEST", 8)
+    for bound, halvings in ((1.01, 0), (0.99, 1), (0.49, 2)):
+        monkeypatch.setattr(dense, "MOST_SHIFT", bound * shift)
+        assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
+    monkeypatch.setattr(dense, "MOST_SHIFT", math.inf)
+    monkeypatch.setattr(dense, "MOST_PIXELS", views.images[0, 0].numel() // 2)
+    assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2
