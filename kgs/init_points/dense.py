@@ -16,11 +16,12 @@ from kgs.progress import Stage, silent
 
 from .agreement import agreed_pixels, average_depths
 from .patches import PatchColors, patch_colors
-from .plane_sweep import DepthMap, planes_wanted, sweep_depths
+from .plane_sweep import DepthMap, plane_count, planes_wanted, sweep_depths
 
 SCORE = 0.35  # the least matching score of a point; noise reaches 0.3 along a smooth surface
 MOST_PIXELS = 250_000  # of one view
-MOST_PIXELS_OF_ALL = 1_300_000  # of all views together: these bound time and memory
+MOST_PIXELS_OF_ALL = 1_600_000  # of all views together
+MOST_SAMPLES = 350_000_000  # pixels of all views, times the planes of the sweep: bounds its time
 SKY = 2.0  # points farther than this times the scene's largest depth belong to the sky
 PER_SKY = 2  # the least number of points of the scene for each point of the sky
 # Pixels by which an image moves from the nearest plane to the farthest one: planes lie at most two pixels apart.
@@ -76,10 +77,13 @@ def dense_points(
 
 
 def small_enough(views: Views, near: float, far: float) -> Views:
-    """The views, halved until a sweep takes not too much memory, and its planes are at most two pixels apart."""
+    """The views, halved until a sweep takes not too long, and its planes are at most two pixels apart."""
     while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
         views = views.halved()
-    while planes_wanted(views, near, far) > MOST_SHIFT and min(views.images.shape[-2:]) >= 2 * SMALLEST:
+    while min(views.images.shape[-2:]) >= 2 * SMALLEST:
+        shift = planes_wanted(views, near, far)
+        if shift <= MOST_SHIFT and views.images[:, 0].numel() * plane_count(shift) <= MOST_SAMPLES:
+            break
         views = views.halved()
     return views
 

@@ -54,7 +54,7 @@ def sweep_depths(
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
-    planes = min(max(math.ceil(planes_wanted(views, near, far)), PLANES), MOST_PLANES)
+    planes = plane_count(planes_wanted(views, near, far))
     inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
     typical = 1 / float(inverse.mean())
     if to_infinity:
@@ -73,6 +73,11 @@ def sweep_depths(
             unknown = torch.full_like(grey[view], -1.0)
             maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
     return maps
+
+
+def plane_count(wanted: float) -> int:
+    """The number of planes from `near` to `far` where so many are wanted."""
+    return min(max(math.ceil(wanted), PLANES), MOST_PLANES)
 
 
 def planes_wanted(views: Views, near: float, far: float) -> float:

@@ -17,7 +17,7 @@ from kgs.init_points import dense, initial_points
 from kgs.init_points.agreement import AGREEMENT
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
-from kgs.init_points.plane_sweep import FARTHEST, _neighbours, planes_wanted, sweep_depths
+from kgs.init_points.plane_sweep import FARTHEST, _neighbours, plane_count, planes_wanted, sweep_depths
 from kgs.init_points.sweep_costs import _semi_global
 from kgs.init_points.tracks import Tracks
 from kgs.init_points.triangulate import TrackedPoints
@@ -293,5 +293,9 @@ def test_views_are_halved_until_planes_lie_close_together(views: Views, monkeypa
         monkeypatch.setattr(dense, "MOST_SHIFT", bound * shift)
         assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
     monkeypatch.setattr(dense, "MOST_SHIFT", math.inf)
+    samples = views.images[:, 0].numel() * plane_count(shift)
+    for most, halvings in ((samples, 0), (samples - 1, 1)):
+        monkeypatch.setattr(dense, "MOST_SAMPLES", most)
+        assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
     monkeypatch.setattr(dense, "MOST_PIXELS", views.images[0, 0].numel() // 2)
     assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2
