@@ -63,15 +63,21 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
 
 def agreed_pixels(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
     """Which of one view's certain pixels another view and their neighbours confirm, `(H, W)`."""
-    rows, columns = certain[view].nonzero().unbind(1)
-    views = torch.zeros_like(maps[view].depths)  # that confirm a pixel
-    for _, _, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
-        views[rows, columns] += agrees
+    views = confirming_views(geometry, maps, certain, view)
     confirmed = views > 0
     window = (WINDOW, WINDOW)
     counts = cv2.boxFilter(confirmed.float().numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
     agreed = confirmed & (torch.from_numpy(counts) >= SUPPORT)
     return agreed & (~_strays(maps[view].depths, agreed) | (views >= min(2, len(maps) - 1)))
+
+
+def confirming_views(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
+    """The number of other views that agree with each of one view's certain pixels, `(H, W)`."""
+    rows, columns = certain[view].nonzero().unbind(1)
+    views = torch.zeros_like(maps[view].depths)
+    for _, _, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
+        views[rows, columns] += agrees
+    return views
 
 
 def _strays(depths: Tensor, mask: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.geometry import ViewGeometry
-from kgs.init_points.agreement import agreed_pixels, agreeing_views
+from kgs.init_points.agreement import agreed_pixels, confirming_views
 from kgs.init_points.dense import agreed_depths, small_enough
 from kgs.init_points.depth_limits import certain_points, sweep_range
 
@@ -108,14 +108,9 @@ def _confirmed_depths(views: Views, near: float, far: float, chosen: list[int]) 
     """Depths `(V, H, W)` of the chosen views where enough other views confirm them, else 0."""
     geometry = ViewGeometry.of(views.cameras)
     maps, certain = agreed_depths(views, near, far)
-    depths = torch.zeros(len(chosen), *certain[0].shape, dtype=torch.float64)
-    for row, view in enumerate(chosen):
-        pixels = certain[view].nonzero().unbind(1)
-        confirming = sum(agrees.int() for _, _, agrees in agreeing_views(geometry, maps, certain, *pixels, view))
-        depths[row][pixels] = torch.where(
-            torch.as_tensor(confirming) >= CONFIRMED, maps[view].depths[pixels], 0.0
-        ).double()
-    return depths
+    confirmed = [confirming_views(geometry, maps, certain, view) >= CONFIRMED for view in chosen]
+    depths = [torch.where(mask, maps[view].depths, 0.0) for view, mask in zip(chosen, confirmed, strict=True)]
+    return torch.stack(depths).double()
 
 
 def _row(known: Truth) -> Row:
