@@ -127,7 +127,8 @@ class FitConfig:
             COLMAP model, which was refined with the test views too. file: the points of a file.
         init_file: a point cloud (PLY, OBJ, ...) for the init "file".
         init_points: number of points of the init random, and largest number of dense; at least 4. Unless given: of
-            dense one for every 3 pixels whose depth two views agree on, 30 000 to 60 000; of random 30 000.
+            dense one for every 3 pixels whose depth two views agree on, 30 000 to 60 000, or to 90 000 with up to
+            three training views; of random 30 000.
         draw: how dense points are chosen. spread: one from each of as many equal cells of the images. uniform: each
             with the same probability.
         training_background: random: another colour in each step, so that a hole in the splat cannot pass for a surface

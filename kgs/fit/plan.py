@@ -8,6 +8,7 @@ import torch
 
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
+from kgs.init_points.dense import FEW_VIEWS
 from kgs.machine import check_device
 from kgs.types import check_kind
 
@@ -33,7 +34,6 @@ class Pace(NamedTuple):
     opacity_decay: float
 
 
-FEW_VIEWS = 3
 FEW = Pace(900, 0.9925)  # of a fit to so few training views
 MANY = Pace(1100, 0.995)  # of a fit to more
 FADING_STEPS = 1000  # up to so many the pace of few views may be used: in longer fits too much would fade

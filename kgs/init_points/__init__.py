@@ -70,7 +70,7 @@ def initial_points(
             or mesh that trimesh reads, up to 1 GiB.
         seed: of the random draws.
         count: how many points "random" gives, and "dense" at most; >= 1. None: of "dense" one for every 3 pixels with
-            an agreed depth, 30 000 at least and 60 000 at most; of "random" 30 000.
+            an agreed depth, 30 000 at least and 60 000 at most, 90 000 of up to three views; of "random" 30 000.
         pixels: how many pixels all images of the fit have, for a count of None; those of `views` unless given.
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world

@@ -31,6 +31,8 @@ SMALLEST = 64  # pixels, the least side of an image that was halved for this
 PIXELS_OF_A_POINT = 3
 FEWEST = 30_000
 MOST = 60_000
+FEW_VIEWS = 3
+MOST_OF_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
 
 
 def dense_points(
@@ -52,7 +54,7 @@ def dense_points(
     all agreed patches.
 
     A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
-    `MOST`, in images that have together `pixels` pixels, or those of the views.
+    `MOST` (`MOST_OF_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
     where the pixels of both views are usable.
@@ -65,7 +67,8 @@ def dense_points(
     points, colors, places = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
-        count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), MOST)
+        most = MOST_OF_FEW_VIEWS if len(views) <= FEW_VIEWS else MOST
+        count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), most)
     view, x, y = places.unbind(1)
     is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
     chosen = torch.randperm(len(points), generator=generator)

@@ -18,7 +18,7 @@ from tiny_scenes import narrow_lpips
 
 from kgs.fit.config import DETAILS, PRESETS, FitConfig
 from kgs.fit.plan import with_pace
-from kgs.init_points.dense import FEWEST, MOST, PIXELS_OF_A_POINT
+from kgs.init_points.dense import FEWEST, MOST, MOST_OF_FEW_VIEWS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
 
 ROOT = Path(__file__).parents[2]
@@ -97,19 +97,20 @@ NUMBERS = [
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [AUTO.drop, AUTO.undropped_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
-    ("docs/comparison.md", "initial points, of which there are # to #", [FEWEST, MOST]),
+    ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MOST_OF_FEW_VIEWS]),
     ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
     ("docs/measured.md", "the default from # to #, then", [FEWEST, MOST]),
     ("docs/measured.md", "default, for # steps with three views and # with more", STEPS_OF_BOTH),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
     ("docs/command.md", "# to #, one for every # pixels", [FEWEST, MOST, PIXELS_OF_A_POINT]),
-    ("docs/command.md", "known depth | #, up to three photos # |", [MANY.steps, FEW.steps]),
+    ("docs/command.md", "three photos to # | #, up to three photos # |", [MOST_OF_FEW_VIEWS, MANY.steps, FEW.steps]),
     ("docs/command.md", "| high | # | # |", [HIGH.size, HIGH.entries["init_points"]]),
     ("docs/recipe.md", "times # (up to three", [FEW.recipe.opacity_decay]),
     ("docs/recipe.md", "or # after every step, from # % of", [MANY.recipe.opacity_decay, 100 * AUTO.recipe.decay_from]),
     ("docs/recipe.md", "| steps | #, here # | # for up", [PAPER.recipe.steps, PAPER.steps, FEW.steps]),
     ("docs/recipe.md", "| initial points | # of", [PAPER.init_points]),
     ("docs/recipe.md", "every # pixels on whose depth two views agree, # to #", [PIXELS_OF_A_POINT, FEWEST, MOST]),
+    ("docs/recipe.md", "(up to three photos to #), each", [MOST_OF_FEW_VIEWS]),
     ("docs/recipe.md", "| scales #, quaternions # | scales", [PAPER.recipe.lr_scales, PAPER.recipe.lr_quats]),
     ("docs/recipe.md", "| scales #, quaternions # | in", [AUTO.recipe.lr_scales, AUTO.recipe.lr_quats]),
     ("docs/recipe.md", "L1 + # (1 - SSIM) | L1 + # (1", [PAPER.recipe.dssim_weight, AUTO.recipe.dssim_weight]),
