@@ -85,16 +85,16 @@ FOLDERS = {  # what is in them, and what is said of it
         ("clip.MOV is a video", 'ffmpeg -i "clip.MOV"', "3 to 12 sharp ones"),
     ),
     "one twice": (
-        lambda at: save(at, [*planes(), planes()[1]]),
-        ("3.png: is the same photo as 1.png: remove one of them",),
+        lambda at: save(at, [*planes()[:2], planes()[1]]),
+        ("2.png: is the same photo as 1.png: remove one of them",),
     ),
     "upright and lying": (
-        lambda at: save(at, [*planes(), planes()[0].transpose(1, 0, 2)]),
-        ("2 (240x180: 0.png, 1.png, 2.png; 180x240: 3.png)", "all upright or all lying"),
+        lambda at: save(at, [*planes()[:2], *planes()[:2].transpose(0, 2, 1, 3)]),
+        ("2 (240x180: 0.png, 1.png; 180x240: 2.png, 3.png)",),
     ),
     "cropped": (
-        lambda at: save(at, [*planes(), planes()[0][:120]]),
-        ("expected photos of one shape, got 2", "240x120: 3.png", "Cropped"),
+        lambda at: save(at, [*planes()[:2], planes()[0][:120]]),
+        ("expected photos of one shape, got 2", "240x120: 2.png", "Cropped"),
     ),
 }
 SLOW_FOLDERS = {
@@ -117,8 +117,7 @@ SLOW_FOLDERS = {
 def test_what_a_folder_holds_instead_is_told(tmp_path, refused, kind):
     fill, said = (FOLDERS | SLOW_FOLDERS)[kind]
     fill(tmp_path / "photos")
-    text = refused(tmp_path / "photos", *said)
-    assert kind != "cropped" or "upright" not in text
+    refused(tmp_path / "photos", *said)
 
 
 def test_a_video_alone_is_told(folder, refused):
@@ -330,7 +329,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
 NOT_FOUND = "kgs: stopped: the cameras were not found yet, and nothing was written\n"
 
 
-@pytest.mark.parametrize("stage", ["pose.write_images", "pose.write_matches"])
+@pytest.mark.parametrize("stage", ["pose.write_images", "agree.write_matches"])
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [(OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, NOT_FOUND)],

@@ -21,7 +21,7 @@ FEWEST_POINTS = 50  # that each photo sees
 MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
 MOST_RATIO = 1.15  # of their focal lengths
 LEAST_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
-_SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
+SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
 _WITHOUT = "A fit without some photos: take them out of the folder"
 _FORWARD = (
@@ -44,7 +44,7 @@ def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> l
         return ["no pair of photos gave a first guess of the cameras"]
     reasons = []
     ratio = cameras.focal / longest
-    if missing := [name for name in names if name not in cameras.points]:
+    if missing := _missing(cameras, names):
         reasons.append(f"{len(missing)} of {len(names)} photos could not be placed: {', '.join(missing)}")
     if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]:
         limits = f"{FOCAL_RANGE[0]:g} to {FOCAL_RANGE[1]:g}"
@@ -62,9 +62,15 @@ def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str
     worst = (0.0, ("", ""))
     for pair in combinations(sorted({*first.rotations, *second.rotations}), 2):
         known = all(name in cameras.rotations for name in pair for cameras in (first, second))
-        angle = _angle(first, second, pair) if known else 180.0
+        angle = angle_between(first, second, pair) if known else 180.0
         worst = max(worst, (angle, pair))
     return worst
+
+
+def angle_between(first: Cameras, second: Cameras, pair: tuple[str, str]) -> float:
+    """The angle between two solvers' rotations from one camera to another, in degrees."""
+    both = [cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T for cameras in (first, second)]
+    return float(degrees_between(*map(torch.from_numpy, both)))
 
 
 def focal_doubt(solutions: Sequence[Cameras]) -> str:
@@ -108,11 +114,11 @@ def judge(
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = [cameras for cameras, against in zip(solutions, reasons, strict=True) if cameras and not against]
     if not good:
-        raise DataError(folder, "", refusal(reasons[0], names, pairs, forward))
+        raise DataError(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
     for cameras in solutions:  # nothing confirms a photo that only one solver placed
-        if missing := [name for name in names if cameras is None or name not in cameras.points]:
+        if missing := _missing(cameras, names):
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
-            raise DataError(folder, "", refusal([reason], names, pairs, forward))
+            raise DataError(folder, "", refusal([reason], names, pairs, forward, missing))
     both = [cameras for cameras in solutions if cameras]
     if doubt := focal_doubt(both):
         raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
@@ -150,6 +156,26 @@ def weakest_link(names: Sequence[str], pairs: Pairs) -> tuple[str, str]:
     return weakest
 
 
+def gap(name: str, others: Sequence[str], pairs: Pairs) -> tuple[str, str]:
+    """The photos beside a gap: one that could not be placed, and that of the others with most matches.
+
+    `others` are in the order in which they were taken; where none matches, the one taken next to it counts.
+    """
+    in_order = sorted([*others, name])
+    place = in_order.index(name)
+
+    def closeness(other: str) -> tuple[int, int]:
+        return matches_of(pairs, name, other), -abs(in_order.index(other) - place)
+
+    nearest = max(others, key=closeness)
+    return (name, nearest) if in_order.index(nearest) > place else (nearest, name)
+
+
+def matches_of(pairs: Pairs, one: str, other: str) -> int:
+    """The verified matches of two photos."""
+    return pairs.get((one, other), pairs.get((other, one), 0))
+
+
 def table(names: Sequence[str], pairs: Pairs) -> str:
     """Verified matches of each pair, a row and a column for each photo."""
     width = max(4, *(len(str(count)) for count in pairs.values()))
@@ -167,7 +193,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         pairs: verified matches of each pair.
         geometries: what the matches of each overlapping pair say about depth.
     """
-    if twins := [pair for pair, geometry in geometries.items() if geometry.shift < _SAME_PLACE]:
+    if twins := [pair for pair, geometry in geometries.items() if geometry.shift < SAME_PLACE]:
         one, other = twins[0]
         return (
             f"{one} and {other} match at the same pixels: either they show the same from the same place, so remove one "
@@ -209,11 +235,17 @@ def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs, forward: bool 
     )
 
 
-def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs, forward: bool = False) -> str:
-    """The error message for cameras that cannot be trusted: the reasons, and what to photograph next."""
+def refusal(
+    reasons: Iterable[str], names: Sequence[str], pairs: Pairs, forward: bool = False, missing: Sequence[str] = ()
+) -> str:
+    """The error message for cameras that cannot be trusted: the reasons, and what to photograph next.
+
+    Photos are advised from beside the first of those that are `missing`, else where fewest matches hold them together.
+    """
     if forward:
         return f"no cameras that can be trusted: {'; '.join(reasons)}. {_FORWARD}. {_WITHOUT}.\n{table(names, pairs)}"
-    between = " and ".join(weakest_link(names, pairs))
+    placed = [name for name in names if name not in missing]
+    between = " and ".join(gap(missing[0], placed, pairs) if missing and placed else weakest_link(names, pairs))
     return (
         f"no cameras that can be trusted: {'; '.join(reasons)}. What helps most: photos from places between {between}, "
         "with steps to the side or up (turning on the spot shows no depth), so that neighbours share two thirds of the "
@@ -222,12 +254,11 @@ def refusal(reasons: Iterable[str], names: Sequence[str], pairs: Pairs, forward:
     )
 
 
+def _missing(cameras: Cameras | None, names: Sequence[str]) -> list[str]:
+    """The photos that a solver did not place."""
+    return [name for name in names if cameras is None or name not in cameras.points]
+
+
 def _row(name: str, names: Sequence[str], pairs: Pairs, width: int) -> str:
-    cells = ("." if name == other else pairs.get((name, other), pairs.get((other, name), 0)) for other in names)
+    cells = ("." if name == other else matches_of(pairs, name, other) for other in names)
     return "".join(f" {cell:>{width}}" for cell in cells)
-
-
-def _angle(first: Cameras, second: Cameras, pair: tuple[str, str]) -> float:
-    """The angle between two solvers' rotations from one camera to another, in degrees."""
-    both = [cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T for cameras in (first, second)]
-    return float(degrees_between(*map(torch.from_numpy, both)))

@@ -125,7 +125,7 @@ def solve(
         images: the folder of the photos.
         work: a folder for what the mapper writes.
         seed: of its random choices.
-        names: the photos' names by those of the images in the database.
+        names: the names of the photos to place, by those of the images in the database.
         focal: the focal length in pixels if it is known; None: it is adjusted.
     """
     best = None
@@ -135,7 +135,7 @@ def solve(
         lens.focal_length = focal or lens.focal_length
         for _ in range(_ROUNDS):
             file.update_camera(lens)
-            scene = _map(pycolmap, database, images, work, seed, focal is None)
+            scene = _map(pycolmap, database, images, work, list(names), seed, focal is None)
             if scene is None or (best is not None and _is_worse(scene, best)):
                 break
             best, error = _adjust(scene, focal)
@@ -163,12 +163,13 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     )
 
 
-def _map(pycolmap: Any, database: Path, images: Path, work: Path, seed: int, free: bool) -> Any:
+def _map(pycolmap: Any, database: Path, images: Path, work: Path, names: list[str], seed: int, free: bool) -> Any:
     """The reconstruction of most photos with the lens of the database; None if no pair can be placed.
 
     If `free`, the second attempt adjusts the focal length while it places photos.
     """
     options = pycolmap.IncrementalPipelineOptions()
+    options.image_names = names
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     options.multiple_models = False

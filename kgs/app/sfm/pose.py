@@ -3,7 +3,6 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from os import PathLike
@@ -16,32 +15,21 @@ import torch
 from kgs.app.console import say
 from kgs.app.files.outputs import png_names
 from kgs.app.files.results_folder import locked, photo_staging
-from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 from kgs.progress import Stage, silent
 
-from .aside import Aside, check_space
+from .agree import agreed_cameras, say_left_out
+from .aside import check_space
 from .find import find_photos
-from .gates import (
-    FEWEST_POINTS,
-    FOCAL_RANGE,
-    LEAST_RISE,
-    MOST_DEGREES,
-    MOST_RATIO,
-    focal_difference,
-    focal_doubt,
-    is_forward,
-    judge,
-    why_no_cameras,
-)
-from .map import Cameras, lens_of_scene, pair_geometries, quiet_pycolmap, solve, verified
-from .match import exif_focal, lens_of, write_matches
+from .gates import FEWEST_POINTS, FOCAL_RANGE, LEAST_RISE, MOST_DEGREES, MOST_RATIO
+from .leave_out import unlike_others
+from .map import Cameras, lens_of_scene, quiet_pycolmap
+from .match import exif_focal
 from .place import IMAGES, MODEL, REPORT, check_place, is_reusable
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .write import level_and_scale, write_images, write_model
 
-SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
 SETTINGS = 5  # increased by every change after which the same photos give other files
 
 
@@ -73,11 +61,11 @@ def pose_photos(
         say: called with each line for the user.
 
     Returns:
-        The content of photos.json: "photos" by file name, "matches" of each pair, "size" (width, height), "photo_size"
-        (that of the smallest photo before it was reduced), "focal_px", "focal_rise" (by what share squared errors grow
-        if the focal length is a quarter off; None if it was held at that of the Exif), "radial_distortion", "points",
-        "reprojection_error_px", "agreement_degrees", "gates", "seconds" and others; "reused": whether a former run
-        wrote it; and "folder": where the scene is.
+        The content of photos.json: "photos" by file name, "left_out" (those without cameras, and why), "matches" of
+        each pair, "size" (width, height), "photo_size" (that of the smallest photo before it was reduced), "focal_px",
+        "focal_rise" (by what share squared errors grow if the focal length is a quarter off; None if it was held at
+        that of the Exif), "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates",
+        "seconds" and others; "reused": whether a former run wrote it; and "folder": where the scene is.
 
     Raises:
         DataError: the folder holds no photos that fit together, or their cameras cannot be trusted; the message says
@@ -108,15 +96,17 @@ def pose_photos(
             new = staging.unfinished
             staging.start()
             try:
-                report = find_cameras(opened, new, seed % 2**31, stage, say)
-                write_json(new / REPORT, inputs | report)
+                write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, stage, say))
                 staging.seal()
             finally:
                 shutil.rmtree(new, ignore_errors=True)
         if not (wait and (out / "splat.ply").exists()):
             staging.complete()
         posed = waiting if staging.is_waiting else out
-        return {**read_json(posed / REPORT), "reused": place is not None, "folder": str(posed)}
+        report = read_json(posed / REPORT)
+        if place is not None:
+            say_left_out(report.get("left_out", {}), say)
+        return {**report, "reused": place is not None, "folder": str(posed)}
 
 
 def find_cameras(
@@ -127,10 +117,11 @@ def find_cameras(
     Raises:
         DataError: the photos do not fit together, or their cameras cannot be trusted.
     """
-    seconds = dict[str, float]()
-    lap = _clock()
-    folder = opened[0].path.parent
-    names = [photo.path.name for photo in opened]
+    seconds, lap = _clock()
+    unlike = unlike_others(opened)
+    say_left_out(unlike, say)
+    opened = [photo for photo in opened if photo.name not in unlike]
+    names = [photo.name for photo in opened]
     work = new / "work"
     images = new / IMAGES
     for path in (images, work):
@@ -141,63 +132,26 @@ def find_cameras(
         if unsharp:
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
         png = png_names(names)
-        image_names = list(png.values())
         photo_names = {image: name for name, image in png.items()}
-        write_images(images, photos, image_names)
-        bare = images
-        if not all(photo.is_opaque for photo in photos):  # COLMAP would find keypoints in what alpha hides
-            bare = work / "opaque"
-            bare.mkdir()
-            write_images(bare, photos, image_names, opaque=True)
-        seconds["photos"] = lap()
-        first = work / "first.db"
-        second = work / "second.db"
-        with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
-            lens = lens_of(photos)
-            second_matches = executor.submit(
-                aside.run,
-                "write_colmap_matches",
-                second,
-                images=str(bare),
-                names=image_names,
-                lens=lens.params_to_string() if lens.has_prior_focal_length else None,
-                seed=seed,
-            )
-            write_matches(first, photos, image_names, stage)
-            aside.run("verify", first, seed=seed)
-            pairs = verified(first, photo_names)
-            seconds["matches"] = lap()
-            geometries = pair_geometries(first, photo_names)
-            if reason := why_no_cameras(names, pairs, geometries):
-                raise DataError(folder, "", reason)
-
-            def solve_second() -> Cameras | None:
-                second_matches.result()
-                return solve(second, images, work / "second", seed, photo_names)
-
-            second_cameras = executor.submit(solve_second)
-            solutions = [solve(first, images, work / "first", seed, photo_names)]
-            seconds["cameras"] = lap()
-            solutions.append(second_cameras.result())
-        placed = [cameras for cameras in solutions if cameras]
-        held = None
-        if placed and (focal_doubt(placed) or focal_difference(placed)):
-            held = exif_focal(photos)
-        if held:
-            say(f"the photos do not tell the focal length; the Exif says {held:.0f} pixels, and that is taken")
-            solutions = [solve(matches, images, work / "held", seed, photo_names, held) for matches in (first, second)]
-        seconds["second solver"] = lap()
-        chosen, degrees = judge(folder, solutions, names, max(photos[0].size), pairs, forward=is_forward(geometries))
+        write_images(images, photos, list(png.values()))
+        lap("photos")
+        found = agreed_cameras(photos, images, work, photo_names, seed, stage, lap, say)
+        for name in found.left_out:
+            (images / png[name]).unlink()
+        if found.held:
+            say(f"the photos do not tell the focal length; the Exif says {found.held:.0f} pixels, and that is taken")
+        photos = [photo for photo in photos if photo.path.name not in found.left_out]
+        chosen = found.cameras
         level_and_scale(chosen)
         write_model(new / MODEL, chosen, images)
         shutil.rmtree(work)
-        seconds["files"] = lap()
+        lap("files")
     error = float(chosen.reconstruction.compute_mean_reprojection_error())
     say(f"cameras: {len(photos)} photos placed, {chosen.reconstruction.num_points3D()} points, {error:.2f} pixels off")
     return {
         **_lens(chosen, photos),
         "photo_size": list(min(photo.size for photo in opened)),
-        "focal_rise": None if held else chosen.focal_rise,
+        "focal_rise": None if found.held else chosen.focal_rise,
         "photos": {
             photo.path.name: {
                 "image": png[photo.path.name],
@@ -207,11 +161,12 @@ def find_cameras(
             }
             for photo in photos
         },
-        "matches": [[*pair, count] for pair, count in pairs.items()],
+        "left_out": unlike | found.left_out,
+        "matches": [[*pair, count] for pair, count in found.pairs.items()],
         "points": chosen.reconstruction.num_points3D(),
         "reprojection_error_px": error,
-        "solver": SOLVERS[solutions.index(chosen)],
-        "agreement_degrees": degrees,
+        "solver": found.solver,
+        "agreement_degrees": found.degrees,
         "gates": {
             "focal_over_longer_side": list(FOCAL_RANGE),
             "least_points_of_a_photo": FEWEST_POINTS,
@@ -238,18 +193,18 @@ def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
     }
 
 
-def _clock() -> Callable[[], float]:
-    """A function that gives the seconds since its last call."""
+def _clock() -> tuple[dict[str, float], Callable[[str], None]]:
+    """The seconds of each part, and a function that is called with a part's name at its end."""
+    seconds = dict[str, float]()
     last = time.perf_counter()
 
-    def lap() -> float:
+    def lap(part: str) -> None:
         nonlocal last
         now = time.perf_counter()
-        seconds = round(now - last, 2)
+        seconds[part] = round(now - last, 2)
         last = now
-        return seconds
 
-    return lap
+    return seconds, lap
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 from kgs.progress import Stage
 
-from .find import CONVERT, listed
+from .find import CONVERT
 
 LONGEST = 1600  # pixels of the longer side, for matching and for what is written
 FILM_DIAGONAL = math.hypot(36, 24)  # mm
@@ -87,6 +87,16 @@ class OpenPhoto(NamedTuple):
     size: tuple[int, int]  # width and height of the upright photo
     image: ImageFile
 
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.path.name
+
+    @property
+    def focal_ratio(self) -> float | None:
+        """The focal length over the longer side that Exif gives, None if it does not."""
+        return self.exif.focal_ratio(*self.size)
+
 
 @dataclass(frozen=True, eq=False)
 class Photo:
@@ -127,17 +137,9 @@ def open_photos(paths: list[Path]) -> list[OpenPhoto]:
     """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
 
     Raises:
-        DataError: a file cannot be read or is not a photo, or two files are the same photo.
+        DataError: a file cannot be read or is not a photo.
     """
-    photos: dict[str, OpenPhoto] = {}
-    for path in paths:
-        photo = _open(path)
-        if photo.sha256 in photos:
-            other = photos[photo.sha256].path.name
-            reason = f"is the same photo as {other}: remove one of them. A second look needs a second place"
-            raise DataError(path, "", reason)
-        photos[photo.sha256] = photo
-    return list(photos.values())
+    return [_open(path) for path in paths]
 
 
 def _open(path: Path) -> OpenPhoto:
@@ -154,16 +156,14 @@ def _open(path: Path) -> OpenPhoto:
 def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     """Decode photos, turn them as their Exif says, and reduce them to the size of the smallest or to 1600 pixels.
 
+    The photos have one shape.
+
     Raises:
-        DataError: a photo cannot be decoded, the photos have several shapes, or were taken at several focal lengths.
+        DataError: a photo cannot be decoded.
     """
-    paths = [photo.path for photo in opened]
-    sizes = [photo.size for photo in opened]
-    _check_shapes(paths, sizes)
-    width, height = min(sizes)
+    width, height = min(photo.size for photo in opened)
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    _check_lenses(paths, [photo.exif.focal_ratio(*size) for photo in opened], size)
     photos = []
     for photo in stage(opened, "photos", "photo"):
         pixels = photo.image.read()
@@ -187,26 +187,27 @@ def _sharpness(grey: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(values, cv2.CV_32F).std() / (cv2.GaussianBlur(values, (0, 0), 4.0).std() + 1.0))
 
 
-def _check_shapes(paths: list[Path], sizes: list[tuple[int, int]]) -> None:
-    groups: dict[tuple[int, int], list[Path]] = defaultdict(list)
-    for path, (width, height) in zip(paths, sizes, strict=True):
-        known = (size for size in groups if Intrinsics(*size, 1, 1, 0, 0).same_aspect(width, height))
-        groups[next(known, (width, height))].append(path)
-    if len(groups) > 1:
-        shapes = "; ".join(f"{width}x{height}: {listed(group)}" for (width, height), group in groups.items())
-        reason = f"expected photos of one shape, got {len(groups)} ({shapes}). Keep one group in the folder"
-        if any(size[::-1] in groups for size in groups):
-            reason += ", or take all upright or all lying: cameras of both cannot share one lens yet"
-        raise DataError(paths[0].parent, "", f"{reason}. Cropped photos do not fit those that are whole")
+def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
+    """The photos by their shape, as "4032x3024": that of the first of each group."""
+    groups: dict[tuple[int, int], list[OpenPhoto]] = defaultdict(list)
+    for photo in photos:
+        known = (size for size in groups if Intrinsics(*size, 1, 1, 0, 0).same_aspect(*photo.size))
+        groups[next(known, photo.size)].append(photo)
+    return {f"{width}x{height}": group for (width, height), group in groups.items()}
 
 
-def _check_lenses(paths: list[Path], ratios: list[float | None], size: tuple[int, int]) -> None:
-    known = sorted((ratio, path) for ratio, path in zip(ratios, paths, strict=True) if ratio)
-    if known and known[-1][0] > _SAME_ZOOM * known[0][0]:
-        to_film = FILM_DIAGONAL * max(size) / float(np.hypot(*size))
-        lenses: dict[int, list[Path]] = defaultdict(list)
-        for ratio, path in known:
-            lenses[round(ratio * to_film)].append(path)
-        groups = "; ".join(f"{film} mm: {listed(group)}" for film, group in lenses.items())
-        reason = f"expected photos of one focal length, got {len(lenses)} (as on 35 mm film, {groups})"
-        raise DataError(paths[0].parent, "", f"{reason}. Take all with one lens and without zoom")
+def by_lens(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
+    """The photos by the focal length of their Exif, as "28 mm" on 35 mm film; those without one are in no group.
+
+    A group's focal lengths differ by at most 10 %.
+    """
+    groups = dict[str, list[OpenPhoto]]()
+    shortest = 0.0
+    for ratio, photo in sorted(((p.focal_ratio, p) for p in photos if p.focal_ratio), key=lambda pair: pair[0]):
+        if ratio > _SAME_ZOOM * shortest:
+            shortest = ratio
+            group = list[OpenPhoto]()
+            film = ratio * FILM_DIAGONAL * max(photo.size) / math.hypot(*photo.size)
+            groups[f"{film:.0f} mm"] = group
+        group.append(photo)
+    return groups

@@ -1,0 +1,142 @@
+"""Cameras that two solvers agree on: matches them, solves twice, leaves out unsuitable photos, and asks the gates."""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from kgs.errors import DataError
+from kgs.progress import Stage
+
+from .aside import Aside
+from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
+from .leave_out import without_cameras, without_overlap
+from .map import Cameras, pair_geometries, quiet_pycolmap, solve, verified
+from .match import exif_focal, lens_of, write_matches
+from .read import Photo
+from .write import write_images
+
+SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
+
+
+class Agreed(NamedTuple):
+    """The cameras that passed the gates."""
+
+    cameras: Cameras
+    solver: str  # whose they are
+    degrees: float  # the largest difference between two solvers
+    held: float | None  # focal length of the Exif, in pixels, where the photos do not tell it
+    pairs: Pairs  # verified matches of each pair of all photos
+    left_out: dict[str, str]  # photos without cameras, and why
+
+
+def agreed_cameras(
+    photos: list[Photo],
+    images: Path,
+    work: Path,
+    names: Mapping[str, str],
+    seed: int,
+    stage: Stage,
+    lap: Callable[[str], None],
+    say: Callable[[str], None],
+) -> Agreed:
+    """The cameras of as many photos as two solvers agree on.
+
+    Args:
+        photos: the photos, all of one size.
+        images: the folder where they are as PNGs.
+        work: a folder for what the solvers write.
+        names: the names of the photos by those of the PNGs, in the order of `photos`.
+        seed: of the solvers.
+        stage: shows how far the work is.
+        lap: called with the name of each part at its end.
+        say: called with each line for the user.
+
+    Raises:
+        DataError: the photos do not fit together, or not even three cameras can be trusted.
+    """
+    folder = photos[0].path.parent
+    first = work / "first.db"
+    second = work / "second.db"
+    lens = lens_of(photos)
+    with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
+        second_matches = executor.submit(
+            aside.run,
+            "write_colmap_matches",
+            second,
+            images=str(_without_alpha(photos, images, work, names)),
+            names=list(names),
+            lens=lens.params_to_string() if lens.has_prior_focal_length else None,
+            seed=seed,
+        )
+        write_matches(first, photos, list(names), stage)
+        aside.run("verify", first, seed=seed)
+        pairs = verified(first, names)
+        lap("matches")
+        geometries = pair_geometries(first, names)
+        left_out = without_overlap(list(names.values()), pairs, geometries)
+        kept = {image: name for image, name in names.items() if name not in left_out}
+        geometries = {pair: geometry for pair, geometry in geometries.items() if left_out.keys().isdisjoint(pair)}
+        if reason := why_no_cameras(list(kept.values()), pairs, geometries):
+            raise DataError(folder, "", reason)
+        solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focal(photos), executor)
+        solutions, held = solvers.solve(kept)
+        while doubtful := without_cameras(solutions, list(kept.values()), pairs):
+            left_out |= doubtful
+            kept = {image: name for image, name in kept.items() if name not in left_out}
+            solutions, held = solvers.solve(kept)
+        lap("cameras")
+    say_left_out(left_out, say)
+    longest = max(photos[0].size)
+    forward = is_forward(geometries)
+    cameras, degrees = judge(folder, solutions, list(kept.values()), longest, pairs, forward=forward)
+    return Agreed(cameras, SOLVERS[solutions.index(cameras)], degrees, held, pairs, left_out)
+
+
+def say_left_out(left_out: Mapping[str, str], say: Callable[[str], None]) -> None:
+    """Say which photos are left out, and why, a line each."""
+    for name, why in left_out.items():
+        say(f"left out: {name}: {why}")
+
+
+@dataclass(frozen=True)
+class _Solvers:
+    """Two solvers with their matches; the second one works in the executor's only thread."""
+
+    databases: tuple[Path, Path]
+    second_matches: "Future[None]"
+    images: Path
+    work: Path
+    seed: int
+    exif_focal: float | None
+    executor: ThreadPoolExecutor
+
+    def solve(self, names: Mapping[str, str]) -> tuple[list[Cameras | None], float | None]:
+        """What each solver finds, and the focal length of the Exif if the photos do not tell it.
+
+        `names` are those of the photos to place, by those of their images.
+        """
+        second = self.executor.submit(self._solve_second, names)
+        solutions = [self._solve(0, "first", names), second.result()]
+        placed = [cameras for cameras in solutions if cameras]
+        if self.exif_focal is None or not placed or not (focal_doubt(placed) or focal_difference(placed)):
+            return solutions, None
+        return [self._solve(solver, "held", names, self.exif_focal) for solver in (0, 1)], self.exif_focal
+
+    def _solve_second(self, names: Mapping[str, str]) -> Cameras | None:
+        self.second_matches.result()
+        return self._solve(1, "second", names)
+
+    def _solve(self, solver: int, work: str, names: Mapping[str, str], focal: float | None = None) -> Cameras | None:
+        return solve(self.databases[solver], self.images, self.work / work, self.seed, names, focal)
+
+
+def _without_alpha(photos: list[Photo], images: Path, work: Path, names: Mapping[str, str]) -> Path:
+    """The folder of the photos over black: COLMAP would find keypoints in what alpha hides."""
+    if all(photo.is_opaque for photo in photos):
+        return images
+    opaque = work / "opaque"
+    opaque.mkdir()
+    write_images(opaque, photos, list(names), opaque=True)
+    return opaque

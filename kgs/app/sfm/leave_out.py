@@ -1,0 +1,146 @@
+"""Decides which photos are left out, so that one unsuitable photo does not stop the others.
+
+A photo is left out if it is a copy, or of another shape or lens than most; if it shows another place, or the same from
+the same place as another one; or if its camera cannot be trusted: each solver has to place it, it has to see enough
+points, and both have to agree about it. At least three photos remain, or nothing is left out and the gates refuse all.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+from kgs.errors import DataError
+
+from .find import FEWEST, listed
+from .gates import FEWEST_POINTS, MOST_DEGREES, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
+from .map import Cameras, PairGeometry
+from .read import OpenPhoto, by_lens, by_shape
+
+
+def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
+    """Photos that are copies, or of another shape or focal length than most, and why.
+
+    Raises:
+        DataError: there are fewer than `FEWEST` photos without copies, or no shape or focal length is that of most.
+    """
+    folder = photos[0].path.parent
+    first = {photo.sha256: photo.name for photo in reversed(photos)}
+    copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
+    left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
+    if copied and len(photos) - len(left) < FEWEST:
+        name, other = next(iter(copied.items()))
+        reason = f"is the same photo as {other}: remove one of them. A second look needs a second place"
+        raise DataError(photos[0].path.with_name(name), "", reason)
+    photos = [photo for photo in photos if photo.name not in left]
+    shapes = by_shape(photos)
+    if (usual := _usual(shapes)) is None:
+        groups = _listed(shapes)
+        reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
+        raise DataError(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
+    left |= _others(shapes, usual, "its shape is {}, not {}: it is cropped, or by another camera")
+    lenses = by_lens(shapes[usual])
+    if lenses and (usual := _usual(lenses)) is None:
+        groups = _listed(lenses)
+        reason = f"expected photos of one focal length, got {len(lenses)} (as on 35 mm film, {groups})"
+        raise DataError(folder, "", f"{reason}. Take all with one lens and without zoom")
+    return left | _others(lenses, usual, "its focal length is {}, not {}, as on 35 mm film")
+
+
+def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
+    """The largest group if it has at least `FEWEST` photos, or is the only one, and is larger than any other."""
+    sizes = sorted((len(group) for group in groups.values()), reverse=True)
+    if len(sizes) > 1 and (sizes[0] < FEWEST or sizes[0] == sizes[1]):
+        return None
+    return max(groups, key=lambda name: len(groups[name]))
+
+
+def _others(groups: Mapping[str, list[OpenPhoto]], usual: str | None, why: str) -> dict[str, str]:
+    return {photo.name: why.format(name, usual) for name, group in groups.items() if name != usual for photo in group}
+
+
+def _listed(groups: Mapping[str, list[OpenPhoto]]) -> str:
+    return "; ".join(f"{name}: {listed([photo.path for photo in group])}" for name, group in groups.items())
+
+
+def without_overlap(
+    names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]
+) -> dict[str, str]:
+    """Photos that cannot help, by their matches alone, and why.
+
+    The second of two photos from one place, and photos outside the largest group that overlapping pairs connect, if
+    that is larger than any other.
+
+    Args:
+        names: the names of all photos.
+        pairs: verified matches of each pair.
+        geometries: what the matches of each overlapping pair say about depth.
+    """
+    left = {
+        second: f"it shows the same from the same place as {first}"
+        for (first, second), geometry in geometries.items()
+        if geometry.shift < SAME_PLACE
+    }
+    kept = [name for name in names if name not in left]
+    groups = groups_of(kept, pairs)
+    if len(groups) > 1 and len(groups[0]) > len(groups[1]):
+        left |= {name: _too_few_matches(name, groups[0], pairs) for group in groups[1:] for name in group}
+    return left if len(names) - len(left) >= FEWEST else {}
+
+
+def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], pairs: Pairs) -> dict[str, str]:
+    """Photos whose cameras cannot be trusted while those of at least `FEWEST` others can, and why.
+
+    Args:
+        solutions: what two solvers found.
+        names: the names of the photos that they were given.
+        pairs: verified matches of each pair.
+    """
+    first, second = solutions
+    if first is None or second is None:
+        return {}
+    left = dict[str, str]()
+    for name in names:
+        solvers = (name in first.points) + (name in second.points)
+        if solvers < 2:
+            who = "only one of two solvers" if solvers else "neither of two solvers"
+            left[name] = f"{who} could place it{_advice(name, names, pairs)}"
+    placed = [name for name in names if name not in left]
+    better = max((first, second), key=lambda cameras: _seen_well(cameras, placed))
+    for name in placed:
+        if better.points[name] < FEWEST_POINTS:
+            few = f"only {better.points[name]} points are seen in it, fewer than {FEWEST_POINTS}"
+            left[name] = f"{few}{_advice(name, names, pairs)}"
+    left |= _disputed(first, second, [name for name in names if name not in left])
+    return left if len(names) - len(left) >= FEWEST else {}
+
+
+def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, str]:
+    """The photos without which both solvers agree about all pairs: at each turn that in most pairs they differ about.
+
+    Empty if not even three photos are left on which they agree.
+    """
+    angles = {pair: angle_between(first, second, pair) for pair in combinations(names, 2)}
+    left = dict[str, str]()
+    while angles and max(angles.values()) > MOST_DEGREES:
+        of_name = {name: [angle for pair, angle in angles.items() if name in pair] for name in names}
+        worst = max(names, key=lambda name: (sum(angle > MOST_DEGREES for angle in of_name[name]), sum(of_name[name])))
+        left[worst] = f"two solvers are {max(of_name[worst]):.3g} degrees apart about it"
+        names = [name for name in names if name != worst]
+        angles = {pair: angle for pair, angle in angles.items() if worst not in pair}
+    return left if len(names) >= FEWEST else {}
+
+
+def _seen_well(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
+    """How many photos see enough points, and how many the worst one sees."""
+    counts = [cameras.points[name] for name in names]
+    return sum(count >= FEWEST_POINTS for count in counts), min(counts, default=0)
+
+
+def _too_few_matches(name: str, group: Sequence[str], pairs: Pairs) -> str:
+    most = max(matches_of(pairs, name, other) for other in group)
+    said = f"it has at most {most} matches with the others" if most else "it shows nothing that the others show"
+    return f"{said}{_advice(name, [*group, name], pairs)}"
+
+
+def _advice(name: str, names: Sequence[str], pairs: Pairs) -> str:
+    between = " and ".join(gap(name, [other for other in names if other != name], pairs))
+    return f"; if it is of the same place, a photo from between {between} would have helped"

@@ -1,0 +1,128 @@
+"""One unsuitable photo stops nothing: which ones are left out, and that the others have their cameras."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from init_point_scenes import texture
+from photo_folders import exif, planes, with_exif
+
+from kgs.app.sfm import pose_photos
+from kgs.app.sfm.gates import MOST_DEGREES, gap
+from kgs.app.sfm.leave_out import unlike_others, without_cameras, without_overlap
+from kgs.app.sfm.map import Cameras, PairGeometry
+from kgs.app.sfm.read import open_photos
+from kgs.errors import DataError
+
+NAMES = list("abcdef")
+PAIRS = dict.fromkeys(pairwise(NAMES), 200)
+DEEP = dict.fromkeys(PAIRS, PairGeometry(30.0, 0.5))
+
+
+def cameras(names=NAMES, points=None, turned=None):
+    """Cameras of these photos, where those in `turned` are turned by so many degrees."""
+    turns = dict.fromkeys(names, 0.0) | (turned or {})
+    rotations = {name: cv2.Rodrigues(np.array([0.0, np.radians(turns[name]), 0.0]))[0] for name in names}
+    counts = dict.fromkeys(names, 90) | (points or {})
+    return Cameras(800.0, rotations, dict.fromkeys(names, np.zeros(3)), counts, None, 0.1)
+
+
+def test_a_photo_of_another_place_or_from_the_same_place():
+    assert without_overlap(NAMES, PAIRS, DEEP) == {}
+    (name, why), *rest = without_overlap(NAMES, PAIRS | {("e", "f"): 29}, DEEP).items()
+    assert (name, rest) == ("f", [])
+    assert "at most 29 matches" in why
+    assert "between e and f" in why
+    (name, why), *rest = without_overlap(NAMES, PAIRS | {("a", "b"): 0}, DEEP).items()
+    assert (name, rest) == ("a", [])
+    assert "shows nothing that the others show" in why
+    beside = PAIRS | {("a", "c"): 200}
+    assert without_overlap(NAMES, beside, DEEP | {("a", "b"): PairGeometry(0.4, 1.0)}).keys() == {"b"}
+
+
+def test_three_photos_remain_and_more_than_in_any_other_group():
+    halves = PAIRS | {("c", "d"): 0}
+    assert without_overlap(NAMES, halves, DEEP) == {}
+    assert without_overlap(NAMES[:5], {p: n for p, n in halves.items() if "f" not in p}, DEEP).keys() == {"d", "e"}
+    watermark = dict.fromkeys(PAIRS, PairGeometry(0.0, 1.0))
+    assert without_overlap(NAMES, PAIRS, watermark) == {}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "left", "said"),
+    [
+        (cameras(), cameras(), "", ""),
+        (cameras(NAMES[1:]), cameras(NAMES[1:]), "a", "neither of two solvers"),
+        (cameras(NAMES[1:]), cameras(NAMES[:5]), "af", "only one of two solvers"),
+        (cameras(points={"c": 49}), cameras(points={"c": 20}), "c", "only 49 points"),
+        (cameras(points={"c": 49}), cameras(), "", ""),  # one solver sees it well, the other confirms it
+        (cameras(), cameras(turned={"d": 2 * MOST_DEGREES}), "d", "4 degrees apart"),
+        (cameras(), cameras(turned={"d": 40.0, "e": 80.0}), "de", "degrees apart"),
+        (cameras(), cameras(turned={"d": 0.9 * MOST_DEGREES}), "", ""),
+        (cameras(), cameras(turned={n: 10.0 * i for i, n in enumerate(NAMES)}), "", ""),  # no three agree
+        (cameras(NAMES[:4]), cameras(NAMES[2:]), "", ""),  # two would remain
+        (cameras(), None, "", ""),
+    ],
+)
+def test_photos_without_cameras_that_can_be_trusted(first, second, left, said):
+    found = without_cameras([first, second], NAMES, PAIRS)
+    assert "".join(sorted(found)) == left
+    assert all(said in why for why in found.values())
+
+
+def test_the_gap_is_beside_the_photo_that_was_not_placed():
+    assert gap("f", NAMES[:5], PAIRS) == ("e", "f")
+    assert gap("a", NAMES[1:], PAIRS) == ("a", "b")
+    assert gap("c", ["a", "b", "d"], {("a", "c"): 20}) == ("a", "c")  # most matches
+    assert gap("c", ["a", "b", "e"], {}) == ("b", "c")  # next to it in the order in which they were taken
+
+
+def folder_of(folder: Path, images, films=None) -> list[Path]:
+    paths = []
+    for i, image in enumerate(images):
+        jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        path = folder / f"{i}.jpg"
+        path.write_bytes(with_exif(jpeg, exif(film=films[i] if films else 0)))
+        paths.append(path)
+    return paths
+
+
+def test_copies_and_photos_of_another_shape_or_lens(tmp_path):
+    whole = list(planes())
+    images = [*whole, whole[1], whole[0][:120], 255 - whole[2]]
+    left = unlike_others(open_photos(folder_of(tmp_path, images, films=[26, 26, 26, 26, 26, 13])))
+    assert left.keys() == {"3.jpg", "4.jpg", "5.jpg"}
+    assert "same photo as 1.jpg" in left["3.jpg"]
+    assert "240x120, not 240x180" in left["4.jpg"]
+    assert "13 mm, not 26 mm" in left["5.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("films", "said"), [((26, 26, 13), "one focal length"), ((26, 26, 13, 13), "one focal length")]
+)
+def test_where_no_lens_is_that_of_most_all_are_refused(tmp_path, films, said):
+    images = [*planes(), 255 - planes()[0]][: len(films)]
+    with pytest.raises(DataError, match=said):
+        unlike_others(open_photos(folder_of(tmp_path, images, films)))
+
+
+def test_the_others_are_placed_as_if_it_were_not_there(tmp_path):
+    """Three photos with one of another place beside them have the cameras of the three."""
+    pytest.importorskip("pycolmap")
+    other = texture(5, (220.0, 220.0, 220.0)).astype(np.uint8)[:180, :240]
+    for name, images in (("three", planes()), ("four", [*planes(), other])):
+        (tmp_path / name).mkdir()
+        folder_of(tmp_path / name, images)
+    lines = []
+    three = pose_photos(tmp_path / "three", tmp_path / "out3")
+    four = pose_photos(tmp_path / "four", tmp_path / "out4", say=lines.append)
+    assert list(four["photos"]) == list(three["photos"]) == ["0.jpg", "1.jpg", "2.jpg"]
+    assert list(four["left_out"]) == ["3.jpg"]
+    assert any(line.startswith("left out: 3.jpg: ") for line in lines)
+    assert sorted(path.name for path in (tmp_path / "out4" / "images").iterdir()) == ["0.png", "1.png", "2.png"]
+    assert four["focal_px"] == pytest.approx(three["focal_px"], rel=0.02)
+    again = []
+    assert pose_photos(tmp_path / "four", tmp_path / "out4", say=again.append)["reused"]
+    assert [line for line in again if "left out" in line] == [line for line in lines if "left out" in line]
