@@ -28,8 +28,8 @@ _MISSPELLED = {
     "transform_train.json": "transforms_train.json",
     "transform_test.json": "transforms_test.json",
 }
-_MASK_FOLDERS = ("masks", "mask")
-_MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
+MASK_FOLDERS = ("masks", "mask")
+MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
 _TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
@@ -44,7 +44,7 @@ def has_heic() -> bool:
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
     """The photos of a folder, sorted by name; hidden files, masks and other kinds of files are passed over."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith((".", _MASK_FILES))]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith((".", MASK_FILES))]
     return sorted(files, key=lambda p: p.name)
 
 
@@ -98,7 +98,7 @@ def _is_model_beside_photos(root: Path) -> bool:
 
 
 def unused_files(root: Path) -> tuple[str, ...]:
-    """What a folder holds besides its layout's files that looks like cameras or masks: one sentence each."""
+    """What a folder holds besides its layout's files that looks like cameras: one sentence each."""
     layout = layout_of(root)
     sentences = []
     for other, name in LAYOUT_FILES.items():
@@ -114,11 +114,6 @@ def unused_files(root: Path) -> tuple[str, ...]:
     for name, right in _MISSPELLED.items():
         if (root / name).is_file():
             sentences.append(f"{name} is not used: expected the name {right}")
-    masks = [f"{name}/" for name in _MASK_FOLDERS if (root / name).is_dir()]
-    if any(any(folder.glob(f"{_MASK_FILES}*.png")) for folder in {root, image_folder(root) or root}):
-        masks.append(f"{_MASK_FILES}*.png")
-    if masks:
-        sentences.append(f"masks are not used yet: {', '.join(masks)}")
     return tuple(sentences)
 
 

@@ -16,6 +16,7 @@ from kgs.errors import DataError
 
 from .image_file import ImageFile
 from .images import Intrinsics
+from .masks import Mask
 
 LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares of them are finite in float32
 
@@ -29,6 +30,7 @@ class Frame:
     image: ImageFile
     intrinsics: Intrinsics  # for any size of the photo's aspect
     pose: Tensor  # (4, 4) float64, camera-to-world with OpenCV axes (x right, y down, z forward)
+    mask: Mask | None = None  # which of its pixels are kept; None: all
 
     @property
     def path(self) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Self
 
 import kornia.geometry as kg
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,12 +22,14 @@ from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .images import rectification, remap, resize
 from .layouts import find_layout
+from .masks import find_masks, mask_folder
 from .options import BACKGROUNDS, check_options
 from .scene import Scene, Views, pinholes
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
 _LISTED = 20
 _BORDER = "the photos have a dark border, left by undistortion: it counts as part of the lens, not of the scene"
+_COUNTED = 0.99  # share of a pixel that a mask keeps, above which it counts
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
@@ -40,6 +43,8 @@ def load_scene(
     points: str = "none",
     photos: bool = True,
     photo_folder: str = "",
+    masks: str | PathLike[str] | None = None,
+    mask_means: str = "away",
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
@@ -68,10 +73,14 @@ def load_scene(
             (they are on torch's "meta" device), `masks` and `finer` are None.
         photo_folder: where a scene (LLFF, COLMAP) has its photos in several sizes, the name of the folder to take, as
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
+        masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
+            files name, or those in `masks/`, and `dynamic_mask_*.png` beside the photos.
+        mask_means: what black in a mask means. "away": look away, somebody walked by; such pixels do not count, see
+            `Views.counted`. "absent": nothing is there, as where an image is transparent.
 
     Raises:
         DataError: the folder is not a scene, or its files are missing, damaged or contradict each other.
-        ValueError: train_views, downscale, hold_out, background or points is out of range.
+        ValueError: train_views, downscale, hold_out, background, points or mask_means is out of range.
 
     Examples:
         >>> scene = load_scene("fern", train_views=3, downscale=2)  # doctest: +SKIP
@@ -80,11 +89,11 @@ def load_scene(
         >>> images = [view["image"] for view in scene.train]  # doctest: +SKIP
         >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
-    check_options(downscale, hold_out, background, points)
+    check_options(downscale, hold_out, background, points, mask_means)
     root = Path(path)
     # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
-        frame_set = find_layout(root, photo_folder)
+        frame_set = _with_masks(root, find_layout(root, photo_folder), None if masks is None else Path(masks))
         train, test = _split(root, frame_set, train_views, hold_out)
         cloud = frame_set.points
         if points == "model-points":
@@ -104,11 +113,12 @@ def load_scene(
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
         if photos and downscale is not None and fine_downscale < downscale:
             scales.append(_Scale.of(train[0], fine_downscale))
-        make_views = partial(_views, offset=offset, background=color, photos=photos)
+        absent = mask_means == "absent"
+        make_views = partial(_views, offset=offset, background=color, photos=photos, absent=absent)
         train_per_scale = [_with_border(views) for views in make_views(train, scales)]
         at_size = train_per_scale[0]
         (test_views,) = make_views(test, scales[:1])
-        notes = frame_set.notes
+        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent))
         if at_size.light is not None:
             notes += (_BORDER,)
         return Scene(
@@ -123,6 +133,28 @@ def load_scene(
             finer=train_per_scale[1] if len(scales) > 1 else None,
             notes=notes,
         )
+
+
+def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSet:
+    """The frames with their masks: those in `folder`, else those that the files name, else those beside the photos."""
+    if folder is not None and not folder.is_dir():
+        raise DataError(folder, "", "expected a folder of masks, found no such folder")
+    parts = [frame_set.frames, frame_set.test or ()]
+    if folder is None and any(frame.mask for frames in parts for frame in frames):
+        return frame_set
+    found = find_masks([frame.path for frames in parts for frame in frames], folder or mask_folder(root))
+    frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
+    return replace(frame_set, frames=frames, test=None if frame_set.test is None else test)
+
+
+def _mask_notes(frames: Sequence[Frame], train: Views, absent: bool) -> list[str]:
+    """How many photos have masks, and what these mean, as a sentence; [] without masks."""
+    masked = sum(frame.mask is not None for frame in frames)
+    if not masked:
+        return []
+    share = "" if train.counted is None else f", {1 - float(train.counted.float().mean()):.0%} of the training pixels"
+    meaning = "nothing is there" if absent else f"is looked away from{share}"
+    return [f"masks of {masked} of {len(frames)} photos: what is black in them {meaning}"]
 
 
 def _with_border(train: Views) -> Views:
@@ -196,7 +228,7 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
 
 
 def _views(
-    frames: Sequence[Frame], scales: Sequence[_Scale], offset: Tensor, background: Tensor, photos: bool
+    frames: Sequence[Frame], scales: Sequence[_Scale], offset: Tensor, background: Tensor, photos: bool, absent: bool
 ) -> list[Views]:
     """The frames as views, once for each scale; their photos are decoded once, or not at all."""
     count = len(frames)
@@ -205,6 +237,7 @@ def _views(
     images = [torch.empty(count, 3, *scale.size, dtype=torch.float32, device=device) for scale in scales]
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(len(scales), count, 1, 1)
     alphas: list[dict[int, Tensor]] = [{} for _ in scales]
+    counted: list[dict[int, Tensor]] = [{} for _ in scales]
     for i, frame in enumerate(frames):
         image = None
         if photos:
@@ -217,11 +250,19 @@ def _views(
             lens, maps = rectify(frame.intrinsics.scaled(width, height))
         except ValueError as error:
             raise DataError(frame.source, frame.name, str(error)) from error
+        kept = None
         if image is not None:
+            if frame.mask is not None:
+                kept = frame.mask.read(frame.path, width, height)
+            if kept is not None and absent:
+                alpha = kept[..., None] * (image[..., 3:] if image.shape[2] == 4 else 1.0)
+                image = np.concatenate([image[..., :3], alpha], axis=2)
+                kept = None
             if image.shape[2] == 4:
                 alpha = image[..., 3:]
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
             image = remap(image, maps)
+            kept = None if kept is None else remap(kept, maps)
         for j, scale in enumerate(scales):
             height, width = scale.size
             if image is None:
@@ -232,6 +273,8 @@ def _views(
                 images[j][i] = pixels[:3]
                 if len(pixels) == 4:
                     alphas[j][i] = pixels[3:].clone()
+                if kept is not None:
+                    counted[j][i] = torch.from_numpy(resize(kept, lens, width, height)[0]) > _COUNTED
             intrinsics[j, i, :3, :3] = torch.from_numpy(reduced_lens.matrix())
     poses = torch.stack([frame.pose for frame in frames]) if frames else torch.zeros(0, 4, 4, dtype=torch.float64)
     u, _, vh = torch.linalg.svd(poses[:, :3, :3])  # u @ vh is a rotation exactly
@@ -241,5 +284,7 @@ def _views(
     for j, scale in enumerate(scales):
         opaque = torch.ones(1, *scale.size, dtype=torch.float32)
         masks = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
-        views.append(Views(pinholes(intrinsics[j], extrinsics, scale.size), images[j], names, masks))
+        every = opaque[0] > 0
+        rows = torch.stack([counted[j].get(i, every) for i in range(count)]) if counted[j] else None
+        views.append(Views(pinholes(intrinsics[j], extrinsics, scale.size), images[j], names, masks, counted=rows))
     return views

@@ -4,12 +4,20 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+MASK_MEANINGS = ("away", "absent")  # of black in a mask: look away from it, or nothing is there
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
-def check_options(downscale: Any, hold_out: Any, background: str = "black", points: str = "none") -> None:
+def check_options(
+    downscale: Any, hold_out: Any, background: str = "black", points: str = "none", mask_means: str = "away"
+) -> None:
     """Raise a ValueError for an argument of `load_scene` that no scene has a use for."""
-    for name, value, known in (("background", background, BACKGROUNDS), ("points", points, ("none", "model-points"))):
+    choices = (
+        ("background", background, BACKGROUNDS),
+        ("points", points, ("none", "model-points")),
+        ("mask_means", mask_means, MASK_MEANINGS),
+    )
+    for name, value, known in choices:
         if value not in known:
             raise ValueError(f"{name}: expected one of {list(known)}, got {value!r}")
     real = isinstance(downscale, Real)

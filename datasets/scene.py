@@ -35,6 +35,8 @@ class Views:
         masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
         light: `(H, W)` in [0, 1], the transmittance of each pixel, the same in all images, or None: 1 everywhere. It is
             below 1 in the dark border that removing a lens's distortion can leave.
+        counted: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
+            and no keypoints or initial points are taken.
 
     Raises:
         TypeError: the images are not a tensor of floating point numbers.
@@ -53,6 +55,7 @@ class Views:
     names: tuple[str, ...]
     masks: Tensor | None = None
     light: Tensor | None = None
+    counted: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -72,6 +75,8 @@ class Views:
             raise ValueError(f"masks: expected shape ({count}, 1, {height}, {width}), got {tuple(self.masks.shape)}")
         if self.light is not None and tuple(self.light.shape) != (height, width):
             raise ValueError(f"light: expected shape ({height}, {width}), got {tuple(self.light.shape)}")
+        if self.counted is not None and tuple(self.counted.shape) != (count, height, width):
+            raise ValueError(f"counted: expected shape ({count}, {height}, {width}), got {tuple(self.counted.shape)}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,15 +86,16 @@ class Views:
 
         Returns:
             image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.pinhole_cameras` and
-            `kgs.rasterization` take them with `pixel_centers="integer"`, index, name, and mask `(1, H, W)` where there
-            are masks.
+            `kgs.rasterization` take them with `pixel_centers="integer"`, index, name, mask `(1, H, W)` where there are
+            masks, and counted `(H, W)` where not all pixels count.
         """
         if not -len(self) <= (given := operator.index(index)) < len(self):
             raise IndexError(f"index: expected a whole number below {len(self)}, the number of views, got {given}")
         i = given % len(self)
         matrices = {"extrinsics": self.cameras.extrinsics[i], "intrinsics": self.cameras.intrinsics[i, :3, :3]}
         mask = {} if self.masks is None else {"mask": self.masks[i]}
-        return {"image": self.images[i], **matrices, "index": i, "name": self.names[i], **mask}
+        counted = {} if self.counted is None else {"counted": self.counted[i]}
+        return {"image": self.images[i], **matrices, "index": i, "name": self.names[i], **mask, **counted}
 
     def __iter__(self) -> Iterator[dict[str, Tensor | int | str]]:
         return (self[i] for i in range(len(self)))
@@ -112,19 +118,34 @@ class Views:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64, device=self.images.device)
         masks = None if self.masks is None else self.masks[rows]
+        counted = None if self.counted is None else self.counted[rows]
         names = tuple(self.names[i] for i in indices)
-        return replace(self, cameras=self.camera(rows), images=self.images[rows], names=names, masks=masks)
+        images = self.images[rows]
+        return replace(self, cameras=self.camera(rows), images=images, names=names, masks=masks, counted=counted)
 
     def as_photo(self, render: Tensor) -> Tensor:
         """A render `(..., H, W)` as these views' photos would show it: clamped to [0, 1], behind their dark border."""
         image = render.clamp(0, 1)
         return image if self.light is None else image * self.light.to(image)
 
+    def compared(self, index: int, render: Tensor) -> tuple[Tensor, Tensor, float]:
+        """A render `(..., 3, H, W)` as the photo of one view would show it, that photo, and the share that counts.
+
+        Both are black where pixels do not count. The photo is `(3, H, W)`, on the device and of the type of the render.
+        """
+        image = self.as_photo(render)
+        photo = self.images[index].to(image)
+        if self.counted is None:
+            return image, photo, 1.0
+        counted = self.counted[index].to(image.device)
+        return image * counted, photo * counted, float(counted.float().mean())
+
     @property
     def usable(self) -> Tensor | None:
-        """Which pixels show the scene: opaque ones that no border covers, bool `(V, H, W)`; None: all."""
+        """Which pixels show the scene: opaque ones that count and no border covers, bool `(V, H, W)`; None: all."""
         parts = [] if self.masks is None else [self.masks[:, 0] > 0.5]
         parts += [] if self.light is None else [(self.light >= 1).expand(len(self), -1, -1)]
+        parts += [] if self.counted is None else [self.counted]
         return torch.stack(parts).all(dim=0) if parts else None
 
     def halved(self) -> Self:
@@ -141,7 +162,9 @@ class Views:
         cameras = pinholes(intrinsics, self.cameras.extrinsics, size)
         masks = None if self.masks is None else avg_pool2d(self.masks, 2)
         light = None if self.light is None else avg_pool2d(self.light[None], 2)[0]
-        return replace(self, cameras=cameras, images=avg_pool2d(self.images, 2), masks=masks, light=light)
+        counted = None if self.counted is None else avg_pool2d(self.counted.float(), 2) == 1
+        images = avg_pool2d(self.images, 2)
+        return replace(self, cameras=cameras, images=images, masks=masks, light=light, counted=counted)
 
 
 @dataclass(frozen=True, eq=False)

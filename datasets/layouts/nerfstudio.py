@@ -18,6 +18,7 @@ from kgs.datasets.folders import IMAGE_SUFFIXES
 from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
+from kgs.datasets.masks import Mask
 from kgs.errors import DataError
 from kgs.json_files import is_number, read_json
 
@@ -32,7 +33,7 @@ _COEFFICIENTS = sorted({*_BROWN, *_KANNALA, "k5", "k6"})
 # Keys that are used; then keys for sorting, framing and normalising a scene, and for what a tool did to the world.
 # The latter change nothing: the world stays that of the file.
 _KNOWN = """
-    frames file_path transform_matrix
+    frames file_path mask_path transform_matrix
     camera_model is_fisheye fl_x fl_y camera_angle_x camera_angle_y cx cy w h k1 k2 k3 k4 k5 k6 p1 p2
     aabb aabb_scale render_aabb scale offset up sharpness rotation colmap_im_id camera_id camera_name camera_label
     applied_transform applied_scale orientation_override auto_scale_poses_override
@@ -108,10 +109,28 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     if not all("w" in values and "h" in values for values in (ChainMap(entry, data) for entry in entries)):
         size = _first_size(images)
     frames = [
-        Frame(source, name, image, _lens(source, ChainMap(entry, data), size), _opencv_pose(source, entry))
+        Frame(
+            source,
+            name,
+            image,
+            _lens(source, ChainMap(entry, data), size),
+            _opencv_pose(source, entry),
+            _mask(source, root, entry),
+        )
         for name, image, entry in zip(names, images, entries, strict=True)
     ]
     return frames, data, notes
+
+
+def _mask(source: Path, root: Path, entry: Object) -> Mask | None:
+    """The mask that a frame's `mask_path` names."""
+    name = _text(source, "mask_path", entry, "")
+    if not name:
+        return None
+    path = find_file(source, root, name)
+    if not path.is_file():
+        raise DataError(source, "mask_path", f"expected a file, got {name[:200]!r}, which is not there")
+    return Mask(ImageFile(path))
 
 
 def _first_size(images: list[ImageFile]) -> tuple[int, int]:

@@ -205,6 +205,7 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
         tensors = {
             "photos": views.images,
             "masks": views.masks,
+            "counted pixels": views.counted,
             "poses": views.cameras.extrinsics,
             "intrinsics": views.cameras.intrinsics,
         }

@@ -23,10 +23,10 @@ class Target(NamedTuple):
     moments: TargetMoments
     clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
     background: Tensor  # (3,), the background that `image` has
-    light: Tensor | None  # (H, W), the transmittance of a dark border; None: 1 everywhere
+    light: Tensor | None  # (H, W), the transmittance of a dark border, and 0 where no pixel counts; None: 1 everywhere
 
     def seen(self, render: Tensor) -> Tensor:
-        """A render as the photo would show it: clamped to 1, and darkened by the border."""
+        """A render as the photo would show it: clamped to 1, darkened by the border, black where no pixel counts."""
         image: Tensor = _AtMostOne.apply(render)  # it is never below 0
         return image if self.light is None else image * self.light
 
@@ -64,14 +64,21 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
     made = []
     for i, photo in enumerate(views.images):
         image = photo[None].to(device, torch.float32)
+        clear = None if views.masks is None else 1.0 - views.masks[i][None].to(image)
+        light = None if views.light is None else views.light.to(image)
+        if views.counted is not None:
+            counted = views.counted[i].to(image)
+            image = image * counted
+            clear = None if clear is None else clear * counted
+            light = counted if light is None else light * counted
         made.append(
             Target(
                 camera=move_camera(views.camera(i), device),
                 image=image,
                 moments=target_moments(image),
-                clear=None if views.masks is None else 1.0 - views.masks[i][None].to(image),
+                clear=clear,
                 background=background.to(image),
-                light=None if views.light is None else views.light.to(image),
+                light=light,
             )
         )
     return made

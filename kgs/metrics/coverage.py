@@ -49,10 +49,11 @@ def measure_coverage(scene: Scene, render: RenderView, median_depth: RenderView)
     for view in range(len(test)):
         camera = test.camera(view)
         covered = views_that_show(median_depth(camera), camera, depths, train.cameras) >= MIN_VIEWS
-        image = test.as_photo(render(camera)[0].cpu())
-        errors = (image - test.images[view].cpu().to(image)).square().mean(dim=0)
-        shares.append(float(covered.float().mean()))
-        for name, where in (("psnr", covered), ("psnr_rest", ~covered)):
+        image, photo, _ = test.compared(view, render(camera)[0].cpu())
+        errors = (image - photo).square().mean(dim=0)
+        counted = torch.ones_like(covered) if test.counted is None else test.counted[view].cpu()
+        shares.append(float(covered[counted].float().mean()) if counted.any() else 0.0)
+        for name, where in (("psnr", covered & counted), ("psnr_rest", ~covered & counted)):
             error = float(errors[where].mean()) if where.any() else 0.0
             if error > 0:
                 levels[name].append(-10 * math.log10(error))

@@ -1,7 +1,8 @@
 """Measures renders against photos: PSNR, SSIM with both borders, LPIPS.
 
-Compared are float renders, clamped to [0, 1], never 8-bit files, over all pixels and channels (masks are not used). The
-photos' dark border, if any, is applied to the renders first.
+Compared are float renders, clamped to [0, 1], never 8-bit files, over all pixels and channels (alpha is not used). The
+photos' dark border, if any, is applied to the renders first. Pixels that do not count (`Views.counted`) are black in
+both; PSNR is that of the others, while SSIM and LPIPS take the black ones as equal.
 
 Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
 Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a border of zeros, the mean over the map.
@@ -50,7 +51,8 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
-        rows.append(_measure(views.as_photo(image), target.to(image), lpips))
+        shown, photo, share = views.compared(index, image)
+        rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
     means = {key: fmean(values) if values and None not in values else None for key, values in columns.items()}
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
@@ -60,10 +62,15 @@ def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float 
     """Mean PSNR over some views in dB, of clamped renders; None without views, or if one PSNR is infinite."""
     values = list[float]()
     for i in range(len(views)):
-        image = views.as_photo(render(views.camera(i))[0].cpu())
-        values.append(float(psnr(image, views.images[i].float(), 1.0)))
+        image, photo, share = views.compared(i, render(views.camera(i))[0].cpu())
+        values.append(float(psnr(image, photo, 1.0)) + decibels(share))
     mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
     return round(mean, 4) if math.isfinite(mean) else None
+
+
+def decibels(share: float) -> float:
+    """What is added to a PSNR over all pixels to get that of the share of them that counts; the others are equal."""
+    return 10 * math.log10(share) if share else math.inf
 
 
 def comparable(level: float | None) -> float:
@@ -103,9 +110,9 @@ def _copy_lpips(source: dict[str, Any], target: dict[str, Any]) -> None:
             target[key] = source.get(key)
 
 
-def _measure(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float | None]:
-    """The `MEASURES` of one image."""
-    level = psnr(image, target, 1.0).item()
+def _measure(image: Tensor, target: Tensor, share: float, lpips: Lpips | None) -> dict[str, float | None]:
+    """The `MEASURES` of one image, of whose pixels a share counts."""
+    level = psnr(image, target, 1.0).item() + decibels(share)
     # Kornia's "valid" map of zero-padded images is the whole map with zero padding.
     border = [_WINDOW // 2] * 4
     padded = F.pad(image, border)

@@ -13,7 +13,7 @@ import pytest
 from photo_folders import planes, write_photos
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
-from kgs.app.sfm import pose, pose_photos
+from kgs.app.sfm import agree, pose_photos
 from kgs.datasets import image_file, load_scene
 from kgs.errors import DataError
 

@@ -121,7 +121,6 @@ REFUSED: list[tuple[str, Any]] = [
     ("rolling_shutter", [0, 0, 0.1, 0]),
     ("distortion_params", [0.1, 0, 0, 0, 0, 0]),
     ("fisheye_crop_radius", 12.0),
-    ("mask_path", "masks/0.png"),
     ("x_fov", 40),
     ("focal_length", 50),
     ("principal_point_x", 20),

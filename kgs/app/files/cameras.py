@@ -106,6 +106,7 @@ def rolled(views: Views, degrees: float) -> Views:
         images=turned(views.images),
         masks=None if views.masks is None else turned(views.masks),
         light=None if views.light is None else turned(views.light),
+        counted=None if views.counted is None else turned(views.counted),
     )
 
 

@@ -158,6 +158,8 @@ def _ground(views: Views, background: Tensor) -> Tensor:
     border = torch.ones(height, width, dtype=torch.bool)
     border[band : height - band, band : width - band] = False
     usable = torch.ones_like(border) if views.light is None else views.light.cpu() >= 1
+    if views.counted is not None:
+        usable = usable & views.counted.cpu().all(0)
     rows = border & usable if bool((border & usable).any()) else usable
     ground: Tensor = views.images.cpu()[:, :, rows].mean((0, 2)) if bool(rows.any()) else background
     return ground

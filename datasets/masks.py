@@ -1,0 +1,82 @@
+"""Masks of photos: pictures beside them that say which pixels are kept.
+
+A mask has the photo's stem (or its whole name before the ending, as COLMAP writes them) and lies in `masks/`, in a
+folder that the user names, or where a layout's file says. White is kept. instant-ngp's `dynamic_mask_*.png` beside the
+photos are the other way round: what is not black there moves, and is not kept.
+
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html (masks); instant-ngp, docs/nerf_dataset_tips.md.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from kgs.errors import DataError
+
+from .folders import MASK_FILES, MASK_FOLDERS, list_images
+from .image_file import Image, ImageFile
+from .images import Intrinsics
+
+
+class Mask(NamedTuple):
+    """The file that says which pixels of a photo are kept."""
+
+    file: ImageFile
+    keeps_white: bool = True
+
+    def read(self, photo: Path, width: int, height: int) -> Image:
+        """The share of each pixel of a photo that is kept, `(height, width)` in [0, 1].
+
+        Raises:
+            DataError: the file cannot be read, has another shape than the photo, or keeps nothing.
+        """
+        pixels = self.file.read()
+        kept = pixels[..., :3].mean(axis=2) * (pixels[..., 3] if pixels.shape[2] == 4 else 1.0)
+        kept = np.asarray(kept > 0.5 if self.keeps_white else kept == 0, np.float32)
+        rows, columns = kept.shape
+        if not Intrinsics(columns, rows, 1, 1, 0, 0).same_aspect(width, height):
+            reason = f"expected the shape of {photo.name}, {width}x{height}, got {columns}x{rows}"
+            raise DataError(self.file.path, "", reason)
+        if not kept.any():
+            raise DataError(self.file.path, "", f"expected pixels of {photo.name} to keep, got a mask of one colour")
+        return kept if (columns, rows) == (width, height) else np.asarray(cv2.resize(kept, (width, height)), np.float32)
+
+
+def mask_folder(root: Path) -> Path | None:
+    """The folder of masks beside a scene's photos, None if there is none."""
+    return next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), None)
+
+
+def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
+    """The masks of photos: those in a folder, and instant-ngp's beside photos that have none there.
+
+    Raises:
+        DataError: the folder holds no masks, or one that fits no photo or several.
+    """
+    found = {photo: Mask(ImageFile(beside), keeps_white=False) for photo in photos if (beside := _dynamic(photo))}
+    if folder is None:
+        return found
+    masks = list_images(folder)
+    if not masks:
+        raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
+    unused = [path for place in {photo.parent for photo in photos} for path in list_images(place)]
+    for mask in masks:
+        fitting = [photo for photo in photos if _fits(mask, photo)]
+        if len(fitting) > 1:
+            raise DataError(mask, "", f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}")
+        if not fitting and not any(_fits(mask, photo) for photo in unused):
+            raise DataError(mask, "", "fits no photo: expected the stem of one, as IMG_1.png for IMG_1.jpg")
+        found.update((photo, Mask(ImageFile(mask))) for photo in fitting)
+    return found
+
+
+def _fits(mask: Path, photo: Path) -> bool:
+    return mask.stem.lower() in (photo.stem.lower(), photo.name.lower())
+
+
+def _dynamic(photo: Path) -> Path | None:
+    path = photo.with_name(f"{MASK_FILES}{photo.stem}.png")
+    return path if path.is_file() else None

@@ -1,0 +1,200 @@
+"""Masks of photos: found, read, resized with the photo; what they leave out is looked away from, or not there."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from init_point_scenes import painted_planes
+from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
+
+from kgs.datasets import load_scene
+from kgs.datasets.scene import Views
+from kgs.errors import DataError
+from kgs.fit.targets import targets
+from kgs.init_points.tracks import detect
+from kgs.metrics.evaluate import evaluate, mean_psnr
+
+LEFT = np.zeros((12, 16), np.uint8)
+LEFT[:, 8:] = 255  # black on the left: only the right half is kept
+
+
+def write_mask(path: Path, mask: np.ndarray = LEFT) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), mask)
+    return path
+
+
+def in_mask_folder(root: Path) -> None:
+    write_llff(root)
+    write_mask(root / "masks" / "0.png")
+
+
+def by_whole_name(root: Path) -> None:
+    write_colmap(root)
+    write_mask(root / "masks" / "0.PNG.png")
+
+
+def in_the_file(root: Path) -> None:
+    write_nerfstudio(root)
+    data = json.loads((root / "transforms.json").read_text())
+    data["frames"][0]["mask_path"] = "elsewhere/a.png"
+    (root / "transforms.json").write_text(json.dumps(data))
+    write_mask(root / "elsewhere" / "a.png")
+
+
+def beside_the_photo(root: Path) -> None:
+    write_nerfstudio(root)
+    write_mask(root / "images" / "dynamic_mask_0.png", 255 - LEFT)
+
+
+def larger_and_coloured(root: Path) -> None:
+    write_llff(root)
+    mask = cv2.resize(LEFT, (64, 48), interpolation=cv2.INTER_NEAREST)
+    write_mask(root / "mask" / "0.jpg", np.repeat(mask[..., None], 3, 2))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [in_mask_folder, by_whole_name, in_the_file, beside_the_photo, larger_and_coloured],
+    ids=lambda f: f.__name__,
+)
+def test_black_is_looked_away_from(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    write(tmp_path)
+    scene = load_scene(tmp_path, hold_out=0)
+    counted = scene.train.counted
+    assert counted is not None
+    assert bool(counted[1:].all())  # photos without a mask count
+    kept = torch.nonzero(counted[0])
+    assert 7 <= int(kept[:, 1].min()) <= 9
+    assert 0.4 < float(counted[0].float().mean()) < 0.6
+    assert any("masks of 1 of 3 photos" in note for note in scene.notes)
+    assert scene.train.masks is None
+
+
+def test_black_is_not_there(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    write_mask(tmp_path / "others" / "0.png")
+    scene = load_scene(tmp_path, hold_out=0, masks=tmp_path / "others", mask_means="absent", background="white")
+    assert scene.train.counted is None
+    assert scene.train.masks is not None
+    assert scene.train.masks.mean((1, 2, 3)).tolist() == pytest.approx([0.5, 1.0, 1.0])
+    assert bool((scene.train.images[0, :, :, :8] == 1).all())  # the background
+    plain = load_scene(tmp_path, hold_out=0)
+    assert plain.train.counted is None
+    assert torch.equal(plain.train.images[0, :, :, 8:], scene.train.images[0, :, :, 8:])
+
+
+def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    mask = np.full((12, 16), 255, np.uint8)
+    mask[5, 7] = 0
+    write_mask(tmp_path / "masks" / "1.png", mask)
+    views = load_scene(tmp_path, hold_out=0, downscale=2).train
+    assert views.counted is not None
+    assert (~views.counted).nonzero().tolist() == [[1, 2, 3]]  # a pixel that a mask covers in part does not count
+    again = load_scene(tmp_path, hold_out=0).train
+    halved = again.halved()
+    assert halved.counted is not None
+    assert torch.equal(halved.counted, views.counted)
+    chosen = again.select([1])
+    assert chosen.counted is not None
+    assert int((~chosen.counted).sum()) == 1
+    assert [int((~view["counted"]).sum()) for view in again] == [0, 1, 0]
+
+
+def without_a_photo(root: Path) -> Path:
+    return write_mask(root / "masks" / "9.png")
+
+
+def of_another_shape(root: Path) -> Path:
+    return write_mask(root / "masks" / "0.png", LEFT[:, :10])
+
+
+def all_black(root: Path) -> Path:
+    return write_mask(root / "masks" / "0.png", 0 * LEFT)
+
+
+def no_masks(root: Path) -> Path:
+    (root / "masks").mkdir()
+    return root / "masks"
+
+
+def broken(root: Path) -> Path:
+    path = write_mask(root / "masks" / "0.png")
+    path.write_bytes(path.read_bytes()[:40])
+    return path
+
+
+@pytest.mark.parametrize("write", [without_a_photo, of_another_shape, all_black, no_masks, broken])
+def test_a_wrong_mask_is_an_error_that_names_it(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    write_llff(tmp_path)
+    path = write(tmp_path)
+    with pytest.raises(DataError) as caught:
+        load_scene(tmp_path, hold_out=0)
+    assert str(path) in str(caught.value)
+
+
+def test_masks_that_cannot_be_found(tmp_path: Path) -> None:
+    in_the_file(tmp_path)
+    (tmp_path / "elsewhere" / "a.png").unlink()
+    with pytest.raises(DataError, match="mask_path"):
+        load_scene(tmp_path)
+    with pytest.raises(DataError, match="expected a folder of masks"):
+        load_scene(tmp_path, masks=tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="mask_means"):
+        load_scene(tmp_path, mask_means="gone")
+
+
+def test_a_stem_that_two_photos_have_is_no_mask_of_one(tmp_path: Path) -> None:
+    write_blender(tmp_path)
+    write_mask(tmp_path / "masks" / "0.png")
+    with pytest.raises(DataError, match="mask of one photo"):
+        load_scene(tmp_path)
+
+
+def test_a_mask_of_a_photo_that_is_not_in_the_model_is_no_error(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    cv2.imwrite(str(tmp_path / "images" / "not registered.png"), LEFT)
+    write_mask(tmp_path / "masks" / "not registered.png")
+    write_mask(tmp_path / "masks" / "0.png")
+    assert load_scene(tmp_path, hold_out=0).train.counted is not None
+
+
+@pytest.fixture
+def half() -> Views:
+    """Three views of which the left half does not count."""
+    views = painted_planes()
+    counted = torch.ones(views.images[:, 0].shape, dtype=torch.bool)
+    counted[:, :, : counted.shape[2] // 2] = False
+    return Views(views.cameras, views.images, views.names, counted=counted)
+
+
+def test_no_keypoint_lies_where_no_pixel_counts(half: Views) -> None:
+    places, _ = detect(half, 0, 1000)
+    assert len(places) > 50
+    assert float(places[:, 0].min()) >= half.images.shape[-1] // 2 - 1
+
+
+def test_the_loss_has_no_gradient_where_no_pixel_counts(half: Views) -> None:
+    for view, target in enumerate(targets(half, torch.zeros(3), torch.device("cpu"))):
+        render = torch.full_like(target.image, 0.4).requires_grad_()
+        (gradient,) = torch.autograd.grad((target.seen(render) - target.image).square().sum(), render)
+        assert half.counted is not None
+        assert torch.equal(gradient[0].any(0), half.counted[view])
+
+
+def test_only_pixels_that_count_are_measured(half: Views) -> None:
+    assert half.counted is not None
+    renders = iter(torch.where(half.counted[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
+    plain = Views(half.cameras, half.images, half.names)
+    shown = evaluate(lambda _: next(renders), half)
+    renders = iter((half.images + 0.01).clamp(0, 1)[:, None])
+    whole = evaluate(lambda _: next(renders), plain)
+    assert shown["psnr"] == pytest.approx(40.0, abs=0.1)
+    assert shown["psnr"] == pytest.approx(whole["psnr"], abs=0.1)
+    renders = iter(torch.where(half.counted[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
+    assert mean_psnr(lambda _: next(renders), half) == pytest.approx(shown["psnr"], abs=1e-3)
