@@ -42,7 +42,9 @@ class Mask(NamedTuple):
             raise DataError(self.file.path, "", reason)
         if not kept.any():
             raise DataError(self.file.path, "", f"expected pixels of {photo.name} to keep, got a mask of one colour")
-        return kept if (columns, rows) == (width, height) else np.asarray(cv2.resize(kept, (width, height)), np.float32)
+        if (columns, rows) == (width, height):
+            return kept
+        return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def mask_folder(root: Path) -> Path | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from kgs.datasets.load import load_scene
+from kgs.datasets.options import MASK_MEANINGS
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.json_files import is_number
@@ -27,6 +28,8 @@ class SceneRequest:
         roll: degrees by which page and film are turned clockwise.
         title: of the page; "": the name of the folder.
         photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
+        masks: the folder of their masks; "": where the scene's files say, or beside the photos.
+        mask_means: what black in a mask means, "away" or "absent".
     """
 
     scene: str
@@ -39,6 +42,8 @@ class SceneRequest:
     roll: float = 0.0
     title: str = ""
     photo_folder: str = ""
+    masks: str = ""
+    mask_means: str = "away"
 
     def load(self, base: Path, say: Callable[[str], None] | None = None) -> Scene:
         """Load the scene; `base` is the folder that a relative path starts from, `say` gets the loader's notes."""
@@ -50,6 +55,8 @@ class SceneRequest:
             background=self.background,
             points=self.points,
             photo_folder=self.photo_folder,
+            masks=base / self.masks if self.masks else None,
+            mask_means=self.mask_means,
         )
         if say is not None:
             for note in scene.notes:
@@ -90,6 +97,8 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "photos": ("true or false", lambda v: isinstance(v, bool)),
     "roll": ("a number", lambda v: is_number(v)),
     "title": ("a text", lambda v: isinstance(v, str)),
+    "masks": ("a path or nothing", lambda v: isinstance(v, str) and "\0" not in v),
+    "mask_means": (f"one of {list(MASK_MEANINGS)}", lambda v: v in MASK_MEANINGS),
     "photo_folder": (
         "images, images_ and a number, or nothing",
         lambda v: isinstance(v, str) and re.fullmatch(r"(images(_\d+)?)?", v) is not None,

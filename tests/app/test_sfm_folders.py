@@ -140,7 +140,7 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
         (folder / name).write_bytes(b"II*\0")
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
     said = " ".join(notes_on(folder))
-    for name in ("0.DNG", "1.dng", "2.HEIC", "dynamic_mask"):
+    for name in ("0.DNG", "1.dng", "2.HEIC"):
         assert name in said
 
 

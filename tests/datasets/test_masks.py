@@ -143,6 +143,7 @@ def test_masks_that_cannot_be_found(tmp_path: Path) -> None:
     (tmp_path / "elsewhere" / "a.png").unlink()
     with pytest.raises(DataError, match="mask_path"):
         load_scene(tmp_path)
+    write_mask(tmp_path / "elsewhere" / "a.png")
     with pytest.raises(DataError, match="expected a folder of masks"):
         load_scene(tmp_path, masks=tmp_path / "nowhere")
     with pytest.raises(ValueError, match="mask_means"):

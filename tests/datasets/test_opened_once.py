@@ -93,7 +93,7 @@ def test_unposed_photos(
     def stop(*_: object) -> None:
         raise DataError(folder, "", "stopped behind the decoding")
 
-    monkeypatch.setattr(pose, "write_matches", stop)
+    monkeypatch.setattr(agree, "write_matches", stop)
     opened.clear()
     with pytest.raises(DataError, match="stopped"):
         pose_photos(folder, tmp_path / "out")

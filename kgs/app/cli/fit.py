@@ -40,6 +40,8 @@ def fit(
     size: int | str | None = None,
     downscale: float | None = None,
     background: Background = "black",
+    masks: Existing | None = None,
+    mask_means: Literal["away", "absent"] = "away",
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
     resume: bool = False,
@@ -62,16 +64,18 @@ def fit(
         hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the scene's files say, or every
             eighth photo; of photos without poses none.
         size: reduce the photos to this many pixels on their longer side. Unless given: 504 for photos without poses on
-            a CPU, else their own size. Or field: the size of published tables (an eighth, for LLFF and Mip-NeRF 360).
-            Or a folder of a scene, as images_4: its photos as they are.
+            a CPU, else their own size. Or field: that of published tables. Or a folder of photos in several sizes, as
+            images_4.
         downscale: reduce the photos by this factor instead.
         background: the colour behind photos with transparency.
+        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside them.
+        mask_means: what black in them means: look away, or nothing is there.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
-        detail: sets size, steps and number of initial points together. low: 378 pixels. high: 1000 pixels. Options that
-            are given by name win. See --detail high --help-all.
+        detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
+            win. See --detail high --help-all.
         resume: continue from the checkpoint in the folder of the results.
-        photos: show photos on the page. --no-photos leaves them out: the page can go where the photos must not.
+        photos: --no-photos leaves the photos out of the page.
         roll: turn page and film clockwise by this angle in degrees, where photos lie on their side.
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
         config: every number of the fit.
@@ -102,6 +106,8 @@ def fit(
         points=config.init if config.init == "model-points" else "none",
         photos=photos,
         roll=roll,
+        masks="" if masks is None else os.path.abspath(masks),
+        mask_means=mask_means,
     )
     base = out
     unposed = is_unposed(scene)

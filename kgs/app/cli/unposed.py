@@ -46,7 +46,8 @@ def find_scene(
     for note in notes_on(photos):
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
-        report = pose_photos(photos, out, seed=seed, wait=True, stage=each, say=say)
+        masks = request.masks or None
+        report = pose_photos(photos, out, seed=seed, masks=masks, wait=True, stage=each, say=say)
     largest = max(report["size"])
     wanted = largest if size is None else size
     if request.downscale is not None:
@@ -59,6 +60,7 @@ def find_scene(
         hold_out=request.hold_out or 0,
         downscale=max(1.0, largest / wanted),
         title=photos.resolve().name,
+        masks="",  # they are beside the copies of the photos
     )
     return loaded_as, Path(report["folder"])
 

@@ -34,6 +34,7 @@ class Agreed(NamedTuple):
 def agreed_cameras(
     photos: list[Photo],
     images: Path,
+    masks: Path,
     work: Path,
     names: Mapping[str, str],
     seed: int,
@@ -46,6 +47,7 @@ def agreed_cameras(
     Args:
         photos: the photos, all of one size.
         images: the folder where they are as PNGs.
+        masks: the folder of their masks, which exists if there are any.
         work: a folder for what the solvers write.
         names: the names of the photos by those of the PNGs, in the order of `photos`.
         seed: of the solvers.
@@ -67,6 +69,7 @@ def agreed_cameras(
             second,
             images=str(_without_alpha(photos, images, work, names)),
             names=list(names),
+            masks=str(masks) if masks.is_dir() else None,
             lens=lens.params_to_string() if lens.has_prior_focal_length else None,
             seed=seed,
         )

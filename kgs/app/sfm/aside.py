@@ -102,7 +102,7 @@ def _failure(code: int, said: str, database: Path) -> Exception:
 
 
 def _write_colmap_matches(
-    pycolmap: Any, database: str, images: str, names: list[str], lens: str | None, seed: int
+    pycolmap: Any, database: str, images: str, names: list[str], lens: str | None, masks: str | None, seed: int
 ) -> None:
     """Write COLMAP's own keypoints and verified matches of photos; without `lens`, COLMAP guesses it from their files.
 
@@ -112,12 +112,15 @@ def _write_colmap_matches(
         images: the folder of the photos.
         names: of the photos in it.
         lens: the parameters of their SIMPLE_RADIAL lens, where they are known.
+        masks: the folder of their masks, named as the photos with .png behind; None: all of each photo is kept.
         seed: of the verification.
     """
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     if lens is not None:
         reader.camera_params = lens
+    if masks is not None:
+        reader.mask_path = masks
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = 1
     extraction.use_gpu = False

@@ -36,9 +36,9 @@ class PhotoKeypoints(NamedTuple):
 
 
 def find_keypoints(photo: Photo, most: int) -> PhotoKeypoints:
-    """The strongest SIFT keypoints of a photo, up to `most`; nothing is random."""
+    """The strongest SIFT keypoints of a photo where it is kept, up to `most`; nothing is random."""
     factor = 2 if max(photo.size) < SMALL else 1
-    keypoints = root_sift(photo.grey(), most, factor, contrastThreshold=_CONTRAST)
+    keypoints = root_sift(photo.grey(), most, factor, photo.mask, contrastThreshold=_CONTRAST)
     places = (keypoints.places + 0.5).float()
     sizes = keypoints.sizes.float()
     angles = keypoints.angles.float()

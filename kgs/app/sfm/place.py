@@ -1,4 +1,4 @@
-"""Where photos and cameras go: `images`, `sparse/0` and `photos.json` in a folder, all three or none.
+"""Where photos and cameras go: `images`, `masks`, `sparse/0` and `photos.json` in a folder, all or none.
 
 New ones go through `unfinished-photos` and `finished-photos`, see `Staging`. Beside a fit, which belongs to the former
 cameras, they wait in the second folder until the new fit is there.
@@ -16,6 +16,7 @@ from kgs.json_files import read_json
 
 REPORT = CAMERAS_REPORT
 IMAGES = "images"
+MASKS = "masks"
 MODEL = "sparse/0"
 
 
@@ -24,7 +25,7 @@ def check_place(out: Path, folder: Path) -> None:
     advice = "choose another folder"
     photos = folder.resolve()
     staging = photo_staging(out)
-    results = [out / IMAGES, out / "sparse"]
+    results = [out / IMAGES, out / MASKS, out / "sparse"]
     temporary = [staging.unfinished, staging.finished]
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in [*results, *temporary]):
         raise DataError(out, "", f"holds the photos themselves: {advice}")
@@ -38,8 +39,9 @@ def is_reusable(out: Path, inputs: dict[str, Any]) -> bool:
     try:
         report = read_json(out / REPORT)
         images = [out / IMAGES / str(photo["image"]) for photo in report["photos"].values()]
+        masks = [out / MASKS / f"{photo['image']}.png" for photo in report["photos"].values() if photo.get("mask")]
     except (DataError, KeyError, TypeError, AttributeError):
         return False
-    files = [*images, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]
-    unchanged = all(report.get(key) == value for key, value in inputs.items())
+    files = [*images, *masks, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]
+    unchanged = all(report.get(key, {}) == value for key, value in inputs.items())
     return unchanged and all(path.is_file() for path in files)

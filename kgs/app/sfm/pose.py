@@ -4,6 +4,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from hashlib import sha256
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -15,6 +16,7 @@ import torch
 from kgs.app.console import say
 from kgs.app.files.outputs import png_names
 from kgs.app.files.results_folder import locked, photo_staging
+from kgs.datasets.masks import mask_folder
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 from kgs.progress import Stage, silent
@@ -26,9 +28,9 @@ from .gates import FEWEST_POINTS, FOCAL_RANGE, LEAST_RISE, MOST_DEGREES, MOST_RA
 from .leave_out import unlike_others
 from .map import Cameras, lens_of_scene, quiet_pycolmap
 from .match import exif_focal
-from .place import IMAGES, MODEL, REPORT, check_place, is_reusable
+from .place import IMAGES, MASKS, MODEL, REPORT, check_place, is_reusable
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
-from .write import level_and_scale, write_images, write_model
+from .write import level_and_scale, write_images, write_masks, write_model
 
 SETTINGS = 5  # increased by every change after which the same photos give other files
 
@@ -38,6 +40,7 @@ def pose_photos(
     out: str | PathLike[str],
     *,
     seed: int = 0,
+    masks: str | PathLike[str] | None = None,
     wait: bool = False,
     stage: Stage = silent,
     say: Callable[[str], None] = say,
@@ -55,6 +58,8 @@ def pose_photos(
     Args:
         folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into.
         out: the folder for the results, created if it does not exist.
+        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one. What
+            is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         wait: leave new files in `out/finished-photos` if `out` holds a fit, which belongs to the former cameras.
         stage: shows how far each part is, as `kgs.app.console.each` does.
@@ -79,8 +84,13 @@ def pose_photos(
         pass
     paths = find_photos(folder)
     check_place(out, folder)
-    opened = open_photos(paths)
-    inputs = {"settings": SETTINGS, "seed": seed, "sha256": {photo.path.name: photo.sha256 for photo in opened}}
+    opened = open_photos(paths, mask_folder(folder) if masks is None else Path(masks))
+    inputs = {
+        "settings": SETTINGS,
+        "seed": seed,
+        "sha256": {photo.name: photo.sha256 for photo in opened},
+        "masks_sha256": {photo.name: sha256(photo.mask.file.load()).hexdigest() for photo in opened if photo.mask},
+    }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         staging = photo_staging(out)
@@ -134,10 +144,12 @@ def find_cameras(
         png = png_names(names)
         photo_names = {image: name for name, image in png.items()}
         write_images(images, photos, list(png.values()))
+        write_masks(new / MASKS, photos, list(png.values()))
         lap("photos")
-        found = agreed_cameras(photos, images, work, photo_names, seed, stage, lap, say)
+        found = agreed_cameras(photos, images, new / MASKS, work, photo_names, seed, stage, lap, say)
         for name in found.left_out:
             (images / png[name]).unlink()
+            (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
             say(f"the photos do not tell the focal length; the Exif says {found.held:.0f} pixels, and that is taken")
         photos = [photo for photo in photos if photo.path.name not in found.left_out]
@@ -157,6 +169,7 @@ def find_cameras(
                 "image": png[photo.path.name],
                 "points": chosen.points[photo.path.name],
                 "blurred": photo.path.name in unsharp,
+                "mask": photo.mask is not None,
                 "exif_focal_35mm": photo.exif.focal_35mm,
             }
             for photo in photos

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import ImageFile, turn
 from kgs.datasets.images import Intrinsics
+from kgs.datasets.masks import Mask, find_masks
 from kgs.errors import DataError
 from kgs.progress import Stage
 
@@ -86,6 +87,7 @@ class OpenPhoto(NamedTuple):
     exif: Exif
     size: tuple[int, int]  # width and height of the upright photo
     image: ImageFile
+    mask: Mask | None
 
     @property
     def name(self) -> str:
@@ -105,6 +107,7 @@ class Photo:
     path: Path
     exif: Exif
     pixels: NDArray[np.uint8]  # `(H, W, 3)` RGB or `(H, W, 4)` RGBA, not premultiplied
+    mask: NDArray[np.uint8] | None = None  # `(H, W)`, 255 where the photo is kept, 0 elsewhere; None: all is
 
     @property
     def size(self) -> tuple[int, int]:
@@ -133,16 +136,19 @@ class Photo:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(self.opaque()), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def open_photos(paths: list[Path]) -> list[OpenPhoto]:
+def open_photos(paths: list[Path], masks: Path | None = None) -> list[OpenPhoto]:
     """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
 
+    `masks` is a folder with masks of photos.
+
     Raises:
-        DataError: a file cannot be read or is not a photo.
+        DataError: a file cannot be read or is not a photo, or a mask is of no photo.
     """
-    return [_open(path) for path in paths]
+    found = find_masks(paths, masks)
+    return [_open(path, found.get(path)) for path in paths]
 
 
-def _open(path: Path) -> OpenPhoto:
+def _open(path: Path, mask: Mask | None) -> OpenPhoto:
     image = ImageFile(path)
     data = image.load()
     if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
@@ -150,7 +156,7 @@ def _open(path: Path) -> OpenPhoto:
     exif = Exif.of(image.metadata.tags)
     width, height = image.size
     size = (height, width) if exif.is_sideways else (width, height)
-    return OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image)
+    return OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image, mask)
 
 
 def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
@@ -171,8 +177,23 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
         if pixels.shape[1::-1] != stored:
             pixels = np.asarray(cv2.resize(pixels, stored, interpolation=cv2.INTER_AREA), np.float32)
         upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
-        photos.append(Photo(photo.path, photo.exif, np.ascontiguousarray(upright)))
+        photos.append(Photo(photo.path, photo.exif, np.ascontiguousarray(upright), _mask(photo, size)))
     return photos
+
+
+def _mask(photo: OpenPhoto, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """The mask of an upright photo of this size; its file is upright, too, unless its shape is that of the stored one.
+
+    Raises:
+        DataError: it cannot be read, has another shape, or keeps nothing.
+    """
+    if photo.mask is None:
+        return None
+    photo.mask.file.load()
+    is_upright = Intrinsics(*size, 1, 1, 0, 0).same_aspect(*photo.mask.file.size)
+    orientation = photo.exif.orientation if photo.exif.is_sideways and not is_upright else 1
+    kept = photo.mask.read(photo.path, *(size[::-1] if orientation > 1 else size))
+    return np.ascontiguousarray(turn(np.where(kept >= 0.5, np.uint8(255), np.uint8(0)), orientation))
 
 
 def blurred(photos: list[Photo]) -> list[Photo]:

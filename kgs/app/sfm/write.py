@@ -24,6 +24,15 @@ def write_images(folder: Path, photos: list[Photo], names: list[str], opaque: bo
         write_png(folder / name, torch.from_numpy(pixels).permute(2, 0, 1) / 255)
 
 
+def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
+    """Write the masks of photos that have one, named as COLMAP wants them: as the photo, with .png behind."""
+    for photo, name in zip(photos, names, strict=True):
+        if photo.mask is not None:
+            folder.mkdir(exist_ok=True)
+            grey = torch.from_numpy(photo.mask)[None].expand(3, -1, -1)
+            write_png(folder / f"{name}.png", grey / 255)
+
+
 def level_and_scale(cameras: Cameras) -> None:
     """Turn, scale and move the world: up is the cameras' common up, the median depth of a seen point is 1.
 
