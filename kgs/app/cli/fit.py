@@ -61,10 +61,10 @@ def fit(
             cameras of photos are found first (extra sfm).
         out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 the film.
         views: number of training views, spread over those that are not held out. Unless given: all of them.
-        hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the scene's files say, or every
-            eighth photo; of photos without poses none.
-        size: reduce the photos to this many pixels on their longer side. Unless given: 504 for photos without poses on
-            a CPU, else their own size. Or field: that of published tables. Or a folder of photos in several sizes, as
+        hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the files say, or every eighth;
+            unposed: none.
+        size: reduce the photos to this many pixels on their longer side. Unless given: 504 for unposed photos on a CPU,
+            else their own size. Or field: that of published tables. Or a folder of photos in several sizes, as
             images_4.
         downscale: reduce the photos by this factor instead.
         background: the colour behind photos with transparency.
