@@ -68,8 +68,8 @@ def fit(
             images_4.
         downscale: reduce the photos by this factor instead.
         background: the colour behind photos with transparency.
-        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside them.
-        mask_means: what black in them means: look away, or nothing is there.
+        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos.
+        mask_means: what black in a mask means. away: look away, somebody walked by. absent: nothing is there.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
