@@ -39,7 +39,7 @@ def is_reusable(out: Path, inputs: dict[str, Any]) -> bool:
     try:
         report = read_json(out / REPORT)
         images = [out / IMAGES / str(photo["image"]) for photo in report["photos"].values()]
-        masks = [out / MASKS / f"{photo['image']}.png" for photo in report["photos"].values() if photo.get("mask")]
+        masks = [out / MASKS / f"{path.name}.png" for path in images] if inputs["masks_sha256"] else []
     except (DataError, KeyError, TypeError, AttributeError):
         return False
     files = [*images, *masks, *(out / MODEL / f"{name}.bin" for name in ("cameras", "images", "points3D"))]

@@ -169,7 +169,6 @@ def find_cameras(
                 "image": png[photo.path.name],
                 "points": chosen.points[photo.path.name],
                 "blurred": photo.path.name in unsharp,
-                "mask": photo.mask is not None,
                 "exif_focal_35mm": photo.exif.focal_35mm,
             }
             for photo in photos

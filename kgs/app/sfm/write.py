@@ -25,12 +25,16 @@ def write_images(folder: Path, photos: list[Photo], names: list[str], opaque: bo
 
 
 def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
-    """Write the masks of photos that have one, named as COLMAP wants them: as the photo, with .png behind."""
+    """Write masks of all photos if any has one, named as COLMAP wants them: as the photo, with .png behind.
+
+    COLMAP skips photos that have none: their masks are white.
+    """
+    if all(photo.mask is None for photo in photos):
+        return
+    folder.mkdir()
     for photo, name in zip(photos, names, strict=True):
-        if photo.mask is not None:
-            folder.mkdir(exist_ok=True)
-            grey = torch.from_numpy(photo.mask)[None].expand(3, -1, -1)
-            write_png(folder / f"{name}.png", grey / 255)
+        white = torch.ones(3, *photo.pixels.shape[:2])
+        write_png(folder / f"{name}.png", white if photo.mask is None else white * torch.from_numpy(photo.mask) / 255)
 
 
 def level_and_scale(cameras: Cameras) -> None:
