@@ -80,9 +80,9 @@ FOLDERS = {  # what is in them, and what is said of it
         ("1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
     "video called JPEG": (lambda at: save(at, planes(), z_jpg=VIDEO), ("z.jpg: is a HEIC photo or a video", "sips")),
-    "video": (
-        lambda at: save(at, [], clip_MOV=VIDEO),
-        ("clip.MOV is a video", 'ffmpeg -i "clip.MOV"', "3 to 12 sharp ones"),
+    "videos": (
+        lambda at: save(at, [], clip_MOV=VIDEO, other_mp4=VIDEO),
+        ("several videos (clip.MOV, other.mp4): name one",),
     ),
     "one twice": (
         lambda at: save(at, [*planes()[:2], planes()[1]]),
@@ -118,11 +118,6 @@ def test_what_a_folder_holds_instead_is_told(tmp_path, refused, kind):
     fill, said = (FOLDERS | SLOW_FOLDERS)[kind]
     fill(tmp_path / "photos")
     refused(tmp_path / "photos", *said)
-
-
-def test_a_video_alone_is_told(folder, refused):
-    save(folder, [], clip_MOV=VIDEO)
-    refused(folder / "clip.MOV", "is a video", "ffmpeg")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")

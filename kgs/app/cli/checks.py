@@ -68,10 +68,15 @@ def check_scene(scene: Path) -> None:
 
 
 def check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
-    """Check a folder of unposed photos, and the options about them; only `downscale` needs the photos' headers."""
-    from kgs.app.sfm.find import find_photos
+    """Check a folder of unposed photos, and the options about them; only `downscale` needs the photos' headers.
+
+    Nothing of a video can be told before its frames are looked at.
+    """
+    from kgs.app.sfm.find import find_photos, find_video
     from kgs.app.sfm.place import check_place
 
+    if find_video(folder):
+        return
     paths = find_photos(folder)
     check_place(out, folder)
     most = len(paths) - (1 if hold_out else 0)

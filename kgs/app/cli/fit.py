@@ -40,6 +40,7 @@ def fit(
     size: int | str | None = None,
     downscale: float | None = None,
     background: Background = "black",
+    frames: int | None = None,
     masks: Existing | None = None,
     mask_means: Literal["away", "absent"] = "away",
     preset: Literal["auto", "paper", "plain"] = "auto",
@@ -57,8 +58,8 @@ def fit(
       kgs fit fern -o fern-3 --views 3 --size 504
 
     Args:
-        scene: a folder of 3 or more photos, or a scene with camera poses (LLFF, COLMAP, Blender or nerfstudio). The
-            cameras of photos are found first (extra sfm).
+        scene: a folder of 3 or more photos, a video, or a scene with camera poses (LLFF, COLMAP, Blender or
+            nerfstudio). The cameras of photos are found first (extra sfm).
         out: folder for the results: index.html is the page to look at, turntable.webm or .mp4 the film.
         views: number of training views, spread over those that are not held out. Unless given: all of them.
         hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the files say, or every eighth;
@@ -68,6 +69,8 @@ def fit(
             images_4.
         downscale: reduce the photos by this factor instead.
         background: the colour behind photos with transparency.
+        frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
+            where it moves far.
         masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos.
         mask_means: what black in a mask means. away: look away, somebody walked by. absent: nothing is there.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
@@ -119,7 +122,7 @@ def fit(
     if unposed:
         stages.begin("cameras")
         assert not isinstance(size, str)  # refused before
-        request, base = find_scene(scene, out, request, config.seed, size)
+        request, base = find_scene(scene, out, request, config.seed, size, frames)
     elif is_own(out / CAMERAS_REPORT):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size == "field":
@@ -172,6 +175,7 @@ def check_fit(
     hold_out: int | None,
     size: int | str | None,
     downscale: float | None,
+    frames: int | None,
     roll: float,
     lpips_weights: Path | None,
     config: FitConfig,
@@ -180,6 +184,7 @@ def check_fit(
     """Check the arguments of `kgs fit`."""
     from kgs.app.files.outputs import check_folder
     from kgs.app.files.results_folder import replaced_files
+    from kgs.app.sfm.find import FEWEST, find_video
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
 
@@ -196,6 +201,10 @@ def check_fit(
     if views is not None and views < 1:
         raise ValueError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
+    if frames is not None and frames < FEWEST:
+        raise ValueError(f"frames: expected at least {FEWEST}, got {frames}")
+    if frames is not None and find_video(scene) is None:
+        raise ValueError("frames: expected a video to take them from, got photos")
     unposed = is_unposed(scene)
     if unposed and isinstance(size, str):
         raise ValueError(f"size: expected pixels for photos without camera poses, got {size!r}")

@@ -22,32 +22,34 @@ def is_unposed(scene: Path) -> bool:
 
 
 def find_scene(
-    photos: Path, out: Path, request: "SceneRequest", seed: int, size: int | None = None
+    photos: Path, out: Path, request: "SceneRequest", seed: int, size: int | None = None, frames: int | None = None
 ) -> "tuple[SceneRequest, Path]":
     """Find the cameras of unposed photos; returns how to load the scene, and the folder it is in.
 
     The folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
 
     Args:
-        photos: the folder of the photos.
+        photos: the folder of the photos, or a video.
         out: that of the results, which gets `images`, `sparse/0` and `photos.json`.
         request: what the user asked for. No photo is held out unless it says so. Its `downscale` divides the photos as
             they came, that of the result the smaller copies in `images`.
         seed: of the solvers.
         size: longer side of the photos in the fit, in pixels.
+        frames: the number of frames that are taken from a video.
 
     Raises:
         DataError: as of `pose_photos`.
     """
     from kgs.app.sfm import pose_photos
-    from kgs.app.sfm.find import notes_on
+    from kgs.app.sfm.find import find_video, notes_on
 
     complete_stopped_move(out)  # with its cameras, before others wait in their place
-    for note in notes_on(photos):
+    video = find_video(photos)
+    for note in () if video else notes_on(photos):
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         masks = request.masks or None
-        report = pose_photos(photos, out, seed=seed, masks=masks, wait=True, stage=each, say=say)
+        report = pose_photos(photos, out, seed=seed, masks=masks, frames=frames, wait=True, stage=each, say=say)
     largest = max(report["size"])
     wanted = largest if size is None else size
     if request.downscale is not None:
@@ -59,7 +61,7 @@ def find_scene(
         scene=".",
         hold_out=request.hold_out or 0,
         downscale=max(1.0, largest / wanted),
-        title=photos.resolve().name,
+        title=video.stem if video else photos.resolve().name,
         masks="",  # they are beside the copies of the photos
     )
     return loaded_as, Path(report["folder"])

@@ -24,22 +24,20 @@ def find_photos(folder: Path) -> list[Path]:
     Raises:
         DataError: the folder does not exist, it holds fewer than 3 photos, or photos of a kind that cannot be read.
     """
-    if folder.is_file() and folder.suffix.lower() in VIDEO_SUFFIXES:
-        raise DataError(folder, "", _from_video(folder))
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = list_photos(folder)
     if lost := [path for path in list_images(folder, _readable()) if not path.exists()]:
         raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed(lost)}")
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
-    videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
+    videos = [path for path in files if _is_video(path)]
     unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
     converted = _converted(folder)
     if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
         wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed(others)}). "
         raise DataError(folder, "", wrong + CONVERT)
     if not paths and videos:
-        raise DataError(folder, "", _from_video(videos[0]))
+        raise DataError(folder, "", f"holds no photos but several videos ({listed(videos)}): name one of them")
     if not paths:
         deeper = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds_photos(path)]
         if deeper:
@@ -51,6 +49,20 @@ def find_photos(folder: Path) -> list[Path]:
         reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed(paths)}). {ADVICE}"
         raise DataError(folder, "", reason)
     return paths
+
+
+def find_video(path: Path) -> Path | None:
+    """The video that is meant by a path: this file, or the only one in a folder without photos; None: there is none."""
+    if path.is_file():
+        return path if _is_video(path) else None
+    if not path.is_dir() or list_images(path, (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)):
+        return None
+    videos = [file for file in sorted(path.iterdir()) if file.is_file() and _is_video(file)]
+    return videos[0] if len(videos) == 1 else None
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -88,11 +100,3 @@ def _holds_photos(folder: Path) -> bool:
         return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES) for path in folder.iterdir())
     except OSError:
         return False
-
-
-def _from_video(path: Path) -> str:
-    line = f'ffmpeg -i "{path.name}" -vf fps=1 frames/%03d.jpg'
-    return (
-        f"{path.name} is a video, not photos. Take frames from it (`mkdir frames && {line}` takes one a second), "
-        "keep 3 to 12 sharp ones that overlap, and name their folder"
-    )

@@ -8,6 +8,7 @@ from hashlib import sha256
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -17,19 +18,21 @@ from kgs.app.console import say
 from kgs.app.files.outputs import png_names
 from kgs.app.files.results_folder import locked, photo_staging
 from kgs.datasets.masks import mask_folder
+from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 from kgs.progress import Stage, silent
 
 from .agree import agreed_cameras, say_left_out
 from .aside import check_space
-from .find import find_photos
+from .find import find_photos, find_video
 from .gates import FEWEST_POINTS, FOCAL_RANGE, LEAST_RISE, MOST_DEGREES, MOST_RATIO
 from .leave_out import unlike_others
 from .map import Cameras, lens_of_scene, quiet_pycolmap
 from .match import exif_focal
 from .place import IMAGES, MASKS, MODEL, REPORT, check_place, is_reusable
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
+from .video import take_frames
 from .write import level_and_scale, write_images, write_masks, write_model
 
 SETTINGS = 5  # increased by every change after which the same photos give other files
@@ -41,6 +44,7 @@ def pose_photos(
     *,
     seed: int = 0,
     masks: str | PathLike[str] | None = None,
+    frames: int | None = None,
     wait: bool = False,
     stage: Stage = silent,
     say: Callable[[str], None] = say,
@@ -56,11 +60,13 @@ def pose_photos(
         -y: the cameras' common up. The median depth of a point in the photos that see it is 1.
 
     Args:
-        folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into.
+        folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into. Or a video, or a folder
+            with one and without photos.
         out: the folder for the results, created if it does not exist.
         masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one. What
             is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
+        frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
         wait: leave new files in `out/finished-photos` if `out` holds a fit, which belongs to the former cameras.
         stage: shows how far each part is, as `kgs.app.console.each` does.
         say: called with each line for the user.
@@ -80,6 +86,9 @@ def pose_photos(
     """
     folder = Path(folder)
     out = Path(out)
+    options: dict[str, Any] = {"seed": seed, "masks": masks, "wait": wait, "stage": stage, "say": say}
+    if video := find_video(folder):
+        return _pose_video(video, out, frames, options)
     with quiet_pycolmap():  # a missing package is an error before any work
         pass
     paths = find_photos(folder)
@@ -117,6 +126,18 @@ def pose_photos(
         if place is not None:
             say_left_out(report.get("left_out", {}), say)
         return {**report, "reused": place is not None, "folder": str(posed)}
+
+
+def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, Any]) -> dict[str, Any]:
+    """Find the cameras of a video's frames; errors about these name the video."""
+    with TemporaryDirectory(prefix="kgs-") as name:
+        folder = Path(name) / video.stem
+        folder.mkdir()
+        take_frames(video, folder, frames, options["stage"], options["say"])
+        try:
+            return pose_photos(folder, out, **options)
+        except DataError as error:
+            raise DataError(video if Path(error.path) == folder else error.path, error.field, error.reason) from error
 
 
 def find_cameras(

@@ -198,11 +198,11 @@ def _mask(photo: OpenPhoto, size: tuple[int, int]) -> NDArray[np.uint8] | None:
 
 def blurred(photos: list[Photo]) -> list[Photo]:
     """Photos that have far less fine detail than the others."""
-    sharpness = np.array([_sharpness(photo.grey()) for photo in photos])
-    return [photo for photo, value in zip(photos, sharpness, strict=True) if value < _BLURRED * np.median(sharpness)]
+    values = np.array([sharpness(photo.grey()) for photo in photos])
+    return [photo for photo, value in zip(photos, values, strict=True) if value < _BLURRED * np.median(values)]
 
 
-def _sharpness(grey: NDArray[np.uint8]) -> float:
+def sharpness(grey: NDArray[np.uint8]) -> float:
     """How much of the contrast is fine: standard deviation of the Laplacian over that of the smoothed brightness."""
     values = grey.astype(np.float32)
     return float(cv2.Laplacian(values, cv2.CV_32F).std() / (cv2.GaussianBlur(values, (0, 0), 4.0).std() + 1.0))

@@ -1,0 +1,184 @@
+"""Takes photos from a video: the sharpest frames, spread so that neighbours overlap.
+
+How far the camera moved is told by points that are tracked from frame to frame: the angle under which a camera with a
+usual lens would see their median way. Frames between which they hardly moved count as one place, however long the
+camera rested there.
+
+Source: B. Lucas and T. Kanade, An iterative image registration technique, IJCAI 1981 (OpenCV's pyramidal version).
+"""
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kgs.app.files.outputs import write_png
+from kgs.errors import DataError
+from kgs.progress import Stage
+
+from .find import FEWEST
+from .match import DEFAULT_FOCAL
+from .read import sharpness
+
+FRAMES = 12
+MOST_FRAMES = 36  # where twelve would be too far apart
+LEAST_DEGREES = 3.0  # between neighbours
+MOST_DEGREES = 10.0
+_LOOKED_AT = 500  # frames, spread over the video
+_LONGEST = 480  # pixels of a frame that is looked at
+_STEP = 0.75  # degrees by which the camera moves at least before points are chosen anew
+_TRACKED = 400  # points
+_LOST = 30  # points, of which fewer tell no motion
+
+Grey = NDArray[np.uint8]
+Points = NDArray[np.float32]  # `(N, 1, 2)`, pixels
+
+
+class _Frame(NamedTuple):
+    """A frame that was looked at."""
+
+    number: int  # in the video
+    sharpness: float
+    way: float  # by how many degrees the camera had moved
+
+
+def take_frames(video: Path, folder: Path, count: int | None, stage: Stage, say: Callable[[str], None]) -> list[Path]:
+    """Write frames of a video to a folder, upright as its header says, as PNGs in the order of time.
+
+    Args:
+        video: a file that OpenCV reads.
+        folder: an empty folder.
+        count: the number of frames; None: twelve, fewer where neighbours would be less than 3 degrees apart, and up to
+            36 where they would be more than 10 apart.
+        stage: shows how far the work is.
+        say: called with a line about the frames.
+
+    Raises:
+        DataError: the file is not a video that can be read, or the camera moves too little in it.
+    """
+    frames = _look(video, stage)
+    way = frames[-1].way
+    least = _STEP * ((count or FEWEST) - 1)
+    if way < least or len(frames) < FEWEST:
+        expected = f"expected a video in which the camera moves by {least:g} degrees or more"
+        raise DataError(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
+    if count is None:
+        count = max(FEWEST, min(FRAMES, round(way / LEAST_DEGREES) + 1))
+        count = max(count, min(MOST_FRAMES, math.ceil(way / MOST_DEGREES) + 1))
+    indices = _sharpest(frames, count)
+    paths = []
+    with _Reader(video) as reader:
+        for index in stage(indices, "frames", "frame"):
+            pixels = reader.read(index)
+            if pixels is None:
+                raise DataError(video, "", f"frame {index} could be decoded once, and now cannot")
+            paths.append(folder / f"frame_{index:05d}.png")
+            write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1) / 255)
+    say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
+    return paths
+
+
+def _look(video: Path, stage: Stage) -> list[_Frame]:
+    """Frames spread over a video, at least one, with their sharpness and how far the camera had moved."""
+    frames = list[_Frame]()
+    with _Reader(video) as reader:
+        motion = _Motion()
+        every = max(1, reader.count // _LOOKED_AT)
+        for index in stage(range(0, reader.count, every), "video", "frame"):
+            pixels = reader.read(index)
+            if pixels is None:
+                break
+            grey = _small(pixels)
+            frames.append(_Frame(index, sharpness(grey), motion.way_to(grey)))
+    if not frames:
+        raise DataError(video, "", "expected a video, got a file without frames that can be decoded")
+    return frames
+
+
+def _sharpest(frames: list[_Frame], count: int) -> list[int]:
+    """The indices of so many frames: of each stretch of the way the sharpest in its middle half."""
+    ways = np.array([frame.way for frame in frames])
+    sharp = np.array([frame.sharpness for frame in frames])
+    targets = np.linspace(0, ways[-1], count)
+    reach = ways[-1] / (count - 1) / 4
+    chosen = list[int]()
+    for target in targets:
+        near = np.flatnonzero(np.abs(ways - target) <= reach)
+        near = near if len(near) else np.array([np.abs(ways - target).argmin()])
+        best = int(near[sharp[near].argmax()])
+        if not chosen or frames[best].number > chosen[-1]:
+            chosen.append(frames[best].number)
+    return chosen
+
+
+class _Motion:
+    """Tells by how many degrees a camera has moved on its way."""
+
+    def __init__(self) -> None:
+        self._way = 0.0  # to where the points were chosen
+        self._last: Grey | None = None
+        self._start: Points = np.zeros((0, 1, 2), np.float32)  # where the points were then
+        self._points: Points = self._start
+
+    def way_to(self, grey: Grey) -> float:
+        """The degrees up to the next frame."""
+        if self._last is None:
+            self._choose(grey)
+            return 0.0
+        if len(self._points):
+            points, found, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, self._points, self._points.copy())
+            kept = found[:, 0] == 1
+            self._start = self._start[kept]
+            self._points = np.asarray(points[kept], np.float32)
+        self._last = grey
+        shifts = np.linalg.norm(self._points - self._start, axis=2)
+        focal = DEFAULT_FOCAL * max(grey.shape)
+        moved = math.degrees(math.atan(float(np.median(shifts)) / focal)) if len(shifts) >= _LOST else _STEP
+        way = self._way + moved
+        if moved >= _STEP:
+            self._way = way
+            self._choose(grey)
+        return way
+
+    def _choose(self, grey: Grey) -> None:
+        corners = cv2.goodFeaturesToTrack(grey, _TRACKED, 0.01, 7)
+        self._points = np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+        self._start = self._points
+        self._last = grey
+
+
+class _Reader:
+    """Reads frames of a video in the order of time."""
+
+    def __init__(self, video: Path) -> None:
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
+        self._capture = cv2.VideoCapture(str(video))
+        self._next = 0
+        self.count = max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._capture.release()
+
+    def read(self, index: int) -> NDArray[np.uint8] | None:
+        """A frame, `(H, W, 3)` BGR, not before the last one that was read; None behind the end."""
+        while self._next <= index:
+            if not self._capture.grab():
+                return None
+            self._next += 1
+        done, pixels = self._capture.retrieve()
+        return np.asarray(pixels, np.uint8) if done else None
+
+
+def _small(pixels: NDArray[np.uint8]) -> Grey:
+    scale = min(1.0, _LONGEST / max(pixels.shape))
+    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,135 @@
+"""Photos from a video: sharp frames, spread by how far the camera moved, upright as the file's header says."""
+
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from command import run
+from init_point_scenes import texture
+
+from kgs.app.sfm.find import find_video
+from kgs.app.sfm.video import FRAMES, take_frames
+from kgs.errors import DataError
+from kgs.progress import silent
+
+SIZE = (320, 240)
+FOCAL = 0.8 * SIZE[0]
+
+
+def write_video(path: Path, degrees: list[float], blurred: tuple[int, ...] = (), size=SIZE) -> Path:
+    """Frames of a wall along which a camera moves: its points have moved by so many degrees."""
+    wall = texture(0, (220.0, 220.0, 220.0)).astype(np.uint8)
+    code = "MJPG" if path.suffix == ".avi" else "mp4v"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 30, size)
+    assert writer.isOpened()
+    for i, angle in enumerate(degrees):
+        move = np.array([[1, 0, -FOCAL * np.tan(np.radians(angle))], [0, 1, -20.0]])
+        frame = cv2.warpAffine(wall, move, size, borderMode=cv2.BORDER_WRAP)
+        writer.write(cv2.GaussianBlur(frame, (0, 0), 3.0) if i in blurred else frame)
+    writer.release()
+    return path
+
+
+def take(video: Path, count: int | None = None) -> list[int]:
+    folder = video.with_suffix("")
+    folder.mkdir()
+    lines: list[str] = []
+    paths = take_frames(video, folder, count, silent, lines.append)
+    assert paths == sorted(folder.iterdir())
+    assert f"{len(paths)} frames" in lines[-1]
+    return [int(path.stem.removeprefix("frame_")) for path in paths]
+
+
+def test_frames_are_spread_by_motion_and_sharp(tmp_path):
+    rest = [0.0] * 40
+    way = np.linspace(0, 40, 81).tolist()
+    blurred = tuple(range(41, 121, 2))
+    numbers = take(write_video(tmp_path / "clip.avi", rest + way, blurred))
+    assert len(numbers) == FRAMES
+    assert not set(numbers) & set(blurred)
+    angles = np.array([([*rest, *way])[i] for i in numbers])
+    assert np.diff(angles).min() > 1.0  # the camera rests in one frame at most
+    assert np.diff(angles).max() < 7.0
+
+
+@pytest.mark.parametrize(("degrees", "count", "expected"), [(9, None, 4), (155, None, 17), (40, 5, 5), (40, 20, 20)])
+def test_how_many_frames(tmp_path, degrees, count, expected):
+    """Neighbours are 3 to 10 degrees apart, unless a number is given."""
+    equal = np.degrees(np.arctan(np.radians(np.arange(0, degrees + 0.1, 0.5)))).tolist()  # ways in the image
+    assert len(take(write_video(tmp_path / "clip.avi", equal), count)) == expected
+
+
+def test_a_frame_is_upright_as_the_header_says(tmp_path):
+    video = write_video(tmp_path / "clip.mp4", np.linspace(0, 20, 30).tolist())
+    data = video.read_bytes()
+    at = data.index(b"tkhd") + 4 + 40  # version, flags, times, ids, duration, layer and volume, then the matrix
+    one = 1 << 16
+    turned = struct.pack(">9i", 0, one, 0, -one, 0, 0, SIZE[1] * one, 0, 1 << 30)
+    video.write_bytes(data[:at] + turned + data[at + 36 :])
+    number, *_ = take(video, 3)
+    assert number >= 0
+    first = cv2.imread(str(next(video.with_suffix("").iterdir())))
+    assert first.shape[:2] == (SIZE[0], SIZE[1])  # 240 wide, 320 high
+
+
+def broken(path: Path) -> Path:
+    video = write_video(path, [0.0, 5.0, 10.0])
+    video.write_bytes(video.read_bytes()[:200])
+    return video
+
+
+def empty(path: Path) -> Path:
+    path.write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (broken, "expected a video"),
+        (empty, "expected a video"),
+        (lambda path: write_video(path, [0.0]), "camera moves"),
+        (lambda path: write_video(path, [0.0] * 30), "camera moves"),
+    ],
+    ids=["broken", "empty", "one frame", "at rest"],
+)
+def test_a_video_that_gives_no_photos(tmp_path, make, said, capsys):
+    pytest.importorskip("pycolmap")
+    video = make(tmp_path / "clip.mp4")
+    with pytest.raises(DataError, match=said):
+        take(video)
+    assert run("fit", video, "-o", tmp_path / "out") == 2
+    assert "clip.mp4" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "images").exists()
+
+
+def test_ffmpeg_says_nothing_of_a_broken_video(tmp_path):
+    """In a process of its own, since FFmpeg's first use in one decides how much it says."""
+    code = "import sys; from pathlib import Path; from kgs.app.sfm.video import _Reader; _Reader(Path(sys.argv[1]))"
+    done = subprocess.run([sys.executable, "-c", code, broken(tmp_path / "clip.mp4")], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_which_video_is_meant(tmp_path):
+    video = write_video(tmp_path / "clip.avi", [0.0])
+    assert find_video(video) == video
+    assert find_video(tmp_path) == video
+    (tmp_path / "other.MOV").write_bytes(b"")
+    assert find_video(tmp_path) is None  # one of two
+    (tmp_path / "other.MOV").unlink()
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"")
+    assert find_video(tmp_path) is None  # a Live Photo stays a photo
+    assert find_video(tmp_path / "nothing.mp4") is None
+
+
+@pytest.mark.parametrize(("frames", "folder"), [("2", False), ("12", True)])
+def test_frames_are_of_a_video_and_three_at_least(tmp_path, frames, folder, capsys):
+    video = write_video(tmp_path / "clip.avi", [0.0])
+    if folder:
+        cv2.imwrite(str(tmp_path / "0.png"), np.zeros((8, 8, 3), np.uint8))
+    assert run("fit", tmp_path if folder else video, "-o", tmp_path / "out", "--frames", frames) == 2
+    assert "--frames: expected" in capsys.readouterr().err
