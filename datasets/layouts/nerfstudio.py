@@ -115,16 +115,16 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
             image,
             _lens(source, ChainMap(entry, data), size),
             _opencv_pose(source, entry),
-            _mask(source, root, entry),
+            _mask(source, root, ChainMap(entry, data)),
         )
         for name, image, entry in zip(names, images, entries, strict=True)
     ]
     return frames, data, notes
 
 
-def _mask(source: Path, root: Path, entry: Object) -> Mask | None:
-    """The mask that a frame's `mask_path` names."""
-    name = _text(source, "mask_path", entry, "")
+def _mask(source: Path, root: Path, values: Values) -> Mask | None:
+    """The mask that `mask_path` names, of a frame or of all."""
+    name = _text(source, "mask_path", values, "")
     if not name:
         return None
     path = find_file(source, root, name)

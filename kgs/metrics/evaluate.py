@@ -41,9 +41,11 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
         published tables), "lpips_vgg" (images in [-1, 1], as in its training) and "lpips_vgg_unscaled" (in [0, 1],
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
-        what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one).
+        what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one). Where not all
+        pixels count, "counted" is the share that does.
     """
     rows = list[dict[str, Any]]()
+    shares = list[float]()
     for index, name in enumerate(views.names):
         image = render(views.camera(index))
         target = views.images[index : index + 1]
@@ -52,9 +54,12 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
         shown, photo, share = views.compared(index, image)
+        shares.append(share)
         rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
     means = {key: fmean(values) if values and None not in values else None for key, values in columns.items()}
+    if views.counted is not None and shares:
+        means["counted"] = round(fmean(shares), 4)
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
@@ -134,7 +139,9 @@ def as_text(metrics: dict[str, Any]) -> str:
         values = metrics[part] or {}
         measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
         if measured:
-            lines.append(f"{part:>5}: " + ", ".join(measured))
+            share = values.get("counted")
+            where = "" if share is None else f" (of {share:.0%} of the pixels: masks leave out the rest)"
+            lines.append(f"{part:>5}: {', '.join(measured)}{where}")
     coverage = metrics.get("seen") or {}
     level = coverage.get("psnr")
     rest = coverage.get("psnr_rest")

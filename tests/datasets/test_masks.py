@@ -197,5 +197,7 @@ def test_only_pixels_that_count_are_measured(half: Views) -> None:
     whole = evaluate(lambda _: next(renders), plain)
     assert shown["psnr"] == pytest.approx(40.0, abs=0.1)
     assert shown["psnr"] == pytest.approx(whole["psnr"], abs=0.1)
+    assert shown["counted"] == 0.5
+    assert "counted" not in whole
     renders = iter(torch.where(half.counted[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
     assert mean_psnr(lambda _: next(renders), half) == pytest.approx(shown["psnr"], abs=1e-3)

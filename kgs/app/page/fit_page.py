@@ -173,13 +173,17 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _report_facts(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content of photos.json, without hashes and settings; long lists become a range. Missing parts are skipped."""
-    report = {name: value for name, value in content.items() if name not in ("seed", "settings", "sha256", "versions")}
+    skipped = ("seed", "settings", "sha256", "masks_sha256", "versions")
+    report = {name: value for name, value in content.items() if name not in skipped}
     photos = report.pop("photos", None)
+    left_out = report.pop("left_out", None)
     matches = report.pop("matches", None)
     with suppress(AttributeError, KeyError, TypeError, ValueError):
         points = [photo["points"] for photo in photos.values()]
         report["points in a photo"] = f"{min(points)} to {max(points)}"
         report["blurred"] = [name for name, photo in photos.items() if photo["blurred"]]
+    with suppress(AttributeError, TypeError):
+        report |= {f"left out: {name}": why for name, why in left_out.items()}
     with suppress(AttributeError, KeyError, TypeError):
         report["time"] = f"{sum(report.pop('seconds').values()):.0f} s"
     with suppress(IndexError, TypeError, ValueError):
