@@ -33,7 +33,7 @@ from .match import exif_focal
 from .place import IMAGES, MASKS, MODEL, REPORT, check_place, is_reusable
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .video import take_frames
-from .write import level_and_scale, write_images, write_masks, write_model
+from .write import level_and_scale, upright, write_images, write_masks, write_model
 
 SETTINGS = 5  # increased by every change after which the same photos give other files
 
@@ -164,17 +164,24 @@ def find_cameras(
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
         png = png_names(names)
         photo_names = {image: name for name, image in png.items()}
-        write_images(images, photos, list(png.values()))
-        write_masks(new / MASKS, photos, list(png.values()))
+        places = images, new / MASKS
+        write_images(images, [photo.upright() for photo in photos], list(png.values()))
+        write_masks(new / MASKS, [photo.upright() for photo in photos], list(png.values()))
+        turned = {photo.name for photo in photos if photo.is_turned}
+        if turned:
+            places = work / IMAGES, work / MASKS
+            places[0].mkdir()
+            write_images(places[0], photos, list(png.values()))
+            write_masks(places[1], photos, list(png.values()))
         lap("photos")
-        found = agreed_cameras(photos, images, new / MASKS, work, photo_names, seed, stage, lap, say)
+        found = agreed_cameras(photos, *places, work, photo_names, seed, stage, lap, say)
         for name in found.left_out:
             (images / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
             say(f"the photos do not tell the focal length; the Exif says {found.held:.0f} pixels, and that is taken")
         photos = [photo for photo in photos if photo.path.name not in found.left_out]
-        chosen = found.cameras
+        chosen = upright(found.cameras, turned, photo_names)
         level_and_scale(chosen)
         write_model(new / MODEL, chosen, images)
         shutil.rmtree(work)

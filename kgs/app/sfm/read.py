@@ -1,10 +1,13 @@
-"""Reads photos as a phone wrote them: decoded, turned upright, reduced to one size, with what Exif says of the lens."""
+"""Reads photos as a phone wrote them: decoded, turned upright, reduced to one size, with what Exif says of the lens.
+
+Upright and lying photos are one lens's: for the solvers, those of the rarer kind lie on their side.
+"""
 
 import hashlib
 import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -102,12 +105,18 @@ class OpenPhoto(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """One photo, upright and reduced."""
+    """One photo, reduced, and as wide and high as all others."""
 
     path: Path
     exif: Exif
     pixels: NDArray[np.uint8]  # `(H, W, 3)` RGB or `(H, W, 4)` RGBA, not premultiplied
     mask: NDArray[np.uint8] | None = None  # `(H, W)`, 255 where the photo is kept, 0 elsewhere; None: all is
+    is_turned: bool = False  # whether it is upright only after a quarter turn counterclockwise
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.path.name
 
     @property
     def size(self) -> tuple[int, int]:
@@ -118,8 +127,15 @@ class Photo:
     @property
     def focal(self) -> float | None:
         """The focal length in pixels that Exif gives, None if it does not."""
-        ratio = self.exif.focal_ratio(*self.size)
+        ratio = self.exif.focal_ratio(*(self.size[::-1] if self.is_turned else self.size))
         return ratio * max(self.size) if ratio else None
+
+    def upright(self) -> Self:
+        """The photo as it is looked at."""
+        if not self.is_turned:
+            return self
+        mask = None if self.mask is None else np.rot90(self.mask)
+        return replace(self, pixels=np.rot90(self.pixels), mask=mask, is_turned=False)
 
     @property
     def is_opaque(self) -> bool:
@@ -162,22 +178,36 @@ def _open(path: Path, mask: Mask | None) -> OpenPhoto:
 def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     """Decode photos, turn them as their Exif says, and reduce them to the size of the smallest or to 1600 pixels.
 
-    The photos have one shape.
+    The photos have one shape, or that and its upright or lying counterpart; of these two the rarer is turned.
 
     Raises:
         DataError: a photo cannot be decoded.
     """
-    width, height = min(photo.size for photo in opened)
+    lying = [photo.size[0] > photo.size[1] for photo in opened]
+    most_lie = 2 * sum(lying) >= len(opened)
+    width, height = min(sorted(photo.size, reverse=most_lie) for photo in opened)
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     photos = []
     for photo in stage(opened, "photos", "photo"):
         pixels = photo.image.read()
-        stored = size[::-1] if photo.exif.is_sideways else size
+        is_turned = (photo.size[0] > photo.size[1]) != most_lie and width != height
+        upright_size = size[::-1] if is_turned else size
+        stored = upright_size[::-1] if photo.exif.is_sideways else upright_size
         if pixels.shape[1::-1] != stored:
             pixels = np.asarray(cv2.resize(pixels, stored, interpolation=cv2.INTER_AREA), np.float32)
         upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
-        photos.append(Photo(photo.path, photo.exif, np.ascontiguousarray(upright), _mask(photo, size)))
+        mask = _mask(photo, upright_size)
+        quarters = -1 if is_turned else 0  # clockwise
+        photos.append(
+            Photo(
+                photo.path,
+                photo.exif,
+                np.ascontiguousarray(np.rot90(upright, quarters)),
+                None if mask is None else np.ascontiguousarray(np.rot90(mask, quarters)),
+                is_turned,
+            )
+        )
     return photos
 
 
@@ -209,12 +239,17 @@ def sharpness(grey: NDArray[np.uint8]) -> float:
 
 
 def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
-    """The photos by their shape, as "4032x3024": that of the first of each group."""
+    """The photos by their shape, as "4032x3024": that of the first of each group; upright and lying are one."""
     groups: dict[tuple[int, int], list[OpenPhoto]] = defaultdict(list)
     for photo in photos:
-        known = (size for size in groups if Intrinsics(*size, 1, 1, 0, 0).same_aspect(*photo.size))
+        known = (size for size in groups if _same_shape(size, photo.size))
         groups[next(known, photo.size)].append(photo)
     return {f"{width}x{height}": group for (width, height), group in groups.items()}
+
+
+def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    long, short = max(one), min(one)
+    return Intrinsics(long, short, 1, 1, 0, 0).same_aspect(max(other), min(other))
 
 
 def by_lens(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:

@@ -1,6 +1,7 @@
 """Photos and cameras as files, as COLMAP has them: PNGs, and a binary model that is upright and scaled."""
 
 import errno
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,17 @@ from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_po
 from kgs.errors import DataError
 
 from .aside import check_space
-from .map import Cameras, quiet_pycolmap
+from .map import Cameras, cameras_of, lens_of_scene, quiet_pycolmap
 from .read import Photo
+
+_COUNTERCLOCKWISE = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # as the picture turns
 
 
 def write_images(folder: Path, photos: list[Photo], names: list[str], opaque: bool = False) -> None:
     """Write the photos, or these over black, as PNGs without metadata: another JPEG compression would lose detail."""
     for photo, name in zip(photos, names, strict=True):
         pixels = photo.opaque() if opaque else photo.pixels
-        write_png(folder / name, torch.from_numpy(pixels).permute(2, 0, 1) / 255)
+        write_png(folder / name, torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1) / 255)
 
 
 def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
@@ -34,7 +37,47 @@ def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
     folder.mkdir()
     for photo, name in zip(photos, names, strict=True):
         white = torch.ones(3, *photo.pixels.shape[:2])
-        write_png(folder / f"{name}.png", white if photo.mask is None else white * torch.from_numpy(photo.mask) / 255)
+        kept = white if photo.mask is None else white * torch.from_numpy(np.ascontiguousarray(photo.mask)) / 255
+        write_png(folder / f"{name}.png", kept)
+
+
+def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cameras:
+    """The cameras with those of photos that were turned clockwise turned back: a second lens for these.
+
+    Args:
+        cameras: of photos of one size.
+        turned: the names of photos that were turned.
+        names: the names of all photos by those of their images.
+    """
+    if turned.isdisjoint(cameras.rotations):
+        return cameras
+    scene = cameras.reconstruction
+    with quiet_pycolmap() as pycolmap:
+        lens = lens_of_scene(scene)
+        focal, x, y, distortion = lens.params
+        other = pycolmap.Camera.create_from_model_name(
+            lens.camera_id + 1, "SIMPLE_RADIAL", focal, lens.height, lens.width
+        )
+        other.params = [focal, y, lens.width - x, distortion]
+        found = pycolmap.Reconstruction()
+        for each in (lens, other):
+            found.add_camera_with_trivial_rig(each)
+        back = pycolmap.Rigid3d(pycolmap.Rotation3d(_COUNTERCLOCKWISE), np.zeros(3))
+        for image_id, image in scene.images.items():
+            if not image.has_pose:
+                continue
+            is_turned = names[image.name] in turned
+            places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+            pose = image.cam_from_world()
+            if is_turned:
+                places = np.stack([places[:, 1], lens.width - places[:, 0]], 1)
+                pose = back * pose
+            camera_id = other.camera_id if is_turned else lens.camera_id
+            new = pycolmap.Image(name=image.name, keypoints=places, camera_id=camera_id, image_id=image_id)
+            found.add_image_with_trivial_frame(new, pose)
+        for point_id, point in scene.points3D.items():
+            found.add_point3D_with_id(point_id, point)
+    return cameras_of(found, names, cameras.focal_rise)
 
 
 def level_and_scale(cameras: Cameras) -> None:
