@@ -41,6 +41,11 @@ class Intrinsics:
         """Whether an image of this size can be a resized one, each side rounded to whole pixels."""
         return abs(width * self.height - height * self.width) <= max(self.width, self.height, width, height)
 
+    def turned(self) -> Self:
+        """The lens of a pinhole camera on an image that was turned by a quarter clockwise: x' = H - y, y' = x."""
+        width, height = self.height, self.width
+        return replace(self, width=width, height=height, fx=self.fy, fy=self.fx, cx=self.height - self.cy, cy=self.cx)
+
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 calibration matrix for integer pixel centres: the one place where half a pixel is subtracted."""
         return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])

@@ -29,6 +29,12 @@ from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
 _LISTED = 20
 _BORDER = "the photos have a dark border, left by undistortion: it counts as part of the lens, not of the scene"
+# A camera whose picture is turned by a quarter clockwise: its x axis is up before, its y axis to the right.
+_CLOCKWISE = torch.tensor(
+    [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+    dtype=torch.float64,
+    device="cpu",
+)
 _COUNTED = 0.99  # share of a pixel that a mask keeps, above which it counts
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
@@ -108,11 +114,12 @@ def load_scene(
             raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {listed}")
         color = torch.tensor(BACKGROUNDS[background], dtype=torch.float32)
         offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; without the test views
-        scales = [_Scale.of(train[0], downscale or 1.0)]
+        first = _usual(train)
+        scales = [_Scale.of(first, downscale or 1.0)]
         height, width = scales[0].size
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
         if photos and downscale is not None and fine_downscale < downscale:
-            scales.append(_Scale.of(train[0], fine_downscale))
+            scales.append(_Scale.of(first, fine_downscale))
         absent = mask_means == "absent"
         make_views = partial(_views, offset=offset, background=color, photos=photos, absent=absent)
         train_per_scale = [_with_border(views) for views in make_views(train, scales)]
@@ -195,6 +202,12 @@ def _split(
     return [frames[i] for i in chosen], test_frames
 
 
+def _usual(frames: Sequence[Frame]) -> Frame:
+    """The first frame of the kind, upright or lying, that most frames are."""
+    lying = [frame.intrinsics.width >= frame.intrinsics.height for frame in frames]
+    return frames[lying.index(2 * sum(lying) >= len(lying))]
+
+
 @dataclass(frozen=True)
 class _Scale:
     """By how much all photos are reduced, and the size that results."""
@@ -218,6 +231,8 @@ def _reduced(width: int, height: int, factor: float) -> tuple[int, int]:
 def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale]) -> None:
     """Refuse a photo whose size is not that of its lens, or not that of the other photos."""
     lens = frame.intrinsics
+    if _is_turned(width, height, scales[0]):
+        width, height, lens = height, width, replace(lens, width=lens.height, height=lens.width)
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
         raise DataError(frame.path, "", f"has {width}x{height} pixels, which is not a scaled version of {described}")
@@ -225,6 +240,12 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
         if _reduced(width, height, scale.factor) != scale.size:
             expected = f"expected {scale.first} pixels as the other images"
             raise DataError(frame.path, "", f"{expected}, got {width}x{height}")
+
+
+def _is_turned(width: int, height: int, scale: _Scale) -> bool:
+    """Whether a photo has to be turned by a quarter to have the size of a scale."""
+    size = _reduced(width, height, scale.factor)
+    return size != scale.size and size == scale.size[::-1]
 
 
 def _views(
@@ -238,6 +259,7 @@ def _views(
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(len(scales), count, 1, 1)
     alphas: list[dict[int, Tensor]] = [{} for _ in scales]
     counted: list[dict[int, Tensor]] = [{} for _ in scales]
+    turned = [False] * count
     for i, frame in enumerate(frames):
         image = None
         if photos:
@@ -263,6 +285,11 @@ def _views(
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
             image = remap(image, maps)
             kept = None if kept is None else remap(kept, maps)
+        turned[i] = _is_turned(width, height, scales[0])
+        if turned[i]:
+            lens = lens.turned()
+            image = None if image is None else np.ascontiguousarray(np.rot90(image, -1))
+            kept = None if kept is None else np.ascontiguousarray(np.rot90(kept, -1))
         for j, scale in enumerate(scales):
             height, width = scale.size
             if image is None:
@@ -276,7 +303,9 @@ def _views(
                 if kept is not None:
                     counted[j][i] = torch.from_numpy(resize(kept, lens, width, height)[0]) > _COUNTED
             intrinsics[j, i, :3, :3] = torch.from_numpy(reduced_lens.matrix())
-    poses = torch.stack([frame.pose for frame in frames]) if frames else torch.zeros(0, 4, 4, dtype=torch.float64)
+    poses = torch.zeros(count, 4, 4, dtype=torch.float64)
+    for i, frame in enumerate(frames):
+        poses[i] = frame.pose @ _CLOCKWISE if turned[i] else frame.pose
     u, _, vh = torch.linalg.svd(poses[:, :3, :3])  # u @ vh is a rotation exactly
     extrinsics = kg.Rt_to_matrix4x4(*kg.camtoworld_to_worldtocam_Rt(u @ vh, poses[:, :3, 3:] - offset[:, None])).float()
     names = tuple(frame.name for frame in frames)
@@ -286,5 +315,7 @@ def _views(
         masks = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
         rows = torch.stack([counted[j].get(i, every) for i in range(count)]) if counted[j] else None
-        views.append(Views(pinholes(intrinsics[j], extrinsics, scale.size), images[j], names, masks, counted=rows))
+        cameras = pinholes(intrinsics[j], extrinsics, scale.size)
+        kinds = tuple(turned) if any(turned) else None
+        views.append(Views(cameras, images[j], names, masks, counted=rows, turned=kinds))
     return views

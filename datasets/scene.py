@@ -37,6 +37,8 @@ class Views:
             below 1 in the dark border that removing a lens's distortion can leave.
         counted: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
             and no keypoints or initial points are taken.
+        turned: whether each photo was turned by a quarter clockwise, and its camera with it, to have the size of the
+            others; None: none was.
 
     Raises:
         TypeError: the images are not a tensor of floating point numbers.
@@ -56,6 +58,7 @@ class Views:
     masks: Tensor | None = None
     light: Tensor | None = None
     counted: Tensor | None = None
+    turned: tuple[bool, ...] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -77,6 +80,8 @@ class Views:
             raise ValueError(f"light: expected shape ({height}, {width}), got {tuple(self.light.shape)}")
         if self.counted is not None and tuple(self.counted.shape) != (count, height, width):
             raise ValueError(f"counted: expected shape ({count}, {height}, {width}), got {tuple(self.counted.shape)}")
+        if self.turned is not None and len(self.turned) != count:
+            raise ValueError(f"turned: expected {count} as names, got {len(self.turned)}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -120,8 +125,16 @@ class Views:
         masks = None if self.masks is None else self.masks[rows]
         counted = None if self.counted is None else self.counted[rows]
         names = tuple(self.names[i] for i in indices)
-        images = self.images[rows]
-        return replace(self, cameras=self.camera(rows), images=images, names=names, masks=masks, counted=counted)
+        turned = None if self.turned is None else tuple(self.turned[i] for i in indices)
+        return replace(
+            self,
+            cameras=self.camera(rows),
+            images=self.images[rows],
+            names=names,
+            masks=masks,
+            counted=counted,
+            turned=turned,
+        )
 
     def as_photo(self, render: Tensor) -> Tensor:
         """A render `(..., H, W)` as these views' photos would show it: clamped to [0, 1], behind their dark border."""
