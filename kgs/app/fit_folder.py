@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kgs.app.console import each, progress, say
+from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
 from kgs.app.files.outputs import check_folder, png_names, write_png
 from kgs.app.files.ownership import is_own
@@ -215,7 +216,7 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     (folder / "test").mkdir(exist_ok=True)
     for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
         render = fit.render(scene.test.camera(i))[0]
-        write_png(folder / "test" / names[name], scene.test.as_photo(render))
+        write_png(folder / "test" / names[name], as_taken(scene.test.as_photo(render), scene.test, i))
     metrics = measure(fit, lpips)
     write_json(folder / "metrics.json", metrics)
     return replace(fit, metrics=metrics, notes=(*fit.notes, *notes))

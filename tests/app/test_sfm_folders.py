@@ -88,10 +88,6 @@ FOLDERS = {  # what is in them, and what is said of it
         lambda at: save(at, [*planes()[:2], planes()[1]]),
         ("2.png: is the same photo as 1.png: remove one of them",),
     ),
-    "upright and lying": (
-        lambda at: save(at, [*planes()[:2], *planes()[:2].transpose(0, 2, 1, 3)]),
-        ("2 (240x180: 0.png, 1.png; 180x240: 2.png, 3.png)",),
-    ),
     "cropped": (
         lambda at: save(at, [*planes()[:2], planes()[0][:120]]),
         ("expected photos of one shape, got 2", "240x120: 2.png", "Cropped"),

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from init_point_scenes import texture
 from photo_folders import exif, planes, with_exif
 
@@ -14,6 +15,7 @@ from kgs.app.sfm.gates import MOST_DEGREES, gap
 from kgs.app.sfm.leave_out import unlike_others, without_cameras, without_overlap
 from kgs.app.sfm.map import Cameras, PairGeometry
 from kgs.app.sfm.read import open_photos
+from kgs.datasets import load_scene
 from kgs.errors import DataError
 
 NAMES = list("abcdef")
@@ -126,3 +128,33 @@ def test_the_others_are_placed_as_if_it_were_not_there(tmp_path):
     again = []
     assert pose_photos(tmp_path / "four", tmp_path / "out4", say=again.append)["reused"]
     assert [line for line in again if "left out" in line] == [line for line in lines if "left out" in line]
+
+
+def test_upright_and_lying_photos_share_a_lens(tmp_path):
+    """Three photos of which one was taken with the camera on its side have the cameras of the three."""
+    pycolmap = pytest.importorskip("pycolmap")
+    lying = list(planes())
+    for name, images in (("lying", lying), ("mixed", [lying[0], np.rot90(lying[1]), lying[2]])):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image)
+    plain = pose_photos(tmp_path / "lying", tmp_path / "out1")
+    mixed = pose_photos(tmp_path / "mixed", tmp_path / "out2")
+    assert mixed["left_out"] == {}
+    assert mixed["focal_px"] == pytest.approx(plain["focal_px"], rel=0.02)
+    model = pycolmap.Reconstruction(tmp_path / "out2" / "sparse" / "0")
+    assert sorted((lens.width, lens.height) for lens in model.cameras.values()) == [(180, 240), (240, 180)]
+    errors = [
+        np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy)
+        for image in model.images.values()
+        for point in image.points2D
+        if point.has_point3D()
+    ]
+    assert len(errors) > 1000
+    assert np.median(errors) < 0.3
+    views = load_scene(tmp_path / "out2", hold_out=0).train
+    assert views.turned == (False, True, False)
+    expected = load_scene(tmp_path / "out1", hold_out=0).train
+    assert float((views.images - expected.images).abs().mean()) < 0.005
+    turns = [part.cameras.extrinsics[1, :3, :3] @ part.cameras.extrinsics[0, :3, :3].T for part in (views, expected)]
+    assert torch.allclose(*turns, atol=0.01)

@@ -41,6 +41,7 @@ def render(
     """
     import torch
 
+    from kgs.app.files.cameras import as_taken
     from kgs.app.files.outputs import check_folder, png_names, write_png
     from kgs.app.files.ownership import writing
     from kgs.camera import move_camera
@@ -62,7 +63,7 @@ def render(
             image = rendering.image
             if is_transparent:  # PNG's colours are not multiplied by alpha
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
-            write_png(out / names[name], image[0])
+            write_png(out / names[name], as_taken(image[0], scene.train, i))
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))
 

@@ -110,6 +110,24 @@ def rolled(views: Views, degrees: float) -> Views:
     )
 
 
+def shown(views: Views, degrees: float = 0.0) -> list[Views]:
+    """The views as they are looked at, in their order, in parts of one size.
+
+    Photos that were turned to have the size of the others are turned back; all are turned clockwise by `degrees`.
+    """
+    if views.turned is None:
+        return [rolled(views, degrees)]
+    return [
+        replace(rolled(views.select([i]), degrees - 90 * is_turned), turned=None)
+        for i, is_turned in enumerate(views.turned)
+    ]
+
+
+def as_taken(image: Tensor, views: Views, index: int) -> Tensor:
+    """A picture `(..., H, W)` of one view, turned back if its photo was turned."""
+    return torch.rot90(image, 1, (-2, -1)) if views.turned and views.turned[index] else image
+
+
 def upright(extrinsics: Tensor) -> Tensor:
     """The rotation from the cameras' world to an upright one, whose y axis is the common up direction of the cameras.
 

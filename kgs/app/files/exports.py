@@ -3,11 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from kgs.app.console import each
-from kgs.app.files.cameras import camera_list, rolled, upright
+from kgs.app.files.cameras import camera_list, rolled, shown, upright
 from kgs.app.files.encoders import film_suffix
 from kgs.app.files.film import path_near_plane, write_film
 from kgs.app.files.glb import save_glb
+from kgs.datasets.scene import pinholes
 from kgs.fit.fit import Fit
 from kgs.geometry import typical_depths
 from kgs.json_files import write_json
@@ -20,12 +23,16 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     :func:`kgs.app.files.cameras.rolled`.
     """
     scene = fit.scene
-    upright_views = rolled(scene.train, roll)
-    write_json(folder / "cameras.json", camera_list([scene.train, scene.test], scene.offset, fit.model.means))
-    save_glb(folder / "splat.glb", fit.model, upright(upright_views.cameras.extrinsics), scene.offset)
+    listed = camera_list([*shown(scene.train), *shown(scene.test)], scene.offset, fit.model.means)
+    write_json(folder / "cameras.json", listed)
+    poses = torch.cat([part.cameras.extrinsics for part in shown(scene.train, roll)])
+    save_glb(folder / "splat.glb", fit.model, upright(poses), scene.offset)
     depth = typical_depths(fit.model.means, scene.train.cameras)[1]
     suffix, note = film_suffix()
     near_plane = path_near_plane(fit.model.means, scene.train.cameras, fit.options.near_plane)
     film_fit = replace(fit, options=replace(fit.options, near_plane=near_plane))
-    why = write_film(folder / f"turntable{suffix}", film_fit.render, upright_views, depth, each)
+    frames = rolled(scene.train, roll)
+    height, width = frames.images.shape[-2:]
+    frames = replace(frames, cameras=pinholes(frames.cameras.intrinsics, poses, (height, width)))
+    why = write_film(folder / f"turntable{suffix}", film_fit.render, frames, depth, each)
     return [line for line in (why, note) if line]

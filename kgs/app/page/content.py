@@ -39,7 +39,7 @@ class PagePhotos:
         World-to-camera extrinsics, OpenCV axes, pixels with integer centres.
 
     Args:
-        cameras: the cameras of the photos, C >= 1 of one image size.
+        cameras: the cameras of the photos, C >= 1.
         names: file names of the C photos.
         parts: what each photo was used for: "training", "test", or another word.
         pictures: some of the photos with their renders.

@@ -11,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.app.console import each
-from kgs.app.files.cameras import rolled
+from kgs.app.files.cameras import shown
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.scene import Views
@@ -72,7 +72,7 @@ def write_fit_page(
         views = scene.train
         word = training_word
     photographed = beside or views.select(spread(len(views), MOST_PICTURES))
-    pictured = rolled(photographed if photos else photographed.select([]), roll)
+    pictured = shown(photographed, roll) if photos else []
     with torch.no_grad():
         gaussians = fit.model()
     runs = {run: one.metrics for run, one in fits.items()}
@@ -85,11 +85,11 @@ def write_fit_page(
             weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
         ),
         photos=PagePhotos(
-            cameras=_all_cameras(rolled(scene.train, roll), rolled(scene.test, roll)),
+            cameras=_all_cameras(*shown(scene.train, roll), *shown(scene.test, roll)),
             names=[*scene.train.names, *scene.test.names],
             parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
             pictures=_pictures(pictured, fits),
-            pictures_note=_pictures_note(len(pictured), len(views), word),
+            pictures_note=_pictures_note(sum(map(len, pictured)), len(views), word),
         ),
         text=PageText(
             title,
@@ -117,11 +117,11 @@ def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> 
     )
 
 
-def _pictures(views: Views, fits: Mapping[str, Fit]) -> list[Picture]:
+def _pictures(parts: Sequence[Views], fits: Mapping[str, Fit]) -> list[Picture]:
     """The photos of some views beside the renders of each fit."""
     levels = {run: psnr_of_views(fit.metrics) for run, fit in fits.items()}
     pictures = []
-    for i in each(range(len(views)), "page", "view"):
+    for views, i in each([(part, i) for part in parts for i in range(len(part))], "page", "view"):
         name = views.names[i]
         renders = {run: views.as_photo(fit.render(views.camera(i))[0]) for run, fit in fits.items()}
         values = [f"{run} {levels[run][name]:.2f} dB".strip() for run in fits if name in levels[run]]

@@ -121,7 +121,7 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 
     photos = content.photos
     text = content.text
-    width, height = scene["cameras"][0]["size"]
+    width, height = scene["cameras"][scene["first"]]["size"]
     first_run = next(iter(text.runs.values()), {})
     measures_head, measures = measure_table(text.runs)
     folder = resources.files("kgs.app.page")

@@ -1,0 +1,97 @@
+"""Upright and lying photos in one scene: the rarer kind is turned, with its camera, and shown as it was taken."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from init_point_scenes import painted_planes
+from kornia.geometry.camera import PinholeCamera
+
+from kgs.app.files.cameras import as_taken, shown
+from kgs.datasets import load_scene
+from kgs.datasets.scene import Views
+from kgs.errors import DataError
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+BACK = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # a picture turned counterclockwise
+NAMES = ("0.png", "1.png", "2.png")
+
+
+def write(root: Path, turned: tuple[int, ...], mask: int | None = None) -> Path:
+    """The painted planes as nerfstudio has them; photos in `turned` as an upright camera would have taken them."""
+    views = painted_planes()
+    (root / "images").mkdir(parents=True)
+    frames = []
+    for i, name in enumerate(NAMES):
+        image = (views.images[i].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
+        height, width = image.shape[:2]
+        lens = views.cameras.intrinsics[i].double().numpy()
+        fx, fy, cx, cy = lens[0, 0], lens[1, 1] * 1.1, lens[0, 2] + 3.5, lens[1, 2] - 1.5
+        pose = np.linalg.inv(views.cameras.extrinsics[i].double().numpy())
+        kept = np.full((height, width), 255, np.uint8)
+        kept[: height // 3] = 0
+        if i in turned:  # x' = y, y' = W - x
+            image, kept = np.rot90(image), np.rot90(kept)
+            fx, fy, cx, cy = fy, fx, cy, width - cx
+            height, width = width, height
+            pose = pose @ BACK
+        cv2.imwrite(str(root / "images" / name), image)
+        frame = {"file_path": f"images/{name}", "transform_matrix": (pose @ OPENGL).tolist(), "w": width, "h": height}
+        frames.append(frame | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
+        if i == mask:
+            (root / "masks").mkdir()
+            cv2.imwrite(str(root / "masks" / name), kept)
+    (root / "transforms.json").write_text(json.dumps({"frames": frames}))
+    return root
+
+
+def close(one: PinholeCamera, other: PinholeCamera) -> bool:
+    names = ("intrinsics", "extrinsics", "height", "width")
+    return all(torch.allclose(getattr(one, name), getattr(other, name), atol=1e-5) for name in names)
+
+
+@pytest.mark.parametrize(("turned", "downscale"), [(0, None), (1, None), (2, 1.5)])
+def test_the_rarer_kind_is_turned_with_its_camera(tmp_path: Path, turned: int, downscale: float | None):
+    mixed = load_scene(write(tmp_path / "mixed", (turned,), mask=turned), downscale=downscale, hold_out=0).train
+    plain = load_scene(write(tmp_path / "plain", (), mask=turned), downscale=downscale, hold_out=0).train
+    assert mixed.turned == tuple(i == turned for i in range(3))
+    assert plain.turned is None
+    assert close(mixed.cameras, plain.cameras)
+    assert torch.equal(mixed.images, plain.images)
+    assert mixed.counted is not None
+    assert plain.counted is not None
+    assert torch.equal(mixed.counted, plain.counted)
+
+
+def test_where_most_photos_are_upright_the_lying_ones_are_turned(tmp_path: Path):
+    mixed = load_scene(write(tmp_path / "mixed", (1, 2)), hold_out=0).train
+    assert mixed.turned == (True, False, False)
+    assert tuple(mixed.images.shape[-2:]) == (240, 180)
+    plain = load_scene(write(tmp_path / "plain", ()), hold_out=0).train
+    lying = shown(mixed)[0]
+    assert close(lying.cameras, plain.select([0]).cameras)
+    assert torch.equal(lying.images, plain.images[:1])
+
+
+def test_a_turned_photo_is_shown_as_it_was_taken(tmp_path: Path):
+    views = load_scene(write(tmp_path, (1,)), hold_out=0).train
+    parts = shown(views)
+    assert [tuple(part.images.shape[-2:]) for part in parts] == [(180, 240), (240, 180), (180, 240)]
+    photo = cv2.imread(str(tmp_path / "images" / "1.png"))[..., ::-1] / np.float32(255)
+    assert torch.allclose(parts[1].images[0].permute(1, 2, 0), torch.from_numpy(photo), atol=1e-6)
+    assert torch.equal(as_taken(views.images[1], views, 1), parts[1].images[0])
+    assert torch.equal(as_taken(views.images[0], views, 0), views.images[0])
+    again = shown(views, 90.0)
+    assert [tuple(part.images.shape[-2:]) for part in again] == [(240, 180), (180, 240), (240, 180)]
+    assert shown(Views(views.cameras, views.images, views.names)) != []
+
+
+def test_sizes_that_are_no_turn_are_still_an_error(tmp_path: Path):
+    root = write(tmp_path, ())
+    image = cv2.imread(str(root / "images" / "2.png"))
+    cv2.imwrite(str(root / "images" / "2.png"), cv2.resize(image, (480, 360)))
+    with pytest.raises(DataError, match="pixels as the other images"):
+        load_scene(root, hold_out=0)
