@@ -9,8 +9,10 @@ import PIL.Image
 import pytest
 from photo_folders import exif, planes, with_exif
 
+from kgs.app.sfm.leave_out import unlike_others
 from kgs.app.sfm.read import Exif, open_photos, read_photos
 from kgs.datasets.image_file import ImageFile
+from kgs.errors import DataError
 from kgs.progress import silent
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
@@ -94,3 +96,26 @@ def test_values_that_are_no_positive_number_count_as_missing(value):
     assert found.orientation == 1
     assert found.focal_35mm in (None, 28.0)
     assert found.focal_ratio(4, 3) is None or found.focal_35mm == 28.0
+
+
+@pytest.mark.parametrize("kind", ["said", "seen"])
+def test_a_panorama_is_refused_and_how_to_cut_it_is_said(tmp_path, kind):
+    """Metadata say so, or the ends fit together."""
+    width = 400
+    angles = np.linspace(0, 2 * np.pi, width, endpoint=False)[None] + np.linspace(0, 3, width // 2)[:, None]
+    around = (120 + 80 * np.sin(angles) + 40 * np.cos(3 * angles)).astype(np.uint8)
+    ahead = np.roll(around, 70, 1)
+    ahead[:, : width // 2] //= 2  # its ends differ
+    for i in range(3):
+        jpeg = cv2.imencode(".jpg", np.roll(around if kind == "seen" else ahead, 9 * i, 0))[1].tobytes()
+        xmp = b"http://ns.adobe.com/xap/1.0/\0<GPano:ProjectionType>equirectangular</GPano:ProjectionType>"
+        tag = b"\xff\xe1" + (len(xmp) + 2).to_bytes(2, "big") + xmp if kind == "said" else b""
+        (tmp_path / f"{i}.jpg").write_bytes(jpeg[:2] + tag + jpeg[2:])
+    photos = open_photos(sorted(tmp_path.iterdir()))
+    assert all(photo.is_panorama for photo in photos)
+    with pytest.raises(DataError, match=r"0\.jpg: is a panorama.*v360"):
+        unlike_others(photos)
+    plain = tmp_path / "plain.png"
+    cv2.imwrite(str(plain), ahead)
+    (photo,) = open_photos([plain])
+    assert not photo.is_panorama  # as wide, and no more

@@ -20,9 +20,15 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     """Photos that are copies, or of another shape or focal length than most, and why.
 
     Raises:
-        DataError: there are fewer than `FEWEST` photos without copies, or no shape or focal length is that of most.
+        DataError: most photos are panoramas, there are fewer than `FEWEST` without copies, or no shape or focal length
+            is that of most.
     """
     folder = photos[0].path.parent
+    panoramas = [photo.path for photo in photos if photo.is_panorama]
+    if 2 * len(panoramas) > len(photos):
+        line = f'ffmpeg -i "{panoramas[0].name}" -vf v360=e:rectilinear:h_fov=90:v_fov=67:yaw=0 yaw_0.jpg'
+        reason = f"is a panorama, not a picture of a lens. Cut some from it: `{line}`, the same for other angles"
+        raise DataError(panoramas[0], "", reason)
     first = {photo.sha256: photo.name for photo in reversed(photos)}
     copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
     left = {name: f"it is the same photo as {other}" for name, other in copied.items()}

@@ -33,6 +33,8 @@ _PIXELS_X = 0xA002
 _DENSITY = 0xA20E
 _DENSITY_UNIT = 0xA210
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
+_PANORAMA = b"equirectangular"  # in XMP, https://developers.google.com/streetview/spherical-metadata
+_SEAM = 2.0  # how much more than neighbouring columns the first and the last one of a panorama may differ
 _SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
 _BLURRED = 0.5  # a photo below this share of the median sharpness is blurred
 
@@ -96,6 +98,19 @@ class OpenPhoto(NamedTuple):
     def name(self) -> str:
         """The name of the file."""
         return self.path.name
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether it has the shape 2:1 and shows all around: its metadata say so, or its two ends fit together."""
+        width, height = self.size
+        if abs(width - 2 * height) > 2:
+            return False
+        if _PANORAMA in self.image.load():
+            return True
+        pixels = self.image.read()[..., :3]
+        neighbours = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
+        seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
+        return bool(seam <= _SEAM * np.median(neighbours) + 1 / 255)
 
     @property
     def focal_ratio(self) -> float | None:
