@@ -64,8 +64,8 @@ class SceneRequest:
         return scene
 
     def title_of(self, base: Path) -> str:
-        """The title of the page."""
-        return self.title or (base / self.scene).resolve().name
+        """The title of the page: as asked for, else the name of the folder in plain words."""
+        return self.title or in_plain_words((base / self.scene).resolve().name)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for config.json."""
@@ -82,6 +82,11 @@ class SceneRequest:
                 got = f"{value!r}"[:60] if name in values else "none"
                 raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
         return replace(request, roll=float(request.roll))
+
+
+def in_plain_words(name: str) -> str:
+    """The name of a folder or file as a title: as "my castle" for "my_castle"."""
+    return re.sub(r"[\s_-]+", " ", name).strip() or name
 
 
 _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {

@@ -65,7 +65,8 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     text = (out / "index.html").read_text(encoding="utf-8")
     assert "<h1>room</h1>" in text
     assert "mine" not in text
-    assert "3 training and 8 test photos of 32 × 24 pixels" in text
+    assert "<p>Eleven photos. Drag to look around.</p>" in text
+    assert text.count(" of 11, held out</option>") == 8
     assert "6 of 8 test photos." in text
     assert text.count('class="render"') == 6
     assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
@@ -77,6 +78,9 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert facts["gates: passed"] == "yes"
     assert facts["time"] == "4 s"
     assert facts["scene"] == "room"
+    assert facts["cameras"] == "3 training and 8 test"
+    assert facts["photo size"] == "32 × 24 pixels"
+    assert "photo 1 of 11" in facts["files"]
     assert facts["steps"] == "3"
     assert "0123abcd" not in text
 

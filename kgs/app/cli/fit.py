@@ -46,6 +46,7 @@ def fit(
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
     resume: bool = False,
+    title: str | None = None,
     photos: bool = True,
     roll: float = 0.0,
     lpips_weights: Existing | None = None,
@@ -78,8 +79,9 @@ def fit(
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
         resume: continue from the checkpoint in the folder of the results.
+        title: of the page. Unless given: the name of the folder.
         photos: --no-photos leaves the photos out of the page.
-        roll: turn page and film clockwise by this angle in degrees, where photos lie on their side.
+        roll: turn page and film clockwise by so many degrees.
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
         config: every number of the fit.
     """
@@ -109,6 +111,7 @@ def fit(
         points=config.init if config.init == "model-points" else "none",
         photos=photos,
         roll=roll,
+        title=title or "",
         masks="" if masks is None else os.path.abspath(masks),
         mask_means=mask_means,
     )

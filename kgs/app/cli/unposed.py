@@ -40,6 +40,7 @@ def find_scene(
     Raises:
         DataError: as of `pose_photos`.
     """
+    from kgs.app.scene_request import in_plain_words
     from kgs.app.sfm import pose_photos
     from kgs.app.sfm.find import find_video, notes_on
 
@@ -61,7 +62,7 @@ def find_scene(
         scene=".",
         hold_out=request.hold_out or 0,
         downscale=max(1.0, largest / wanted),
-        title=video.stem if video else photos.resolve().name,
+        title=request.title or in_plain_words(video.stem if video else photos.resolve().name),
         masks="",  # they are beside the copies of the photos
     )
     return loaded_as, Path(report["folder"])

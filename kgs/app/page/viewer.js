@@ -336,7 +336,7 @@ class Viewer {
   addPyramid(camera, index) {
     const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
     path.innerHTML = "<title></title>";  // shown while a pointer rests on it
-    path.firstChild.textContent = `${camera.part} ${camera.name}`;
+    path.firstChild.textContent = camera.label;
     path.setAttribute("class", camera.part === "test" ? "held-out" : "");
     path.addEventListener("click", () => {
       if (this.dragged <= CLICK_PIXELS) this.flyTo(index);

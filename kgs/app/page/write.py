@@ -23,6 +23,8 @@ from .pictures import GAIN, encoded
 MOST_BYTES = 8_000_000  # of a page
 _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
+_NUMBERS = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
+_LISTED = 24  # photos whose file names are under Details
 _FILES = [
     "style.css",
     "viewer.css",
@@ -121,15 +123,14 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 
     photos = content.photos
     text = content.text
-    width, height = scene["cameras"][scene["first"]]["size"]
+    cameras = scene["cameras"]
+    width, height = cameras[scene["first"]]["size"]
     first_run = next(iter(text.runs.values()), {})
     measures_head, measures = measure_table(text.runs)
     folder = resources.files("kgs.app.page")
     return {
         "title": without_folders(text.title),
-        "summary": (
-            f"{len(content.splat.gaussians)} Gaussians; {_counts(photos.parts)} photos of {width} × {height} pixels."
-        ),
+        "lead": f"{_in_words(len(cameras))}. Drag to look around.",
         "version": __version__,
         "aspect": f"{width} / {height}",
         "scene": scene,
@@ -142,7 +143,7 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
         "pictures": encoded(photos.pictures, _PICTURE_BYTES),
         "pictures_note": photos.pictures_note,
         "difference_gain": GAIN,
-        "cameras": {**_camera_facts(scene["cameras"], photos.parts), **facts(text.report)},
+        "cameras": {**_camera_facts(cameras, photos.parts), **facts(text.report)},
         "costs": _costs(text),
         "left_out": without_folders(text.left_out),
         "settings": facts(text.settings),
@@ -165,6 +166,12 @@ def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:
     }
 
 
+def _in_words(count: int) -> str:
+    """As "Six photos"."""
+    number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
+    return f"{number} photo{'s' if count > 1 else ''}"
+
+
 def _counts(parts: Sequence[str]) -> str:
     """As "3 training and 2 test", or the number alone if all photos are of one kind."""
     words = list(dict.fromkeys(parts))
@@ -179,10 +186,12 @@ def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) ->
     span = f"{focal[0]:.1f}" if focal[-1] - focal[0] < 0.1 else f"{focal[0]:.1f} to {focal[-1]:.1f}"
     width, height = cameras[0]["size"]
     share = focal[len(focal) // 2] / max(width, height)
+    files = sorted(f"{camera['label']}: {camera['name']}" for camera in cameras) if len(cameras) <= _LISTED else []
     return {
         "cameras": _counts(parts),
         "photo size": f"{width} × {height} pixels",
         "focal length": f"{span} pixels, {share:.2f} of the longer side",
+        **({"files": "; ".join(files)} if files else {}),
     }
 
 
