@@ -21,6 +21,7 @@ from kgs.app.files import exports, film
 from kgs.app.files.cameras import camera_list, upright
 from kgs.app.files.outputs import EXPORTS
 from kgs.app.files.ownership import is_own
+from kgs.app.files.preview import write_preview
 from kgs.app.files.staging import Staging
 from kgs.datasets import Scene
 from kgs.fit import Fit
@@ -163,3 +164,23 @@ def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path:
         ]
     assert (images[0] - images[1]).abs().max() > 0.01
     torch.testing.assert_close(renders[0](camera), images[1])
+
+
+@pytest.mark.parametrize("size", [(30, 60), (60, 30)])
+def test_the_still_is_the_middle_of_a_photo(tmp_path: Path, size: tuple[int, int]) -> None:
+    views = random_views(3, *size)
+    seen = []
+
+    def draw(camera: PinholeCamera) -> torch.Tensor:
+        seen.append(camera)
+        return torch.full((1, 3, int(camera.height), int(camera.width)), 0.5)
+
+    write_preview(tmp_path / "preview.jpg", draw, views)
+    assert cv2.imread(str(tmp_path / "preview.jpg")).shape == (630, 1200, 3)
+    (camera,) = seen
+    index = [torch.equal(camera.extrinsics[0], pose) for pose in views.cameras.extrinsics].index(True)
+    height, width = size
+    scale = max(1200 / width, 630 / height)
+    x, y = views.camera(index).project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist()
+    expected = (x - (width - 1) / 2) * scale + 1199 / 2, (y - (height - 1) / 2) * scale + 629 / 2
+    assert camera.project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist() == pytest.approx(expected, abs=1e-2)

@@ -1,4 +1,4 @@
-"""Writes a fit for other programs, besides its PLY file: cameras, glTF, a film."""
+"""Writes a fit for other programs, besides its PLY file: cameras, glTF, a film, a still."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +10,7 @@ from kgs.app.files.cameras import camera_list, rolled, shown, upright
 from kgs.app.files.encoders import film_suffix
 from kgs.app.files.film import path_near_plane, write_film
 from kgs.app.files.glb import save_glb
+from kgs.app.files.preview import write_preview
 from kgs.datasets.scene import pinholes
 from kgs.fit.fit import Fit
 from kgs.geometry import typical_depths
@@ -34,5 +35,6 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     frames = rolled(scene.train, roll)
     height, width = frames.images.shape[-2:]
     frames = replace(frames, cameras=pinholes(frames.cameras.intrinsics, poses, (height, width)))
+    write_preview(folder / "preview.jpg", film_fit.render, frames)
     why = write_film(folder / f"turntable{suffix}", film_fit.render, frames, depth, each)
     return [line for line in (why, note) if line]

@@ -1,0 +1,41 @@
+"""A still of a splat, in the size in which messengers show links and files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.datasets.scene import Views, pinholes
+from kgs.geometry import camera_centers
+from kgs.json_files import write_whole
+
+from .images import eight_bits
+
+WIDTH = 1200
+HEIGHT = 630
+_QUALITY = 90  # of the JPEG
+
+
+def write_preview(path: Path, render: Callable[[PinholeCamera], Tensor], views: Views) -> None:
+    """Write what the camera nearest the middle of all sees, as a JPEG of 1200 x 630 pixels. The write is atomic.
+
+    The middle of its photo is shown, as much of it as fills that shape.
+
+    Args:
+        path: the file to write.
+        render: from a camera to an image `(1, 3, H, W)`.
+        views: the views, at least one.
+    """
+    centers = camera_centers(views.cameras.extrinsics)
+    nearest = int((centers - centers.mean(0)).norm(dim=1).argmin())
+    height, width = views.images.shape[-2:]
+    scale = max(WIDTH / width, HEIGHT / height)
+    lens = views.cameras.intrinsics[nearest : nearest + 1].clone()
+    lens[:, :2, :3] *= scale
+    lens[:, 0, 2] += (scale - 1) / 2 - (scale * width - WIDTH) / 2  # (c + 1/2) s - 1/2: pixel centres are integers
+    lens[:, 1, 2] += (scale - 1) / 2 - (scale * height - HEIGHT) / 2
+    image = render(pinholes(lens, views.cameras.extrinsics[nearest : nearest + 1], (HEIGHT, WIDTH)))
+    _, content = cv2.imencode(".jpg", eight_bits(image[0]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    write_whole(path, content.tobytes())
