@@ -144,8 +144,6 @@ def load_scene(
 
 def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSet:
     """The frames with their masks: those in `folder`, else those that the files name, else those beside the photos."""
-    if folder is not None and not folder.is_dir():
-        raise DataError(folder, "", "expected a folder of masks, found no such folder")
     parts = [frame_set.frames, frame_set.test or ()]
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set

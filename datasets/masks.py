@@ -56,11 +56,13 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
     """The masks of photos: those in a folder, and instant-ngp's beside photos that have none there.
 
     Raises:
-        DataError: the folder holds no masks, or one that fits no photo or several.
+        DataError: the folder does not exist, or holds no masks, or one that fits no photo or several.
     """
     found = {photo: Mask(ImageFile(beside), keeps_white=False) for photo in photos if (beside := _dynamic(photo))}
     if folder is None:
         return found
+    if not folder.is_dir():
+        raise DataError(folder, "", "expected a folder of masks, found no such folder")
     masks = list_images(folder)
     if not masks:
         raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")

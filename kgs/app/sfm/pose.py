@@ -51,9 +51,10 @@ def pose_photos(
 ) -> dict[str, Any]:
     """Find the cameras of unposed photos, and write a scene that `kgs.datasets.load_scene` reads.
 
-    The folder `out` gets `images` (upright PNGs of one size, at most 1600 pixels long, without metadata), `sparse/0`
-    (COLMAP's binary model: one SIMPLE_RADIAL lens, poses, points with tracks) and `photos.json` (the report). If a
-    former run had the same photos and seed, its results are used again.
+    The folder `out` gets `images` (PNGs as the photos are looked at, at most 1600 pixels long, without metadata),
+    `masks` if there are any, `sparse/0` (COLMAP's binary model: one SIMPLE_RADIAL lens, twice if some photos are
+    upright and some lie, poses, points with tracks) and `photos.json` (the report). If a former run had the same
+    photos, masks and seed, its results are used again.
 
     Convention:
         COLMAP's: world-to-camera poses with OpenCV axes, the first pixel's centre at (0.5, 0.5). Up in the world is
