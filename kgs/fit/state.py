@@ -246,7 +246,7 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     _compare_settings(saved["config"] | {"backend": saved["backend"]}, asked)
     for part in ("training", "test"):
         for what, sums in scene[part].items():
-            before = saved["scene"][part][what]
+            before = saved["scene"][part].get(what)  # former versions had fewer entries
             if before != sums:
                 both = zip(scene[part]["names"], before or [], sums or [], strict=False)
                 changed = ", ".join(name for name, one, other in both if one != other)

@@ -80,10 +80,23 @@ def test_other_views_masks_and_background_are_named(scene, saved):
     for other, said in (
         (replace(scene, train=views.select([0, 1])), "names of the training views"),
         (replace(scene, train=replace(views, masks=torch.ones(3, 1, 32, 40))), "masks of the training views"),
+        (
+            replace(scene, train=replace(views, counted=torch.ones(3, 32, 40, dtype=torch.bool))),
+            "counted pixels of the training views",
+        ),
         (replace(scene, background=torch.tensor([1.0, 1.0, 1.0])), "background"),
     ):
         with pytest.raises(DataError, match=said):
             Trainer.resume(other, CONFIG, saved)
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_a_checkpoint_from_before_masks_goes_on(scene, saved, tmp_path):
+    state = load_checkpoint(saved)
+    for part in ("training", "test"):
+        del state["scene"][part]["counted pixels"]
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    assert Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors").step > 0
 
 
 @pytest.mark.usefixtures("torch_alone")
