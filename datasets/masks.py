@@ -41,7 +41,7 @@ class Mask(NamedTuple):
             reason = f"expected the shape of {photo.name}, {width}x{height}, got {columns}x{rows}"
             raise DataError(self.file.path, "", reason)
         if not kept.any():
-            raise DataError(self.file.path, "", f"expected pixels of {photo.name} to keep, got a mask of one colour")
+            raise DataError(self.file.path, "", f"expected pixels of {photo.name} that are kept, got none")
         if (columns, rows) == (width, height):
             return kept
         return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_AREA), np.float32)
