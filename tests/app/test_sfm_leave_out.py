@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from init_point_scenes import texture
 from photo_folders import exif, planes, with_exif
 
 from kgs.app.sfm import pose_photos
@@ -113,7 +112,8 @@ def test_where_no_lens_is_that_of_most_all_are_refused(tmp_path, films, said):
 def test_the_others_are_placed_as_if_it_were_not_there(tmp_path):
     """Three photos with one of another place beside them have the cameras of the three."""
     pytest.importorskip("pycolmap")
-    other = texture(5, (220.0, 220.0, 220.0)).astype(np.uint8)[:180, :240]
+    blocks = np.random.default_rng(0).integers(0, 255, (45, 60, 3), dtype=np.uint8)
+    other = cv2.resize(blocks, (240, 180), interpolation=cv2.INTER_CUBIC)
     for name, images in (("three", planes()), ("four", [*planes(), other])):
         (tmp_path / name).mkdir()
         folder_of(tmp_path / name, images)
