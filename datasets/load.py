@@ -229,13 +229,12 @@ def _reduced(width: int, height: int, factor: float) -> tuple[int, int]:
 def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale]) -> None:
     """Refuse a photo whose size is not that of its lens, or not that of the other photos."""
     lens = frame.intrinsics
-    if _is_turned(width, height, scales[0]):
-        width, height, lens = height, width, replace(lens, width=lens.height, height=lens.width)
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
         raise DataError(frame.path, "", f"has {width}x{height} pixels, which is not a scaled version of {described}")
     for scale in scales:
-        if _reduced(width, height, scale.factor) != scale.size:
+        size = _reduced(width, height, scale.factor)
+        if scale.size not in (size, size[::-1]):
             expected = f"expected {scale.first} pixels as the other images"
             raise DataError(frame.path, "", f"{expected}, got {width}x{height}")
 

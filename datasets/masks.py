@@ -66,12 +66,12 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
     masks = list_images(folder)
     if not masks:
         raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
-    unused = [path for place in {photo.parent for photo in photos} for path in list_images(place)]
+    folders = [place for place in {photo.parent for photo in photos} if place.is_dir()]
     for mask in masks:
         fitting = [photo for photo in photos if _fits(mask, photo)]
         if len(fitting) > 1:
             raise DataError(mask, "", f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}")
-        if not fitting and not any(_fits(mask, photo) for photo in unused):
+        if not fitting and not any(_fits(mask, photo) for place in folders for photo in list_images(place)):
             raise DataError(mask, "", "fits no photo: expected the stem of one, as IMG_1.png for IMG_1.jpg")
         found.update((photo, Mask(ImageFile(mask))) for photo in fitting)
     return found

@@ -150,6 +150,16 @@ def test_masks_that_cannot_be_found(tmp_path: Path) -> None:
         load_scene(tmp_path, mask_means="gone")
 
 
+def test_photos_that_are_missing_are_named_beside_masks_too(tmp_path: Path) -> None:
+    in_the_file(tmp_path)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    data["frames"][0] = data["frames"][0] | {"file_path": "gone/0.png", "mask_path": ""}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    write_mask(tmp_path / "masks" / "1.png")
+    with pytest.raises(DataError, match="images are missing"):
+        load_scene(tmp_path, hold_out=0)
+
+
 def test_a_stem_that_two_photos_have_is_no_mask_of_one(tmp_path: Path) -> None:
     write_blender(tmp_path)
     write_mask(tmp_path / "masks" / "0.png")

@@ -186,7 +186,8 @@ def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) ->
     span = f"{focal[0]:.1f}" if focal[-1] - focal[0] < 0.1 else f"{focal[0]:.1f} to {focal[-1]:.1f}"
     width, height = cameras[0]["size"]
     share = focal[len(focal) // 2] / max(width, height)
-    files = sorted(f"{camera['label']}: {camera['name']}" for camera in cameras) if len(cameras) <= _LISTED else []
+    in_order = sorted(cameras, key=lambda camera: camera["name"])
+    files = [f"{camera['label']}: {camera['name']}" for camera in in_order] if len(cameras) <= _LISTED else []
     return {
         "cameras": _counts(parts),
         "photo size": f"{width} × {height} pixels",

@@ -160,7 +160,7 @@ def find_cameras(
         path.mkdir(parents=True)
     with _one_thread(), report_full_disk(new):
         photos = read_photos(opened, stage)
-        unsharp = [photo.path.name for photo in blurred(photos)]
+        unsharp = [photo.name for photo in blurred(photos)]
         if unsharp:
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
         png = png_names(names)
@@ -181,7 +181,7 @@ def find_cameras(
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
             say(f"the photos do not tell the focal length; the Exif says {found.held:.0f} pixels, and that is taken")
-        photos = [photo for photo in photos if photo.path.name not in found.left_out]
+        photos = [photo for photo in photos if photo.name not in found.left_out]
         chosen = upright(found.cameras, turned, photo_names)
         level_and_scale(chosen)
         write_model(new / MODEL, chosen, images)
@@ -194,10 +194,10 @@ def find_cameras(
         "photo_size": list(min(photo.size for photo in opened)),
         "focal_rise": None if found.held else chosen.focal_rise,
         "photos": {
-            photo.path.name: {
-                "image": png[photo.path.name],
-                "points": chosen.points[photo.path.name],
-                "blurred": photo.path.name in unsharp,
+            photo.name: {
+                "image": png[photo.name],
+                "points": chosen.points[photo.name],
+                "blurred": photo.name in unsharp,
                 "exif_focal_35mm": photo.exif.focal_35mm,
             }
             for photo in photos

@@ -32,7 +32,7 @@ LEAST_DEGREES = 3.0  # between neighbours
 MOST_DEGREES = 10.0
 _LOOKED_AT = 500  # frames, spread over the video
 _LONGEST = 480  # pixels of a frame that is looked at
-_STEP = 0.75  # degrees by which the camera moves at least before points are chosen anew
+_STEP = 0.75  # degrees; after so large a move new points are tracked
 _TRACKED = 400  # points
 _LOST = 30  # points, of which fewer tell no motion
 
