@@ -187,7 +187,7 @@ def suffix(request: Any, monkeypatch: Any) -> str:
     return f".{request.param}"
 
 
-@pytest.mark.parametrize(("size", "expected"), [((33, 45), (32, 44)), ((1000, 1500), (426, 640))])
+@pytest.mark.parametrize(("size", "expected"), [((33, 45), (32, 44)), ((1400, 2100), (1280, 1920))])
 def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: str, size: Any, expected: Any) -> None:
     monkeypatch.setattr(film, "FRAMES", 8)
     monkeypatch.setattr(encoders, "BITS", 2.0)
