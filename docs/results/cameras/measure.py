@@ -68,7 +68,9 @@ def arc_cell(cell: Cell) -> dict[str, Any]:
         except DataError as error:
             return {"accepted": False, "why": str(error).partition("photos: ")[2].partition(". ")[0]}
         found = load_scene(Path(place) / "out", hold_out=0).train
-    ours, given = found.cameras.extrinsics.double(), truth.cameras.extrinsics.double()
+    placed = [truth.names.index(Path(name).stem) for name in found.names]
+    ours = found.cameras.extrinsics.double()
+    given = truth.cameras.extrinsics.double()[placed]
     between = [(r[:, None] @ r[None].mT) for r in (ours[:, :3, :3], given[:, :3, :3])]
     scales = torch.pdist(camera_centers(ours)) / torch.pdist(camera_centers(given))
     focal = report["focal_px"] / float(truth.cameras.fx[0]) - 1
@@ -76,7 +78,7 @@ def arc_cell(cell: Cell) -> dict[str, Any]:
         "degrees": float(degrees_between(*between).max()),
         "distances": float((scales.max() - scales.min()) / scales.mean()),
     }
-    return {"accepted": True, "focal": focal, **errors}
+    return {"accepted": True, "placed": len(placed), "focal": focal, **errors}
 
 
 def write_arcs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
