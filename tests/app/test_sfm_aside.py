@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits and sign
 def own_matches(tmp_path):
     """The arguments of the longer step."""
     images = write_planes(tmp_path / "photos")
-    return {"images": str(images), "names": list(NAMES), "lens": None, "masks": None, "seed": 0}
+    return {"images": str(images), "lenses": [[list(NAMES), None]], "masks": None, "seed": 0}
 
 
 def test_a_full_disk_is_an_error_and_not_the_end(tmp_path, own_matches):

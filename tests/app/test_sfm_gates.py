@@ -31,7 +31,7 @@ def cameras(focal=800.0, points=(90, 80, 70), turn=0.0, missing=(), rise=0.1):
     centers = {n: np.array([float(i), 0, 0]) for i, n in enumerate(NAMES)}
     counts = {n: count for n, count in zip(NAMES, points, strict=True) if n not in missing}
     rows = ({n: v for n, v in kind.items() if n not in missing} for kind in (rotations, centers))
-    return Cameras(focal, *rows, counts, None, rise)
+    return Cameras(dict.fromkeys(NAMES, focal), *rows, counts, None, rise)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Cameras that two solvers agree on: matches them, solves twice, leaves out unsuitable photos, and asks the gates."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from .aside import Aside
 from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
 from .leave_out import without_cameras, without_overlap
 from .map import Cameras, pair_geometries, quiet_pycolmap, solve, verified
-from .match import exif_focal, lens_of, write_matches
+from .match import exif_focals, lenses_of, write_matches
 from .read import Photo
 from .write import write_images
 
@@ -26,7 +26,7 @@ class Agreed(NamedTuple):
     cameras: Cameras
     solver: str  # whose they are
     degrees: float  # the largest difference between two solvers
-    held: float | None  # focal length of the Exif, in pixels, where the photos do not tell it
+    held: list[float]  # focal lengths of the Exif, in pixels, one a lens; [] where the photos tell them
     pairs: Pairs  # verified matches of each pair of all photos
     left_out: dict[str, str]  # photos without cameras, and why
 
@@ -61,16 +61,14 @@ def agreed_cameras(
     folder = photos[0].path.parent
     first = work / "first.db"
     second = work / "second.db"
-    lens = lens_of(photos)
     with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
         second_matches = executor.submit(
             aside.run,
             "write_colmap_matches",
             second,
             images=str(_without_alpha(photos, images, work, names)),
-            names=list(names),
+            lenses=_lenses(photos, list(names)),
             masks=str(masks) if masks.is_dir() else None,
-            lens=lens.params_to_string() if lens.has_prior_focal_length else None,
             seed=seed,
         )
         write_matches(first, photos, list(names), stage)
@@ -83,7 +81,7 @@ def agreed_cameras(
         geometries = {pair: geometry for pair, geometry in geometries.items() if left_out.keys().isdisjoint(pair)}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
             raise DataError(folder, "", reason)
-        solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focal(photos), executor)
+        solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor)
         solutions, held = solvers.solve(kept)
         while doubtful := without_cameras(solutions, list(kept.values()), pairs):
             left_out |= doubtful
@@ -112,27 +110,40 @@ class _Solvers:
     images: Path
     work: Path
     seed: int
-    exif_focal: float | None
+    exif_focals: list[float | None]  # of each lens
     executor: ThreadPoolExecutor
 
-    def solve(self, names: Mapping[str, str]) -> tuple[list[Cameras | None], float | None]:
-        """What each solver finds, and the focal length of the Exif if the photos do not tell it.
+    def solve(self, names: Mapping[str, str]) -> tuple[list[Cameras | None], list[float]]:
+        """What each solver finds, and the focal lengths of the Exif if the photos do not tell them, else [].
 
         `names` are those of the photos to place, by those of their images.
         """
         second = self.executor.submit(self._solve_second, names)
         solutions = [self._solve(0, "first", names), second.result()]
         placed = [cameras for cameras in solutions if cameras]
-        if self.exif_focal is None or not placed or not (focal_doubt(placed) or focal_difference(placed)):
-            return solutions, None
-        return [self._solve(solver, "held", names, self.exif_focal) for solver in (0, 1)], self.exif_focal
+        known = [focal for focal in self.exif_focals if focal]
+        is_known = len(known) == len(self.exif_focals)
+        if not is_known or not placed or not (focal_doubt(placed) or focal_difference(placed)):
+            return solutions, []
+        return [self._solve(solver, "held", names, known) for solver in (0, 1)], known
 
     def _solve_second(self, names: Mapping[str, str]) -> Cameras | None:
         self.second_matches.result()
         return self._solve(1, "second", names)
 
-    def _solve(self, solver: int, work: str, names: Mapping[str, str], focal: float | None = None) -> Cameras | None:
-        return solve(self.databases[solver], self.images, self.work / work, self.seed, names, focal)
+    def _solve(self, solver: int, work: str, names: Mapping[str, str], focals: Sequence[float] = ()) -> Cameras | None:
+        return solve(self.databases[solver], self.images, self.work / work, self.seed, names, focals)
+
+
+def _lenses(photos: list[Photo], images: list[str]) -> list[tuple[list[str], str | None]]:
+    """The names of each lens's images, and its parameters where the Exif says its focal length."""
+    return [
+        (
+            [image for photo, image in zip(photos, images, strict=True) if photo.lens == number],
+            lens.params_to_string() if lens.has_prior_focal_length else None,
+        )
+        for number, lens in enumerate(lenses_of(photos))
+    ]
 
 
 def _without_alpha(photos: list[Photo], images: Path, work: Path, names: Mapping[str, str]) -> Path:

@@ -102,23 +102,21 @@ def _failure(code: int, said: str, database: Path) -> Exception:
 
 
 def _write_colmap_matches(
-    pycolmap: Any, database: str, images: str, names: list[str], lens: str | None, masks: str | None, seed: int
+    pycolmap: Any, database: str, images: str, lenses: list[tuple[list[str], str | None]], masks: str | None, seed: int
 ) -> None:
-    """Write COLMAP's own keypoints and verified matches of photos; without `lens`, COLMAP guesses it from their files.
+    """Write COLMAP's own keypoints and verified matches of photos.
 
     Args:
         pycolmap: the module.
         database: the file to write.
         images: the folder of the photos.
-        names: of the photos in it.
-        lens: the parameters of their SIMPLE_RADIAL lens, where they are known.
+        lenses: for each the names of its photos in the folder, and the parameters of the SIMPLE_RADIAL lens where they
+            are known; None: COLMAP guesses them from the files.
         masks: the folder of their masks, named as the photos with .png behind; None: all of each photo is kept.
         seed: of the verification.
     """
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
-    if lens is not None:
-        reader.camera_params = lens
     if masks is not None:
         reader.mask_path = masks
     extraction = pycolmap.FeatureExtractionOptions()
@@ -129,15 +127,17 @@ def _write_colmap_matches(
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = 1
     matching.use_gpu = False
-    pycolmap.extract_features(
-        database,
-        images,
-        image_names=names,
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
+    for names, lens in lenses:
+        reader.camera_params = lens or ""
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
     pycolmap.match_exhaustive(
         database,
         matching_options=matching,

@@ -43,11 +43,11 @@ def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> l
     if cameras is None:
         return ["no pair of photos gave a first guess of the cameras"]
     reasons = []
-    ratio = cameras.focal / longest
     if missing := _missing(cameras, names):
         reasons.append(f"{len(missing)} of {len(names)} photos could not be placed: {', '.join(missing)}")
-    if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]:
-        limits = f"{FOCAL_RANGE[0]:g} to {FOCAL_RANGE[1]:g}"
+    limits = f"{FOCAL_RANGE[0]:g} to {FOCAL_RANGE[1]:g}"
+    ratios = sorted({focal / longest for focal in cameras.focals.values()})
+    for ratio in (ratio for ratio in ratios if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]):
         reasons.append(f"the focal length came out at {ratio:.3g} times the longer side, where lenses have {limits}")
     if few := [f"{name} ({count})" for name, count in cameras.points.items() if count < FEWEST_POINTS]:
         reasons.append(f"fewer than {FEWEST_POINTS} points are seen in {', '.join(few)}")
@@ -82,9 +82,11 @@ def focal_doubt(solutions: Sequence[Cameras]) -> str:
 
 
 def focal_difference(solutions: Sequence[Cameras]) -> str:
-    """How far the solvers' focal lengths are apart, if that is too far; "" if it is not."""
-    focals = [cameras.focal for cameras in solutions]
-    ratio = max(focals) / min(focals)
+    """How far the solvers' focal lengths are apart, if that is too far; "" if it is not. Each lens counts."""
+    placed = set[str].intersection(*(set(cameras.focals) for cameras in solutions))
+    focals = [[cameras.focal for cameras in solutions]]
+    focals += [[cameras.focals[name] for cameras in solutions] for name in placed]
+    ratio = max(max(of_lens) / min(of_lens) for of_lens in focals)
     if ratio <= MOST_RATIO:
         return ""
     return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}"

@@ -1,8 +1,8 @@
 """Decides which photos are left out, so that one unsuitable photo does not stop the others.
 
-A photo is left out if it is a copy, or of another shape or lens than most; if it shows another place, or the same from
-the same place as another one; or if its camera cannot be trusted: each solver has to place it, it has to see enough
-points, and both have to agree about it. At least three photos remain, or nothing is left out and the gates refuse all.
+A photo is left out if it is a copy, or of another shape than most; if it shows another place, or the same from the same
+place as another one; or if its camera cannot be trusted: each solver has to place it, it has to see enough points, and
+both have to agree about it and its lens. At least three photos remain, or nothing is left out and the gates refuse all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,17 +11,16 @@ from itertools import combinations
 from kgs.errors import DataError
 
 from .find import FEWEST, listed
-from .gates import FEWEST_POINTS, MOST_DEGREES, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
+from .gates import FEWEST_POINTS, MOST_DEGREES, MOST_RATIO, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
 from .map import Cameras, PairGeometry
-from .read import OpenPhoto, by_lens, by_shape
+from .read import OpenPhoto, by_shape
 
 
 def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
-    """Photos that are copies, or of another shape or focal length than most, and why.
+    """Photos that are copies, or of another shape than most, and why.
 
     Raises:
-        DataError: most photos are panoramas, there are fewer than `FEWEST` without copies, or no shape or focal length
-            is that of most.
+        DataError: most photos are panoramas, there are fewer than `FEWEST` without copies, or no shape is that of most.
     """
     folder = photos[0].path.parent
     panoramas = [photo.path for photo in photos if photo.is_panorama]
@@ -42,13 +41,12 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
         groups = _listed(shapes)
         reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
         raise DataError(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
-    left |= _others(shapes, usual, "its shape is {}, not {}: it is cropped, or by another camera")
-    lenses = by_lens(shapes[usual])
-    if lenses and (usual := _usual(lenses)) is None:
-        groups = _listed(lenses)
-        reason = f"expected photos of one focal length, got {len(lenses)} (as on 35 mm film, {groups})"
-        raise DataError(folder, "", f"{reason}. Take all with one lens and without zoom")
-    return left | _others(lenses, usual, "its focal length is {}, not {}, as on 35 mm film")
+    return left | {
+        photo.name: f"its shape is {name}, not {usual}: it is cropped, or by another camera"
+        for name, group in shapes.items()
+        if name != usual
+        for photo in group
+    }
 
 
 def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
@@ -57,10 +55,6 @@ def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
     if len(sizes) > 1 and (sizes[0] < FEWEST or sizes[0] == sizes[1]):
         return None
     return max(groups, key=lambda name: len(groups[name]))
-
-
-def _others(groups: Mapping[str, list[OpenPhoto]], usual: str | None, why: str) -> dict[str, str]:
-    return {photo.name: why.format(name, usual) for name, group in groups.items() if name != usual for photo in group}
 
 
 def _listed(groups: Mapping[str, list[OpenPhoto]]) -> str:
@@ -115,8 +109,19 @@ def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], p
         if better.points[name] < FEWEST_POINTS:
             few = f"only {better.points[name]} points are seen in it, fewer than {FEWEST_POINTS}"
             left[name] = f"{few}{_advice(name, names, pairs)}"
+    left |= _other_lenses(first, second, [name for name in names if name not in left])
     left |= _disputed(first, second, [name for name in names if name not in left])
     return left if len(names) - len(left) >= FEWEST else {}
+
+
+def _other_lenses(first: Cameras, second: Cameras, names: list[str]) -> dict[str, str]:
+    """The photos by another lens than most, about whose focal length the solvers disagree."""
+    ratios = {name: first.focals[name] / second.focals[name] for name in names if first.focals[name] != first.focal}
+    return {
+        name: f"two solvers differ by a factor of {max(ratio, 1 / ratio):.3g} about the focal length of its lens"
+        for name, ratio in ratios.items()
+        if max(ratio, 1 / ratio) > MOST_RATIO
+    }
 
 
 def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, str]:

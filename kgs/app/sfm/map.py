@@ -8,10 +8,11 @@ import copy
 import math
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
+from statistics import mode
 from typing import Any, NamedTuple
 
 import cv2
@@ -35,12 +36,17 @@ _WRONG_FOCAL = 1.25  # factor by which the focal length is made wrong to see whe
 class Cameras(NamedTuple):
     """What one solver found. Poses are world-to-camera with OpenCV axes, by the photos' names."""
 
-    focal: float  # pixels
+    focals: dict[str, float]  # focal length in pixels of each photo's lens
     rotations: dict[str, NDArray[np.float64]]  # (3, 3) each
     centers: dict[str, NDArray[np.float64]]  # (3,) each, in the world
     points: dict[str, int]  # how many points a photo sees
     reconstruction: Any  # pycolmap's
     focal_rise: float  # relative growth of the squared errors with a wrong focal length; infinite where it was given
+
+    @property
+    def focal(self) -> float:
+        """The focal length in pixels of most photos."""
+        return mode(self.focals.values())
 
 
 class PairGeometry(NamedTuple):
@@ -113,39 +119,48 @@ def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: A
 
 
 def solve(
-    database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str], focal: float | None = None
+    database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str], focals: Sequence[float] = ()
 ) -> Cameras | None:
     """Cameras and points from verified matches, of as many photos as can be placed; None if no pair can be.
 
-    The lens is held while photos are placed, because two photos do not determine it, and adjusted to all of them after
-    that. This is repeated with the lens that came out until it no longer changes.
+    Lenses are held while photos are placed, because two photos do not determine them, and adjusted to all of them after
+    that. This is repeated with the lenses that came out until they no longer change.
 
     Args:
-        database: with verified matches, and a first guess of the lens, which the result replaces.
+        database: with verified matches, and a first guess of each lens, which the result replaces.
         images: the folder of the photos.
         work: a folder for what the mapper writes.
         seed: of its random choices.
         names: the names of the photos to place, by those of the images in the database.
-        focal: the focal length in pixels if it is known; None: it is adjusted.
+        focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
     """
     best = None
     error = 0.0
+    is_held = len(focals) > 0
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
-        lens = file.read_all_cameras()[0]
-        lens.focal_length = focal or lens.focal_length
+        lenses = {lens.camera_id: lens for lens in file.read_all_cameras()}
+        for camera_id, focal in zip(sorted(lenses), focals, strict=is_held):
+            lenses[camera_id].focal_length = focal
         for _ in range(_ROUNDS):
-            file.update_camera(lens)
-            scene = _map(pycolmap, database, images, work, list(names), seed, focal is None)
+            for lens in lenses.values():
+                file.update_camera(lens)
+            scene = _map(pycolmap, database, images, work, list(names), seed, not is_held)
             if scene is None or (best is not None and _is_worse(scene, best)):
                 break
-            best, error = _adjust(scene, focal)
-            before = np.array(lens.params)
-            lens.params = lens_of_scene(best).params
-            if abs(lens.params[0] / before[0] - 1) < _CONVERGED and abs(lens.params[3] - before[3]) < _CONVERGED:
+            best, error = _adjust(scene, is_held)
+            changes = [_change(lenses[camera_id], lens) for camera_id, lens in best.cameras.items()]
+            for camera_id, lens in best.cameras.items():
+                lenses[camera_id].params = lens.params
+            if max(changes) < _CONVERGED:
                 break
     if best is None:
         return None
-    return cameras_of(best, names, _focal_rise(best, error) if focal is None else math.inf)
+    return cameras_of(best, names, math.inf if is_held else _focal_rise(best, error))
+
+
+def _change(before: Any, after: Any) -> float:
+    """The relative change of a lens's focal length, or that of its distortion if this is larger."""
+    return max(abs(after.params[0] / before.params[0] - 1), abs(after.params[3] - before.params[3]))
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
@@ -154,7 +169,7 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     placed = {name: images[image] for image, name in names.items() if image in images}
     poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
     return Cameras(
-        float(lens_of_scene(reconstruction).focal_length),
+        {name: float(reconstruction.cameras[image.camera_id].focal_length) for name, image in placed.items()},
         {name: pose[:, :3] for name, pose in poses.items()},
         {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
         {name: int(image.num_points3D) for name, image in placed.items()},
@@ -164,9 +179,9 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
 
 
 def _map(pycolmap: Any, database: Path, images: Path, work: Path, names: list[str], seed: int, free: bool) -> Any:
-    """The reconstruction of most photos with the lens of the database; None if no pair can be placed.
+    """The reconstruction of most photos with the lenses of the database; None if no pair can be placed.
 
-    If `free`, the second attempt adjusts the focal length while it places photos.
+    If `free`, the second attempt adjusts focal lengths while it places photos.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = names
@@ -209,39 +224,49 @@ def _is_worse(scene: Any, best: Any) -> bool:
     return bool(scene.num_reg_images() < best.num_reg_images() or 2 * scene.num_points3D() < best.num_points3D())
 
 
-def _adjust(reconstruction: Any, focal: float | None) -> tuple[Any, float]:
-    """Bundle adjustment with a radial distortion that is usual or explains enough of the errors, else without one.
+def _adjust(reconstruction: Any, is_held: bool) -> tuple[Any, float]:
+    """Bundle adjustment with radial distortions that are usual or explain enough of the errors, else without any.
 
-    Photos that hardly determine the focal length trade it against a distortion that no camera has.
+    Photos that hardly determine the focal length trade it against a distortion that no camera has. If `is_held`, the
+    focal lengths stay.
     """
-    distorted, error = _bundle_adjust(reconstruction, None, focal)
-    if abs(lens_of_scene(distorted).params[3]) <= _USUAL_DISTORTION:
+    distorted, error = _bundle_adjust(reconstruction, hold_focal=is_held)
+    if max(abs(lens.params[3]) for lens in distorted.cameras.values()) <= _USUAL_DISTORTION:
         return distorted, error
-    undistorted, larger_error = _bundle_adjust(reconstruction, 0.0, focal)
+    undistorted, larger_error = _bundle_adjust(reconstruction, hold_focal=is_held, distortion=0.0)
     if larger_error > (1 + _DISTORTION_GAIN) * error:
         return distorted, error
     return undistorted, larger_error
 
 
-def _bundle_adjust(reconstruction: Any, distortion: float | None, focal: float | None) -> tuple[Any, float]:
+def _bundle_adjust(
+    reconstruction: Any,
+    *,
+    hold_focal: bool,
+    hold_distortion: bool = False,
+    factor: float = 1.0,
+    distortion: float | None = None,
+) -> tuple[Any, float]:
     """A copy, adjusted until it converges, and half its sum of squared errors in pixels.
 
     Args:
         reconstruction: pycolmap's.
-        distortion: radial distortion at which the lens is held; None: it is adjusted.
-        focal: focal length in pixels at which the lens is held; None: it is adjusted.
+        hold_focal: whether focal lengths stay.
+        hold_distortion: whether radial distortions stay.
+        factor: by which focal lengths are multiplied first.
+        distortion: at which the radial distortions are held instead.
     """
     scene = copy.deepcopy(reconstruction)
     with quiet_pycolmap() as pycolmap:
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = 1
-        options.refine_focal_length = focal is None
-        options.refine_extra_params = distortion is None
+        options.refine_focal_length = not hold_focal
+        options.refine_extra_params = not hold_distortion and distortion is None
         config = pycolmap.BundleAdjustmentConfig()
-        lens = lens_of_scene(scene)
-        known = lens.params.copy()
-        lens.params = [focal or known[0], *known[1:3], known[3] if distortion is None else distortion]
+        for lens in scene.cameras.values():
+            focal, x, y, own = lens.params
+            lens.params = [factor * focal, x, y, own if distortion is None else distortion]
         for image in scene.reg_image_ids():
             config.add_image(image)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -250,21 +275,16 @@ def _bundle_adjust(reconstruction: Any, distortion: float | None, focal: float |
 
 
 def _focal_rise(reconstruction: Any, error: float) -> float:
-    """The relative growth of the sum of squared errors with a focal length 1.25 times too long or too short.
+    """The relative growth of the sum of squared errors with focal lengths 1.25 times too long or too short.
 
-    The smaller of the two counts; all else but the distortion is adjusted to the wrong focal length. Near 0 the photos
-    do not determine the focal length: the scene is stretched instead.
+    The smaller of the two counts; all else but the distortion is adjusted to the wrong focal lengths. Near 0 the photos
+    do not determine them: the scene is stretched instead.
     """
-    focal, _, _, distortion = lens_of_scene(reconstruction).params
     wrong = min(
-        _bundle_adjust(reconstruction, distortion, focal * factor)[1] for factor in (_WRONG_FOCAL, 1 / _WRONG_FOCAL)
+        _bundle_adjust(reconstruction, hold_focal=True, hold_distortion=True, factor=factor)[1]
+        for factor in (_WRONG_FOCAL, 1 / _WRONG_FOCAL)
     )
     return wrong / max(error, np.finfo(np.float64).tiny) - 1
-
-
-def lens_of_scene(reconstruction: Any) -> Any:
-    """The one camera, with params focal length, centre (x, y) and radial distortion."""
-    return next(iter(reconstruction.cameras.values()))
 
 
 def _inliers(file: Any, i: int, j: int) -> NDArray[np.int64]:

@@ -47,7 +47,7 @@ def find_keypoints(photo: Photo, most: int) -> PhotoKeypoints:
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], stage: Stage) -> None:
-    """Make a COLMAP database of all photos with one lens, their keypoints and the matches of each pair.
+    """Make a COLMAP database of all photos with their lenses, their keypoints and the matches of each pair.
 
     Args:
         database: the file to write.
@@ -110,33 +110,44 @@ def exif_focal(photos: list[Photo]) -> float | None:
     return median_high(known) if known else None
 
 
-def lens_of(photos: list[Photo]) -> Any:
-    """A first guess of the one lens of all photos, as a camera of pycolmap."""
+def exif_focals(photos: list[Photo]) -> list[float | None]:
+    """The same for each lens, in the order of their numbers."""
+    count = 1 + max(photo.lens for photo in photos)
+    return [exif_focal([photo for photo in photos if photo.lens == number]) for number in range(count)]
+
+
+def lenses_of(photos: list[Photo]) -> list[Any]:
+    """First guesses of the photos' lenses, as cameras of pycolmap, in the order of their numbers."""
     import pycolmap
 
     width, height = photos[0].size
-    known = exif_focal(photos)
-    focal = known or DEFAULT_FOCAL * max(width, height)
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
-    camera.has_prior_focal_length = known is not None
-    return camera
+    cameras = []
+    for camera_id, known in enumerate(exif_focals(photos), 1):
+        focal = known or DEFAULT_FOCAL * max(width, height)
+        camera = pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_RADIAL", focal, width, height)
+        camera.has_prior_focal_length = known is not None
+        cameras.append(camera)
+    return cameras
 
 
 def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]:
-    """Write one lens for all photos, and the photos; returns their ids."""
+    """Write the lenses, and the photos; returns the photos' ids."""
     import pycolmap
 
-    camera = lens_of(photos)
-    camera.camera_id = file.write_camera(camera)
-    rig = pycolmap.Rig()
-    rig.add_ref_sensor(camera.sensor_id)
-    rig_id = file.write_rig(rig)
+    cameras = lenses_of(photos)
+    rig_ids = []
+    for camera in cameras:
+        camera.camera_id = file.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(camera.sensor_id)
+        rig_ids.append(file.write_rig(rig))
     ids = []
-    for name in names:
+    for photo, name in zip(photos, names, strict=True):
+        camera = cameras[photo.lens]
         image = pycolmap.Image(name=name, camera_id=camera.camera_id)
         image.image_id = file.write_image(image)
         frame = pycolmap.Frame()
-        frame.rig_id = rig_id
+        frame.rig_id = rig_ids[photo.lens]
         frame.add_data_id(image.data_id)
         file.write_frame(frame)
         ids.append(image.image_id)

@@ -28,14 +28,14 @@ from .aside import check_space
 from .find import find_photos, find_video
 from .gates import FEWEST_POINTS, FOCAL_RANGE, LEAST_RISE, MOST_DEGREES, MOST_RATIO
 from .leave_out import unlike_others
-from .map import Cameras, lens_of_scene, quiet_pycolmap
+from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
 from .place import IMAGES, MASKS, MODEL, REPORT, check_place, is_reusable
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .video import take_frames
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 
-SETTINGS = 5  # increased by every change after which the same photos give other files
+SETTINGS = 6  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
@@ -52,16 +52,16 @@ def pose_photos(
     """Find the cameras of unposed photos, and write a scene that `kgs.datasets.load_scene` reads.
 
     The folder `out` gets `images` (PNGs as the photos are looked at, at most 1600 pixels long, without metadata),
-    `masks` if there are any, `sparse/0` (COLMAP's binary model: one SIMPLE_RADIAL lens, twice if some photos are
-    upright and some lie, poses, points with tracks) and `photos.json` (the report). If a former run had the same
-    photos, masks and seed, its results are used again.
+    `masks` if there are any, `sparse/0` (COLMAP's binary model: a SIMPLE_RADIAL lens for each focal length that the
+    Exif tells apart, twice if some photos are upright and some lie; poses, points with tracks) and `photos.json` (the
+    report). If a former run had the same photos, masks and seed, its results are used again.
 
     Convention:
         COLMAP's: world-to-camera poses with OpenCV axes, the first pixel's centre at (0.5, 0.5). Up in the world is
         -y: the cameras' common up. The median depth of a point in the photos that see it is 1.
 
     Args:
-        folder: at least 3 photos of one scene, by one lens. Folders in it are not looked into. Or a video, or a folder
+        folder: at least 3 photos of one scene and one shape. Folders in it are not looked into. Or a video, or a folder
             with one and without photos.
         out: the folder for the results, created if it does not exist.
         masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one. What
@@ -75,8 +75,8 @@ def pose_photos(
     Returns:
         The content of photos.json: "photos" by file name, "left_out" (those without cameras, and why), "matches" of
         each pair, "size" (width, height), "photo_size" (that of the smallest photo before it was reduced), "focal_px",
-        "focal_rise" (by what share squared errors grow if the focal length is a quarter off; None if it was held at
-        that of the Exif), "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates",
+        "focal_rise" (by what share squared errors grow if focal lengths are a quarter off; None if they were held at
+        those of the Exif), "radial_distortion", "points", "reprojection_error_px", "agreement_degrees", "gates",
         "seconds" and others; "reused": whether a former run wrote it; and "folder": where the scene is.
 
     Raises:
@@ -180,7 +180,8 @@ def find_cameras(
             (images / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
-            say(f"the photos do not tell the focal length; the Exif says {found.held:.0f} pixels, and that is taken")
+            focals = " and ".join(f"{focal:.0f}" for focal in found.held)
+            say(f"the photos do not tell the focal length; the Exif says {focals} pixels, and that is taken")
         photos = [photo for photo in photos if photo.name not in found.left_out]
         chosen = upright(found.cameras, turned, photo_names)
         level_and_scale(chosen)
@@ -198,6 +199,7 @@ def find_cameras(
                 "image": png[photo.name],
                 "points": chosen.points[photo.name],
                 "blurred": photo.name in unsharp,
+                "focal_px": chosen.focals[photo.name],
                 "exif_focal_35mm": photo.exif.focal_35mm,
             }
             for photo in photos
@@ -222,15 +224,18 @@ def find_cameras(
 
 
 def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
-    """What the report says about image size and lens."""
+    """What the report says about image size and the lens of most photos."""
+    usual = [photo for photo in photos if cameras.focals[photo.name] == cameras.focal]
+    scene = cameras.reconstruction
+    lens = next(lens for lens in scene.cameras.values() if lens.focal_length == cameras.focal)
     width, height = photos[0].size
     film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
     return {
         "size": [width, height],
         "focal_px": cameras.focal,
         "focal_35mm": film,
-        "exif_focal_px": exif_focal(photos),
-        "radial_distortion": float(lens_of_scene(cameras.reconstruction).params[3]),
+        "exif_focal_px": exif_focal(usual),
+        "radial_distortion": float(lens.params[3]),
     }
 
 

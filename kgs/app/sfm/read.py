@@ -1,6 +1,7 @@
 """Reads photos as a phone wrote them: decoded, turned upright, reduced to one size, with what Exif says of the lens.
 
-Upright and lying photos are one lens's: for the solvers, those of the rarer kind lie on their side.
+Upright and lying photos are one lens's: for the solvers, those of the rarer kind lie on their side. Photos whose focal
+length differs, by a zoom or another phone, are of a lens of their own.
 """
 
 import hashlib
@@ -127,6 +128,7 @@ class Photo:
     pixels: NDArray[np.uint8]  # `(H, W, 3)` RGB or `(H, W, 4)` RGBA, not premultiplied
     mask: NDArray[np.uint8] | None = None  # `(H, W)`, 255 where the photo is kept, 0 elsewhere; None: all is
     is_turned: bool = False  # whether it is upright only after a quarter turn counterclockwise
+    lens: int = 0  # the number of its lens; 0 took most photos
 
     @property
     def name(self) -> str:
@@ -203,6 +205,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     width, height = min(sorted(photo.size, reverse=most_lie) for photo in opened)
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
+    lenses = _lens_numbers(opened)
     photos = []
     for photo in stage(opened, "photos", "photo"):
         pixels = photo.image.read()
@@ -221,6 +224,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
                 np.ascontiguousarray(np.rot90(upright, quarters)),
                 None if mask is None else np.ascontiguousarray(np.rot90(mask, quarters)),
                 is_turned,
+                lenses[photo.name],
             )
         )
     return photos
@@ -260,6 +264,13 @@ def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
         known = (size for size in groups if _same_shape(size, photo.size))
         groups[next(known, photo.size)].append(photo)
     return {f"{width}x{height}": group for (width, height), group in groups.items()}
+
+
+def _lens_numbers(photos: list[OpenPhoto]) -> dict[str, int]:
+    """The number of each photo's lens by its name; 0 took most, and those whose Exif says no focal length."""
+    numbers = dict.fromkeys((photo.name for photo in photos), 0)
+    groups = sorted(by_lens(photos).values(), key=len, reverse=True)
+    return numbers | {photo.name: number for number, group in enumerate(groups) for photo in group}
 
 
 def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:

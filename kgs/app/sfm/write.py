@@ -14,7 +14,7 @@ from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_po
 from kgs.errors import DataError
 
 from .aside import check_space
-from .map import Cameras, cameras_of, lens_of_scene, quiet_pycolmap
+from .map import Cameras, cameras_of, quiet_pycolmap
 from .read import Photo
 
 _COUNTERCLOCKWISE = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # as the picture turns
@@ -42,7 +42,7 @@ def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
 
 
 def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cameras:
-    """The cameras with those of photos that were turned clockwise turned back: a second lens for these.
+    """The cameras with those of photos that were turned clockwise turned back: other lenses for these.
 
     Args:
         cameras: of photos of one size.
@@ -53,26 +53,28 @@ def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cam
         return cameras
     scene = cameras.reconstruction
     with quiet_pycolmap() as pycolmap:
-        lens = lens_of_scene(scene)
-        focal, x, y, distortion = lens.params
-        other = pycolmap.Camera.create_from_model_name(
-            lens.camera_id + 1, "SIMPLE_RADIAL", focal, lens.height, lens.width
-        )
-        other.params = [focal, y, lens.width - x, distortion]
         found = pycolmap.Reconstruction()
-        for each in (lens, other):
-            found.add_camera_with_trivial_rig(each)
+        count = max(scene.cameras)
+        for camera_id, lens in scene.cameras.items():
+            focal, x, y, distortion = lens.params
+            other = pycolmap.Camera.create_from_model_name(
+                count + camera_id, "SIMPLE_RADIAL", focal, lens.height, lens.width
+            )
+            other.params = [focal, y, lens.width - x, distortion]
+            found.add_camera_with_trivial_rig(lens)
+            found.add_camera_with_trivial_rig(other)
         back = pycolmap.Rigid3d(pycolmap.Rotation3d(_COUNTERCLOCKWISE), np.zeros(3))
         for image_id, image in scene.images.items():
             if not image.has_pose:
                 continue
+            lens = scene.cameras[image.camera_id]
             is_turned = names[image.name] in turned
             places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
             pose = image.cam_from_world()
             if is_turned:
                 places = np.stack([places[:, 1], lens.width - places[:, 0]], 1)
                 pose = back * pose
-            camera_id = other.camera_id if is_turned else lens.camera_id
+            camera_id = lens.camera_id + is_turned * count
             new = pycolmap.Image(name=image.name, keypoints=places, camera_id=camera_id, image_id=image_id)
             found.add_image_with_trivial_frame(new, pose)
         for point_id, point in scene.points3D.items():
