@@ -160,7 +160,9 @@ def solve(
 
 def _change(before: Any, after: Any) -> float:
     """The relative change of a lens's focal length, or that of its distortion if this is larger."""
-    return max(abs(after.params[0] / before.params[0] - 1), abs(after.params[3] - before.params[3]))
+    focal = abs(after.params[0] / before.params[0] - 1)
+    distortion = abs(after.params[3] - before.params[3])
+    return float(max(focal, distortion))
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
