@@ -37,6 +37,8 @@ class Views:
             below 1 in the dark border that removing a lens's distortion can leave.
         counted: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
             and no keypoints or initial points are taken.
+        gains: `(V, 3)` above 0, the factors of the scene's colours in each photo: its exposure and white balance; or
+            None: 1. They are estimated before a fit, and loaders set none.
         turned: whether each photo was turned by a quarter clockwise, and its camera with it, to have the size of the
             others; None: none was.
 
@@ -59,6 +61,7 @@ class Views:
     light: Tensor | None = None
     counted: Tensor | None = None
     turned: tuple[bool, ...] | None = None
+    gains: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -80,6 +83,8 @@ class Views:
             raise ValueError(f"light: expected shape ({height}, {width}), got {tuple(self.light.shape)}")
         if self.counted is not None and tuple(self.counted.shape) != (count, height, width):
             raise ValueError(f"counted: expected shape ({count}, {height}, {width}), got {tuple(self.counted.shape)}")
+        if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
+            raise ValueError(f"gains: expected numbers above 0 of shape ({count}, 3), got {self.gains.tolist()!s:.80}")
         if self.turned is not None and len(self.turned) != count:
             raise ValueError(f"turned: expected {count} as names, got {len(self.turned)}")
 
@@ -126,6 +131,7 @@ class Views:
         counted = None if self.counted is None else self.counted[rows]
         names = tuple(self.names[i] for i in indices)
         turned = None if self.turned is None else tuple(self.turned[i] for i in indices)
+        gains = None if self.gains is None else self.gains[rows.to(self.gains.device)]
         return replace(
             self,
             cameras=self.camera(rows),
@@ -134,11 +140,16 @@ class Views:
             masks=masks,
             counted=counted,
             turned=turned,
+            gains=gains,
         )
 
-    def as_photo(self, render: Tensor) -> Tensor:
-        """A render `(..., H, W)` as these views' photos would show it: clamped to [0, 1], behind their dark border."""
-        image = render.clamp(0, 1)
+    def as_photo(self, index: int, render: Tensor) -> Tensor:
+        """A render `(..., 3, H, W)` as the photo of one view would show it.
+
+        Its colours are multiplied by the gains of the view and clamped to [0, 1], behind the photos' dark border.
+        """
+        image = render if self.gains is None else render * self.gains[index, :, None, None].to(render)
+        image = image.clamp(0, 1)
         return image if self.light is None else image * self.light.to(image)
 
     def compared(self, index: int, render: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -146,7 +157,7 @@ class Views:
 
         Both are black where pixels do not count. The photo is `(3, H, W)`, on the device and of the type of the render.
         """
-        image = self.as_photo(render)
+        image = self.as_photo(index, render)
         photo = self.images[index].to(image)
         if self.counted is None:
             return image, photo, 1.0

@@ -27,9 +27,8 @@ from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import Plan, expected_memory, make_plan, most_gaussians
 from kgs.fit.prune import prune
-from kgs.fit.run import choose_points
+from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
-from kgs.fit.view_dependence import decide
 from kgs.json_files import write_json
 from kgs.machine import check_packages
 from kgs.metrics.lpips import Lpips
@@ -216,7 +215,7 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     (folder / "test").mkdir(exist_ok=True)
     for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
         render = fit.render(scene.test.camera(i))[0]
-        write_png(folder / "test" / names[name], as_taken(scene.test.as_photo(render), scene.test, i))
+        write_png(folder / "test" / names[name], as_taken(scene.test.as_photo(i, render), scene.test, i))
     metrics = measure(fit, lpips)
     write_json(folder / "metrics.json", metrics)
     return replace(fit, metrics=metrics, notes=(*fit.notes, *notes))

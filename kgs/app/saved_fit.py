@@ -12,6 +12,7 @@ from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.checkpoint import newest_checkpoint
 from kgs.fit.config import FitConfig
+from kgs.fit.exposure import with_exposure
 from kgs.fit.fit import Fit
 from kgs.fit.poses import place_cameras
 from kgs.fit.state import check_plain
@@ -66,7 +67,7 @@ def load_fit(
         raise DataError(path, "step", reason)
     if damage and say is not None:
         say(f"{damage}; the previous checkpoint is used")
-    scene = _place(request.load(out, say), path, values)
+    scene = _place(_exposed(request.load(out, say), path, values), path, values)
     options = RasterOptions(near_plane=float(values["near_plane"]), max_bytes=settings.max_bytes)
     return request, Fit(scene, model, options, backend, settings, metrics=metrics)
 
@@ -86,6 +87,14 @@ def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:
         return model.select(**part) if part else model
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error
+
+
+def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
+    """The scene, with the gains of the training photos that were decided."""
+    try:
+        return with_exposure(scene, values.get("needs", {}))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, "needs", f"expected the gains of {len(scene.train)} photos, got others") from error
 
 
 def _place(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:

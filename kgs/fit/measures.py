@@ -16,6 +16,7 @@ _INIT_NOTES = {
 }
 _CONVENTIONS = {
     "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
+    "recolored": "test views, each channel of a render with the gain and offset that fit its photo best",
     "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
     "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
     "test_views_used_for": "metrics and the curve only; no early stopping",
@@ -30,7 +31,8 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         lpips: the perceptual metric, on the device of the fit, or None to leave it out.
 
     Returns:
-        The content of metrics.json as plain values; None stands for what was not measured.
+        The content of metrics.json as plain values; None stands for what was not measured. Where the training photos
+        differ in exposure, "recolored" has the measures of test views after an affine fit of their colours.
 
     Raises:
         ValueError: the fit has no settings.
@@ -43,8 +45,10 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     if fit.history["poses"] is not None:
         poses += ", those of the training views refined by the fit"
+    is_exposed = scene.train.gains is not None and len(scene.test) > 0
     return {
         "test": evaluate(fit.render, scene.test, lpips) if len(scene.test) else None,
+        **({"recolored": evaluate(fit.render, scene.test, lpips, recolor=True)} if is_exposed else {}),
         "train": evaluate(fit.render, scene.train, lpips),
         "seen": measure_coverage(scene, fit.render, fit.median_depth),
         **fit.history,

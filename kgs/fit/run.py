@@ -9,11 +9,12 @@ from kgs.init_points.in_view import check_in_view
 from kgs.progress import Stage, silent
 
 from .config import FitConfig
+from .exposure import decide_exposure
 from .fit import Fit
-from .plan import make_plan
+from .plan import Plan, make_plan
 from .prune import prune
 from .trainer import Trainer
-from .view_dependence import decide
+from .view_dependence import decide_degree
 
 
 def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = silent) -> Fit:
@@ -33,6 +34,11 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = s
     plan = make_plan(scene, config)
     points = choose_points(scene, config, stage)
     return prune(Trainer(scene, decide(plan, points), points).fit())
+
+
+def decide(plan: Plan, points: InitialPoints) -> Plan:
+    """Decide what the photos tell before a fit: the degree of harmonics, and whether exposures differ."""
+    return decide_exposure(decide_degree(plan, points), points)
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:

@@ -83,7 +83,10 @@ class TrainState:
     def begin(cls, scene: Scene, plan: Plan, points: InitialPoints) -> Self:
         """The state before the first step, with Gaussians at the initial points."""
         nearest, median = typical_depths(points.points, scene.train.cameras)
-        model = GaussianModel.from_points(points.points.float(), points.colors.float(), plan.config.sh_degree or 0)
+        colors = points.colors.float()
+        if scene.train.gains is not None and points.views is not None:
+            colors = (colors / scene.train.gains[points.views]).clamp(0, 1)
+        model = GaussianModel.from_points(points.points.float(), colors, plan.config.sh_degree or 0)
         model.sh_degree = 0
         start = Start(
             init={"kind": points.kind, "points": len(points.points)},
@@ -243,7 +246,8 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     elif planned != steps or done > planned:
         expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
         raise ValueError(f"steps: expected {expected} got {steps}")
-    _compare_settings(saved["config"] | {"backend": saved["backend"]}, asked)
+    new = {"same_exposure": False}  # of fits from before there was this entry
+    _compare_settings(new | saved["config"] | {"backend": saved["backend"]}, asked)
     for part in ("training", "test"):
         for what, sums in scene[part].items():
             before = saved["scene"][part].get(what)  # former versions had fewer entries

@@ -23,11 +23,13 @@ class Target(NamedTuple):
     moments: TargetMoments
     clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
     background: Tensor  # (3,), the background that `image` has
+    gains: Tensor | None  # (3, 1, 1), the factors of the scene's colours in the photo; None: 1
     light: Tensor | None  # (H, W), the transmittance of a dark border, and 0 where no pixel counts; None: 1 everywhere
 
     def seen(self, render: Tensor) -> Tensor:
-        """A render as the photo would show it: clamped to 1, darkened by the border, black where no pixel counts."""
-        image: Tensor = _AtMostOne.apply(render)  # it is never below 0
+        """A render as the photo would show it: exposed, clamped to 1, behind its border, black where nothing counts."""
+        exposed = render if self.gains is None else render * self.gains
+        image: Tensor = _AtMostOne.apply(exposed)  # it is never below 0
         return image if self.light is None else image * self.light
 
     def over(self, background: Tensor, backend: str) -> Self:
@@ -78,6 +80,7 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
                 moments=target_moments(image),
                 clear=clear,
                 background=background.to(image),
+                gains=None if views.gains is None else views.gains[i, :, None, None].to(image),
                 light=light,
             )
         )

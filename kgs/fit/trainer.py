@@ -29,6 +29,7 @@ from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 from .checkpoint import newest_checkpoint, save_checkpoint
 from .config import FitConfig
 from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
+from .exposure import with_exposure
 from .fit import Fit
 from .plan import Plan, make_plan
 from .poses import decayed, place_cameras
@@ -71,14 +72,12 @@ class Trainer:
         self._look_every = 1 if device.type == "cpu" else _LOOK
         self._loss = float("nan")
         self._background = background_of(scene, device)
-        self._views = targets(scene.train, scene.background, device)
-        self._halved = targets(scene.train.halved(), scene.background, device) if plan.times.coarse else []
         self._fingerprint = fingerprint(scene)
         if isinstance(points, dict):
             self.load_state_dict(points)
         else:
             check_kind("points", points, InitialPoints)
-            self._use(TrainState.begin(scene, plan, points))
+            self._use(TrainState.begin(with_exposure(scene, plan.needs), plan, points))
 
     def _use(self, state: TrainState) -> None:
         """Train on from a state."""
@@ -92,8 +91,12 @@ class Trainer:
             absgrad=config.recipe.absgrad,
             backend=self.plan.backend,
         ).train()
-        if state.poses is not None:
-            self.scene = place_cameras(self._given, state.poses.extrinsics)
+        scene = with_exposure(self._given, self.plan.needs)
+        self.scene = scene if state.poses is None else place_cameras(scene, state.poses.extrinsics)
+        self._views = targets(scene.train, scene.background, self.plan.device)
+        self._halved = (
+            targets(scene.train.halved(), scene.background, self.plan.device) if self.plan.times.coarse else []
+        )
 
     @property
     def model(self) -> GaussianModel:

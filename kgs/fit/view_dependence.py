@@ -32,7 +32,7 @@ MOST_APART = 4.0  # from a patch's median, in medians of all such differences
 FLAT_PRIOR = 1e3  # variance of a patch's colour without its dependence on the direction
 
 
-def decide(plan: Plan, points: InitialPoints) -> Plan:
+def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
     """Decide the degree of the harmonics, if the plan leaves it open.
 
     Args:

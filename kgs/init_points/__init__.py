@@ -34,12 +34,14 @@ class InitialPoints:
         colors: RGB in [0, 1], `(P, 3)` float32.
         kind: where the points come from: "dense", "sift", "random", "file", or the scene's `init_kind`.
         patches: of "dense", the colours of the surface in the views that agree on it; else None.
+        views: of "dense", the number of the view that each point's colour is from, `(P,)` int64; else None.
     """
 
     points: Tensor
     colors: Tensor
     kind: str
     patches: PatchColors | None = None
+    views: Tensor | None = None
 
 
 def initial_points(
@@ -103,10 +105,12 @@ def initial_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = sweep_range(tracked, geometry)
-        points, colors, agreed, patches = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
-        if agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
-            return InitialPoints(points, colors, kind, patches)
-        message = f"initial points: {len(views)} training views agree on {agreed} points only; SIFT points instead"
+        dense = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
+        if dense.agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
+            return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views)
+        message = (
+            f"initial points: {len(views)} training views agree on {dense.agreed} points only; SIFT points instead"
+        )
         warnings.warn(message, stacklevel=2)
     count = FEWEST if count is None else count
     if kind in ("dense", "sift"):

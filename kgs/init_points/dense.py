@@ -5,6 +5,8 @@ which fog the view of cameras beside the photos'. Points of the sky are a minori
 stays that of the scene.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -35,6 +37,16 @@ FEW_VIEWS = 3
 MOST_OF_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
 
 
+class DensePoints(NamedTuple):
+    """Points on which two views agree."""
+
+    points: Tensor  # (P, 3) float32
+    colors: Tensor  # (P, 3), RGB in [0, 1]
+    agreed: int  # how many points were agreed on, without those of the sky
+    patches: PatchColors  # the colours of all agreed patches
+    views: Tensor  # (P,), the view that each colour is from
+
+
 def dense_points(
     views: Views,
     near: float,
@@ -45,13 +57,10 @@ def dense_points(
     backend: str = "auto",
     draw: str = "uniform",
     pixels: int | None = None,
-) -> tuple[Tensor, Tensor, int, PatchColors]:
+) -> DensePoints:
     """At most `count` points on which two views agree, drawn at random.
 
     The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
-
-    Returns the points and RGB, both `(P, 3)`, the number of agreed points without those of the sky, and the colours of
-    all agreed patches.
 
     A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
     `MOST` (`MOST_OF_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
@@ -76,7 +85,7 @@ def dense_points(
     chosen = chosen[_with_less_sky(is_sky[chosen])]
     of_view = [places[view == i, 1:] for i in range(len(views))]
     patches = patch_colors(views, geometry, maps, certain, of_view)
-    return points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches
+    return DensePoints(points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches, view[chosen])
 
 
 def small_enough(views: Views, near: float, far: float) -> Views:

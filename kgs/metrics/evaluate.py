@@ -31,8 +31,13 @@ _WINDOW = 11
 
 
 @torch.no_grad()
-def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpips | None = None) -> dict[str, Any]:
+def evaluate(
+    render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpips | None = None, *, recolor: bool = False
+) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
+
+    With `recolor`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
+    exposure and white balance of a held-out photo do is then not counted.
 
     Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a network on the device of the renders. A ValueError for a
     render that differs in shape from its photo or holds NaN or infinity.
@@ -54,6 +59,8 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
         shown, photo, share = views.compared(index, image)
+        if recolor:
+            shown, _, _ = views.compared(index, recolored(image, shown, photo))
         shares.append(share)
         rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
@@ -61,6 +68,21 @@ def evaluate(render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpi
     if views.counted is not None and shares:
         means["counted"] = round(fmean(shares), 4)
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
+
+
+def recolored(image: Tensor, shown: Tensor, photo: Tensor) -> Tensor:
+    """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
+
+    `shown` is the render as it is compared with the photo; least squares in float64.
+    """
+    x = shown[0].flatten(1).double()
+    y = photo.flatten(1).double()
+    mean_x = x.mean(1, keepdim=True)
+    mean_y = y.mean(1, keepdim=True)
+    variance = (x - mean_x).square().sum(1, keepdim=True)
+    gain = torch.where(variance > 0, ((x - mean_x) * (y - mean_y)).sum(1, keepdim=True) / variance, 1.0)
+    offset = mean_y - gain * mean_x
+    return image * gain[:, :, None].to(image) + offset[:, :, None].to(image)
 
 
 def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float | None:
@@ -91,6 +113,8 @@ def measure_again(
     DataError if the views differ.
     """
     fresh: dict[str, Any] = {}
+    if metrics.get("recolored") and len(scene.test):
+        fresh["recolored"] = evaluate(render, scene.test, lpips, recolor=True)
     for part, views in (("test", scene.test), ("train", scene.train)):
         old = metrics.get(part) or {"views": []}
         try:
@@ -135,13 +159,14 @@ def as_text(metrics: dict[str, Any]) -> str:
     """The metrics of a fit as lines of text."""
     lines = list[str]()
     names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
-    for part in ("test", "train"):
-        values = metrics[part] or {}
+    for part in ("test", "recolored", "train"):
+        values = metrics.get(part) or {}
         measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
         if measured:
             share = values.get("counted")
             where = "" if share is None else f" (of {share:.0%} of the pixels: masks leave out the rest)"
-            lines.append(f"{part:>5}: {', '.join(measured)}{where}")
+            adjusted = ", each render in the colours that fit its photo best" if part == "recolored" else ""
+            lines.append(f"{'test' if adjusted else part:>5}: {', '.join(measured)}{where}{adjusted}")
     coverage = metrics.get("seen") or {}
     level = coverage.get("psnr")
     rest = coverage.get("psnr_rest")

@@ -22,9 +22,8 @@ from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
 from kgs.fit.prune import prune
-from kgs.fit.run import choose_points
+from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
-from kgs.fit.view_dependence import decide
 from kgs.init_points import InitialPoints
 from kgs.machine import peak_rss_mb, revision
 from kgs.metrics.evaluate import MEASURES

@@ -111,10 +111,10 @@ def test_a_render_is_compared_as_the_photo_shows_it(scene):
     """In [0, 1] and behind the border; what lies in the border is black whatever the render has there."""
     plain, light = scene.train, behind(left=1.0, top=0.0, right=0.0)
     render = torch.tensor([-0.5, 0.25, 1.5])[:, None, None].expand(3, 144, 192)
-    shown = replace(plain, light=light).as_photo(render)
+    shown = replace(plain, light=light).as_photo(0, render)
     assert bool((shown[:, :, 0] == 0).all())
     assert shown[:, 5, 5].tolist() == [0.0, 0.25, 1.0]
-    assert plain.as_photo(render)[:, 0, 0].tolist() == [0.0, 0.25, 1.0]
+    assert plain.as_photo(0, render)[:, 0, 0].tolist() == [0.0, 0.25, 1.0]
 
 
 def test_halving_and_choosing_keep_the_border(scene):

@@ -1,0 +1,106 @@
+"""Estimates, before a fit, how much brighter or warmer each photo is than the others, from the photos alone.
+
+Dense initial points come with the colours of small patches of surface in the views that agree on their depth. If
+exposure or white balance changed between photos, all colours of a photo differ from those of the others by a factor in
+each channel. The logarithms of the factors, with a mean of zero over the photos, are the least squares solution of
+
+    log color(patch, view) = log color(patch) + log gain(view)
+
+over all patches and views, weighted anew against outliers. Shading, reflections and noise give gains, too, which make a
+fit worse: gains are used where they explain much of what the patches differ by.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kgs.datasets.scene import Scene
+from kgs.init_points import InitialPoints
+from kgs.init_points.patches import PatchColors
+
+from .plan import Plan
+
+LEAST_RATIO = 1.03  # between the gains of two photos in a channel, for gains to be used
+MOST_LEFT = 0.7  # of the median difference of a patch's colours, after the gains, for gains to be used
+MIN_PATCHES = 200
+USABLE = 0.03, 0.97  # colours beyond are black or saturated
+ROUNDS = 8  # of the weights
+PRIOR = 1e-3  # patches that speak for a gain of 1: where no other does
+
+
+def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
+    """Decide whether the training photos differ in exposure or white balance, and by how much.
+
+    Args:
+        plan: of the fit; nothing is decided with `same_exposure`.
+        points: its initial points; nothing is decided without patches.
+
+    Returns:
+        The plan. If the photos differ, its `needs` have under "exposure" a dict: "gains", three numbers for each
+        training view, with a geometric mean of 1; "left", the share of the patches' differences that they leave; and
+        "n", the number of patches.
+    """
+    if plan.config.same_exposure or points.patches is None or len(points.patches) < MIN_PATCHES:
+        return plan
+    gains, left = estimate_gains(points.patches)
+    ratio = float((gains.amax(0) / gains.amin(0)).max())
+    if ratio < LEAST_RATIO or left > MOST_LEFT:
+        return plan
+    rows = [[round(value, 4) for value in row] for row in gains.tolist()]
+    exposure = {"gains": rows, "left": round(left, 3), "n": len(points.patches)}
+    return replace(plan, needs={**plan.needs, "exposure": exposure})
+
+
+def estimate_gains(patches: PatchColors) -> tuple[Tensor, float]:
+    """The factor of each view's colours, `(V, 3)` float64, and the share of differences that the factors leave.
+
+    In each channel the factors have a geometric mean of 1. Differences are those of a patch's log colours from their
+    mean over the views, in the median; the share is that of the channel where it is least, and 1 without patches.
+
+    Iteratively reweighted least squares with the weights of Cauchy; each round is a linear system of V unknowns.
+    """
+    low, high = USABLE
+    colors = patches.colors.double()
+    usable = patches.visible & ((colors > low) & (colors < high)).all(2)
+    rows = usable.sum(1) >= 2
+    usable = usable[rows]
+    logs = colors[rows].masked_fill(~usable[..., None], 1.0).log()
+    gains = logs.new_zeros(logs.shape[1:])
+    if not len(logs):
+        return gains.exp(), 1.0
+    typical = list[Tensor]()  # differences of each channel
+    for _ in range(ROUNDS + 1):
+        levels = logs - gains
+        means = (levels * usable[..., None]).sum(1, keepdim=True) / usable.sum(1)[:, None, None]
+        differences = levels - means
+        typical.append(differences[usable].abs().median(0).values.clamp_min(1e-4))
+        if len(typical) <= ROUNDS:
+            weights = usable[..., None] / (1 + (differences / (2 * typical[-1])).square())
+            gains = torch.stack([_solve(weights[..., k], logs[..., k]) for k in range(3)], dim=1)
+    return gains.exp(), float((typical[-1] / typical[0]).min())
+
+
+def _solve(weights: Tensor, logs: Tensor) -> Tensor:
+    """Log gains `(V,)` of one channel, with a mean of 0: the patches' own levels are eliminated from the equations."""
+    totals = weights.sum(1, keepdim=True)
+    count = weights.shape[1]
+    own = torch.diag(weights.sum(0) + PRIOR)
+    matrix = own - weights.T @ (weights / totals) + 1 / count
+    right = (weights * logs).sum(0) - (weights / totals).T @ (weights * logs).sum(1)
+    found = torch.linalg.solve(matrix, right)
+    return found - found.mean()
+
+
+def with_exposure(scene: Scene, needs: dict[str, Any]) -> Scene:
+    """The scene whose training views have the gains that were decided; the same one where none were.
+
+    Raises:
+        ValueError: they are not three numbers above 0 for each view.
+    """
+    if "exposure" not in needs:
+        return scene
+    views = scene.train
+    gains = torch.tensor(needs["exposure"]["gains"], dtype=torch.float32)
+    return replace(scene, train=replace(views, gains=gains))

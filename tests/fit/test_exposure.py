@@ -1,0 +1,159 @@
+"""Exposure: gains that were put on are found; a fit holds them, and photos that do not differ have none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from kgs.datasets import synthetic_scene
+from kgs.fit.config import PRESETS, FitConfig
+from kgs.fit.exposure import LEAST_RATIO, MIN_PATCHES, decide_exposure, estimate_gains, with_exposure
+from kgs.fit.measures import measure
+from kgs.fit.plan import make_plan
+from kgs.fit.run import choose_points, decide, fit_scene
+from kgs.fit.trainer import Trainer
+from kgs.init_points import InitialPoints
+from kgs.init_points.patches import PatchColors
+from kgs.metrics.evaluate import evaluate, recolored
+
+GAINS = torch.tensor([[0.5, 0.5, 0.5], [0.8, 0.8, 0.8], [1.25, 1.25, 1.25], [1.1, 1.0, 0.8]])
+
+
+def patches(gains=GAINS, count=600, noise=0.0, outliers=0.0, seed=0):
+    """Colours of random surfaces, each seen by three views or more, times the views' gains."""
+    draw = torch.Generator().manual_seed(seed)
+    views = len(gains)
+    visible = torch.rand(count, views, generator=draw).argsort(1) < torch.randint(
+        3, views + 1, (count, 1), generator=draw
+    )
+    colors = 0.1 + 0.6 * torch.rand(count, 1, 3, generator=draw).expand(-1, views, -1)
+    colors = colors * gains * torch.exp(noise * torch.randn(colors.shape, generator=draw))
+    wrong = torch.rand(count, views, 1, generator=draw) < outliers
+    colors = torch.where(wrong, torch.rand(colors.shape, generator=draw), colors)
+    colors = torch.where(visible[..., None], colors, torch.full_like(colors, torch.nan))
+    return PatchColors(colors.clamp(0, 1), visible, torch.zeros(count, views, 3))
+
+
+def centred(gains):
+    return gains / gains.log().mean(0).exp()
+
+
+def points_with(patches):
+    return InitialPoints(torch.zeros(4, 3), torch.zeros(4, 3), "dense", patches, torch.zeros(4, dtype=torch.int64))
+
+
+@pytest.mark.parametrize(("noise", "outliers", "close"), [(0.0, 0.0, 2e-3), (0.05, 0.0, 0.02), (0.05, 0.2, 0.03)])
+def test_gains_that_were_put_on_are_found(noise, outliers, close):
+    found, left = estimate_gains(patches(noise=noise, outliers=outliers))
+    torch.testing.assert_close(found.float(), centred(GAINS), rtol=close, atol=0.0)
+    assert left < 0.3
+
+
+def test_a_view_without_patches_keeps_its_exposure():
+    seen = patches(GAINS[[0, 1, 2, 3, 3]])
+    hidden = PatchColors(seen.colors, seen.visible & (torch.arange(5) < 4), seen.directions)
+    found, _ = estimate_gains(hidden)
+    assert bool(found.isfinite().all())
+    torch.testing.assert_close((found / found[4])[:4].float(), centred(GAINS[:4]), rtol=0.05, atol=0.0)
+
+
+def test_gains_are_used_only_where_photos_differ(tiny_plan):
+    equal = torch.ones(4, 3)
+    assert decide_exposure(tiny_plan, points_with(patches(equal, noise=0.1))) == tiny_plan
+    assert decide_exposure(tiny_plan, points_with(patches(count=MIN_PATCHES - 1))) == tiny_plan
+    assert decide_exposure(tiny_plan, points_with(None)) == tiny_plan
+    same = replace(tiny_plan, config=replace(tiny_plan.config, same_exposure=True))
+    assert decide_exposure(same, points_with(patches())) == same
+    assert decide_exposure(tiny_plan, points_with(patches(1 + 0.04 * (GAINS - 1), noise=0.1))) == tiny_plan
+    warm = torch.ones(4, 3)
+    warm[0, 0] = 1.1 * LEAST_RATIO
+    needs = decide_exposure(tiny_plan, points_with(patches(warm))).needs["exposure"]
+    torch.testing.assert_close(torch.tensor(needs["gains"]), centred(warm), rtol=5e-3, atol=0.0)
+
+
+# -- of a scene -----------------------------------------------------------------------------------------------------
+
+CONFIG = FitConfig(steps=150, evaluations=1, sh_degree=0)
+
+
+@pytest.fixture(scope="module")
+def arc():
+    return synthetic_scene("arc", train_views=6, test_views=2, size=(72, 96))
+
+
+@pytest.fixture(scope="module")
+def exposed(arc):
+    """The same scene in photos of which each has an exposure and a white balance of its own, one of them saturated."""
+    gains = GAINS[[0, 1, 2, 3, 1, 2]]
+    return replace(arc, train=replace(arc.train, images=(arc.train.images * gains[:, :, None, None]).clamp(0, 1)))
+
+
+@pytest.fixture(scope="module")
+def tiny_plan(arc):
+    return make_plan(arc, FitConfig())
+
+
+@pytest.fixture(scope="module")
+def fit(exposed):
+    return fit_scene(exposed, CONFIG)
+
+
+def test_a_fit_of_photos_that_differ_is_as_good_as_of_photos_that_do_not(arc, exposed, fit):
+    """Held-out views, after an affine fit of their colours; without gains they lose much."""
+    truth = centred(GAINS[[0, 1, 2, 3, 1, 2]])
+    torch.testing.assert_close(fit.scene.train.gains, truth, rtol=0.05, atol=0.0)
+    same = fit_scene(exposed, replace(CONFIG, same_exposure=True))
+    assert same.scene.train.gains is None
+    levels = [evaluate(f.render, arc.test, recolor=True)["psnr"] for f in (fit, same, fit_scene(arc, CONFIG))]
+    assert levels[0] > levels[2] - 1.0
+    assert levels[0] > levels[1] + 2.0
+
+
+def test_training_views_are_compared_as_they_were_exposed_and_both_measures_are_named(fit):
+    metrics = measure(fit)
+    assert metrics["train"]["psnr"] > metrics["test"]["psnr"]
+    assert metrics["recolored"]["psnr"] > metrics["test"]["psnr"] + 1.0
+    assert metrics["needs"]["exposure"]["n"] >= MIN_PATCHES
+
+
+def test_the_presets_of_the_paper_have_none(exposed):
+    for name in ("paper", "plain"):
+        config = PRESETS[name]
+        assert "exposure" not in decide(make_plan(exposed, config), choose_points(exposed, config)).needs
+
+
+def test_resumed_is_bit_identical(exposed, tmp_path):
+    points = choose_points(exposed, CONFIG)
+    config = replace(CONFIG, steps=20)
+    plan = decide(make_plan(exposed, config), points)
+    whole = Trainer(exposed, plan, points)
+    whole.fit()
+    begun = Trainer(exposed, plan, points)
+    begun.fit(lambda trainer, _: trainer.step == 10)
+    begun.save(tmp_path / "checkpoint")
+    resumed = Trainer.resume(exposed, config, tmp_path / "checkpoint")
+    resumed.fit()
+    for name, value in whole.model.named_parameters():
+        assert torch.equal(value, resumed.model.get_parameter(name)), name
+
+
+def test_gains_of_another_number_of_photos_are_refused(arc):
+    with pytest.raises(ValueError, match="gains"):
+        with_exposure(arc, {"exposure": {"gains": [[1.0, 1.0, 1.0]]}})
+    with pytest.raises(ValueError, match="gains"):
+        replace(arc.train, gains=torch.zeros(6, 3))
+
+
+def test_recoloured_renders_fit_best():
+    """Against least squares of numpy."""
+    draw = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 3, 5, 7, generator=draw)
+    photo = torch.rand(3, 5, 7, generator=draw)
+    found = recolored(image, image, photo)
+    for k in range(3):
+        columns = np.stack([image[0, k].flatten().numpy(), np.ones(35)], 1)
+        best = columns @ np.linalg.lstsq(columns, photo[k].flatten().numpy(), rcond=None)[0]
+        np.testing.assert_allclose(found[0, k].flatten().numpy(), best, atol=1e-5)
+    flat = torch.full((1, 3, 5, 7), 0.25)
+    torch.testing.assert_close(recolored(flat, flat, photo)[0].mean((1, 2)), photo.mean((1, 2)))
