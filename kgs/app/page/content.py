@@ -44,6 +44,8 @@ class PagePhotos:
         parts: what each photo was used for: "training", "test", or another word.
         pictures: some of the photos with their renders.
         pictures_note: a sentence that says which photos these are.
+        thumbnails: some of the photos, RGB in [0, 1], `(3, H, W)`, by their names; a click on one flies to its camera.
+            Without any there are numbers instead.
     """
 
     cameras: PinholeCamera
@@ -51,6 +53,7 @@ class PagePhotos:
     parts: Sequence[str]
     pictures: Sequence[Picture] = ()
     pictures_note: str = ""
+    thumbnails: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
