@@ -44,6 +44,16 @@ def test_fit_writes_everything(fitted):
     assert cv2.imread(str(fitted / "curve.png")) is not None
 
 
+def test_a_fit_of_fewer_pixels_than_the_photos_have_names_detail_high(folder, tmp_path, monkeypatch, capsys):
+    """Where --detail chose them; --size was a choice of the user."""
+    monkeypatch.setitem(DETAILS, "low", DETAILS["low"]._replace(size=32))
+    quick = ("--steps", 2, "--evaluations", 1, *FIT)
+    for options, expected in ((("--detail", "low"), True), (("--size", 32), False), ((), False)):
+        assert run("fit", folder, "-o", tmp_path / "out", *options, *quick) == 0
+        line = "the same command with --detail high fits 40 pixels instead of 32"
+        assert (line in capsys.readouterr().out) == expected, options
+
+
 def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {

@@ -56,7 +56,7 @@ def encoded(pictures: Sequence[Picture], most_bytes: int) -> list[dict[str, Any]
 
 
 def in_strip(names: Sequence[str]) -> list[int]:
-    """Indices of the photos in the strip of thumbnails: up to `MOST_THUMBNAILS`, spread evenly, in the order of names."""
+    """Indices of the photos in the strip: up to `MOST_THUMBNAILS`, spread evenly, in the order of their names."""
     order = sorted(range(len(names)), key=lambda i: names[i])
     return [order[k] for k in select_evenly(len(order), min(len(order), MOST_THUMBNAILS))] if order else []
 

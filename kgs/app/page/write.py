@@ -156,7 +156,7 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _strip(photos: PagePhotos, cameras: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The photos to fly to, in the order of names: index of the camera, label, number, and thumbnail if there is any."""
+    """The photos to fly to, in the order of names: index of the camera, label, number, and thumbnail if any."""
     names = [camera["name"] for camera in cameras]
     small = photos.thumbnails
     shown = [i for i, name in enumerate(names) if not small or name in small]
