@@ -684,3 +684,65 @@ def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: s
     assert browser.run("document.documentElement.scrollWidth") <= 400
     channels = browser.run("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
     assert (max(channels) < 64) if scheme == "dark" else (min(channels) > 240)
+
+
+def test_the_depth_at_a_pixel_is_that_of_the_renderer(browser: Browser, scene: Any, tmp_path: Path) -> None:
+    """The median depth within 1 %, plain and antialiased, from the cameras of all photos."""
+    gaussians, cameras = scene
+    browser.size(1000, 800)
+    for antialiased in (False, True):
+        write_page(tmp_path / "index.html", bare_page(gaussians, cameras, antialiased=antialiased))
+        browser.open(tmp_path / "index.html", READY)
+        with torch.no_grad():
+            renderer = kgs.GaussianRenderer(antialiased=antialiased, backend="torch").eval()
+            depth = renderer(gaussians, cameras, outputs=("median_depth",)).median_depth[:, 0].numpy()
+        rows, columns = (axis.ravel() for axis in np.mgrid[3 : SIZE[0] : 7, 4 : SIZE[1] : 9])
+        pixels = np.stack([columns, rows], 1).tolist()
+        for index in range(4):
+            show(browser, index)
+            found = browser.run(
+                f"(({{ renderer, view, eye }}) => {pixels}.map((pixel) => "
+                "renderer.medianDepth(viewer.withNearPlane(eye), view, pixel)))(viewer)"
+            )
+            expected = depth[index, rows, columns]
+            differences = np.abs(np.array([value or 0.0 for value in found]) - expected)
+            assert (expected > 0).sum() > 25
+            # A pixel where the transmittance is just about one half can take the next Gaussian.
+            assert (differences > 0.01 * expected).sum() <= 1, (antialiased, index)
+
+
+def test_two_clicked_points_have_a_distance(opened: Browser) -> None:
+    """On a wall of Gaussians at a known depth, the points and their distance are known as well."""
+    opened.run("document.querySelector('.unfold').click(); document.querySelector('.measure').click()")
+    text = "document.querySelector('.measured').innerText"
+    assert opened.run(text).startswith("Choose two points")
+    opened.run("viewer.renderer.medianDepth = () => 2; viewer.scene.offset = [1000, 0, -3]; viewer.draw()")
+    left, top, width, height = box(opened)
+    clicked = [(0.3, 0.4), (0.6, 0.7)]
+    for x, y in clicked:
+        for kind in ("Pressed", "Released"):
+            mouse(opened, kind, left + x * width, top + y * height, clickCount=1)
+    camera = opened.run("viewer.scene.cameras[viewer.chosen]")
+    size, focal, centre = (np.array(camera[name]) for name in ("size", "focal", "centre"))
+    points = [
+        np.array(camera["position"])
+        + 2 * np.array([*((np.array(at) * size - 0.5 - centre) / focal), 1]) @ np.array(camera["rotation"])
+        for at in clicked
+    ]
+    said = opened.run(text)
+    distance = np.linalg.norm(points[1] - points[0])
+    assert float(said.split()[0]) == pytest.approx(distance, rel=5e-3)  # a click is at a whole pixel of the page
+    words = opened.run("document.querySelector('.measured code').textContent").split()
+    assert words[:4] == ["kgs", "scale", "FOLDER", "--by"]
+    shown = [np.array([float(value) for value in word.split(",")]) for word in words[4:6]]
+    for one, expected in zip(shown, points, strict=True):
+        np.testing.assert_allclose(one, expected + np.array([1000, 0, -3]), atol=5e-3 * distance)
+    assert np.linalg.norm(shown[1] - shown[0]) == pytest.approx(float(said.split()[0]), rel=1e-4)
+    marks = (
+        "[...document.querySelectorAll('.ruler circle')].map((one) => ['cx', 'cy'].map((n) => +one.getAttribute(n)))"
+    )
+    for mark, (x, y) in zip(opened.run(marks), clicked, strict=True):
+        assert mark == pytest.approx([x * width, y * height], abs=1.5)
+    opened.run("document.querySelector('.measure').click()")
+    assert opened.run(text) == ""
+    assert opened.run("getComputedStyle(document.querySelector('.ruler circle')).display") == "none"

@@ -23,12 +23,15 @@ class PageSplat:
             near plane is farther away, see :func:`kgs.app.files.film.path_near_plane`.
         weights: returns the contribution of each Gaussian, `(N,)`; called only if Gaussians must be left out, those
             that contribute least first. None: opacity times area.
+        offset: the origin of the Gaussians' frame in the coordinates of the splat's file, `(3,)`, in which the page
+            says where points are: the `offset` of a Scene. None: zero.
     """
 
     gaussians: Gaussians
     background: Tensor
     options: RasterOptions = field(default_factory=RasterOptions)
     weights: Callable[[], Tensor] | None = None
+    offset: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)

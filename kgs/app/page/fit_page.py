@@ -92,6 +92,7 @@ def write_fit_page(
             background=_ground(photographed, scene.background),
             options=fit.options,
             weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
+            offset=scene.offset,
         ),
         photos=PagePhotos(
             cameras=_all_cameras(*parts),

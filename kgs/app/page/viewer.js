@@ -58,7 +58,8 @@ function target({ position, rotation, distance }) {
 }
 
 class Viewer {
-  // `scene` is what `viewer_scene` of kgs/app/page/cameras.py returns.
+  // `scene` is what `viewer_scene` of kgs/app/page/cameras.py returns, and `offset`, the origin of its coordinates in
+  // those of the splat's file.
   constructor(frame, renderer, scene) {
     this.frame = frame;
     this.canvas = frame.querySelector("canvas");
@@ -78,6 +79,7 @@ class Viewer {
     this.playButton = frame.querySelector(".play");
     this.place(scene.first);
     this.listen(frame);
+    this.ruler = new Ruler(this, frame);
     new ResizeObserver(() => this.requestDraw()).observe(this.canvas);
     this.draw();
     if (!wantsLessMotion()) this.flyTour(this.slowRound());
@@ -350,6 +352,7 @@ class Viewer {
     this.renderer.resize(...this.view.sides);
     this.renderer.draw(this.withNearPlane(eye), this.view);
     this.drawPyramids();
+    this.ruler.draw();
   }
 
   // -- The pyramids that mark the cameras.
@@ -401,6 +404,19 @@ class Viewer {
     const { focal, centre, ratio } = this.view;
     const pixel = [x, y].map((value, axis) => (focal[axis] * value / z + centre[axis] + 0.5) / ratio);
     return pixel.map((value) => value.toFixed(1)).join(" ");
+  }
+
+  // The point of the splat that a pixel of the page shows, in the world; null where the splat lets more than half of the
+  // light through.
+  pointAt(clientX, clientY) {
+    const { left, top } = this.canvas.getBoundingClientRect();
+    const { ratio, focal, centre } = this.view;
+    const { rotation: [right, down, forward], position } = this.eye;
+    const pixel = [clientX - left, clientY - top].map((value) => ratio * value - 0.5);  // integer pixel centres
+    const depth = this.renderer.medianDepth(this.withNearPlane(this.eye), this.view, pixel);
+    if (depth === null) return null;
+    const [x, y] = pixel.map((value, axis) => depth * (value - centre[axis]) / focal[axis]);
+    return add(add(add(position, right, x), down, y), forward, depth);
   }
 
   // -- Input.

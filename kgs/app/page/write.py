@@ -30,6 +30,7 @@ _FILES = [
     "style.css",
     "viewer.css",
     "renderer.js",
+    "ruler.js",
     "viewer.js",
     "pictures.js",
     "splat.vert.glsl",
@@ -80,13 +81,15 @@ class _Page:
         import jinja2
 
         runs = list(content.text.runs.values())
-        self._scene = viewer_scene(
+        scene = viewer_scene(
             content.photos.cameras,
             content.photos.names,
             content.photos.parts,
             content.splat.gaussians.means,
             psnr_of_views(runs[-1]) if runs else {},
         )
+        offset = content.splat.offset
+        self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
         self._settings = _viewer_settings(content.splat, content.photos)
         self._context = _context(content, self._scene)
         loader = jinja2.PackageLoader("kgs.app.page", ".")
