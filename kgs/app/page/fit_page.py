@@ -129,14 +129,30 @@ def load_small(path: str | PathLike[str], scene: Scene, background: str) -> View
     return load_scene(path, count, shrink, hold_out=0, background=background).train
 
 
-def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> None:
-    """Write the page of a fit into a folder that has its other files; `out` is where they belong."""
+def write_own_page(
+    folder: Path,
+    out: Path,
+    fit: Fit,
+    request: SceneRequest,
+    config: Path | None = None,
+    remarks: Sequence[str] = (),
+) -> None:
+    """Write the page of a fit into a folder that has its other files.
+
+    Args:
+        folder: for the page.
+        out: where the files of the fit belong.
+        fit: with metrics.
+        request: how the scene was loaded.
+        config: config.json of the fit; None: that in `folder`.
+        remarks: sentences to show under Details.
+    """
     write_fit_page(
         folder / PAGE,
         request.title_of(out),
         {"": fit},
-        remarks=_finer_note(fit.scene, request),
-        settings=read_json(folder / "config.json"),
+        remarks=[*remarks, *_finer_note(fit.scene, request)],
+        settings=read_json(config or folder / "config.json"),
         report=fit.scene.root / CAMERAS_REPORT,
         photos=request.photos,
         roll=request.roll,
