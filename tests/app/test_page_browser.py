@@ -715,7 +715,7 @@ def test_two_clicked_points_have_a_distance(opened: Browser) -> None:
     """On a wall of Gaussians at a known depth, the points and their distance are known as well."""
     opened.run("document.querySelector('.unfold').click(); document.querySelector('.measure').click()")
     text = "document.querySelector('.measured').innerText"
-    assert opened.run(text).startswith("Choose two points")
+    assert opened.run(text).startswith("Choose two points in")
     opened.run("viewer.renderer.medianDepth = () => 2; viewer.scene.offset = [1000, 0, -3]; viewer.draw()")
     left, top, width, height = box(opened)
     clicked = [(0.3, 0.4), (0.6, 0.7)]

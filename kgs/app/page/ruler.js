@@ -20,7 +20,7 @@ class Ruler {
     this.points = [];
     this.button.setAttribute("aria-pressed", String(this.isOn));
     this.viewer.canvas.classList.toggle("measures", this.isOn);
-    this.show(this.isOn ? "Choose two points of the picture." : "");
+    this.show(this.isOn ? "Choose two points in the picture." : "");
   }
 
   choose({ clientX, clientY }) {
@@ -44,8 +44,8 @@ class Ruler {
     const digits = clamped(DISTANCE_DIGITS - 1 - Math.floor(Math.log10(distance)), 0, 20);
     const offset = this.viewer.scene.offset ?? [0, 0, 0];
     const [a, b] = this.points.map((point) => add(point, offset).map((value) => value.toFixed(digits)).join(","));
-    this.show(`${distance.toPrecision(DISTANCE_DIGITS)} units apart. If you know this length, in metres say, `
-      + "this command makes it the unit of the splat and its cameras:", `kgs scale FOLDER --by ${a} ${b} LENGTH -o OUT`);
+    this.show(`${distance.toPrecision(DISTANCE_DIGITS)} units apart. With the true length in place of LENGTH, in metres `
+      + "say, this command scales splat, cameras and page to it:", `kgs scale FOLDER --by ${a} ${b} LENGTH -o OUT`);
   }
 
   show(text, command = "") {
