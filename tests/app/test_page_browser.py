@@ -677,7 +677,7 @@ def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: s
     browser.size(400, 800, scheme)
     browser.open(page, READY)
     assert browser.run("document.documentElement.scrollWidth") <= 400
-    cut = """[...document.querySelectorAll("body *")].filter((one) => !one.closest(".scroll, pre, svg, details")
+    cut = """[...document.querySelectorAll("body *")].filter((one) => !one.closest(".scroll, .strip, pre, svg, details")
       && one.getBoundingClientRect().right > innerWidth + 0.5).map((one) => one.outerHTML.slice(0, 99))"""
     assert browser.run(cut) == []
     browser.run("document.querySelector('details').open = true")

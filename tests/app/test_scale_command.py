@@ -104,6 +104,7 @@ def test_a_splat_far_from_the_origin_keeps_its_digits(tmp_path: Path) -> None:
         ((A, "1,2,nan", 1), "--by: "),
         ((A, A, 1), "--by: "),
         ((A, "-1.0,2,0.50", 1), "--by: "),
+        ((A, "-1,2,0.50001", 1e308), "--by: "),
         ((A, B, 0), "--by: "),
         ((A, B, -2), "--by: "),
         ((A, B, "inf"), "--by: "),

@@ -32,13 +32,11 @@ def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
     import torch
 
     a, b, length = by
-    start = torch.tensor(_point(a), dtype=torch.float64)
-    end = torch.tensor(_point(b), dtype=torch.float64)
-    factor = length / float((end - start).norm())
+    factor = length / math.dist(_point(a), _point(b))
     if splat.is_dir():
         _scale_folder(splat, out, factor, length)
     else:
-        _scale_ply(splat, out, factor, start)
+        _scale_ply(splat, out, factor, torch.tensor(_point(a), dtype=torch.float64))
     say(f"{printable(out)}: {factor:.6g} times as large")
     if splat.is_dir():
         say_next(f"open {as_line(out / 'index.html')} in a browser")
@@ -98,8 +96,9 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
     a, b, length = by
     if not (math.isfinite(length) and length > 0):
         raise ValueError(f"by: expected a length above 0, got {length:g}")
-    if _point(a) == _point(b):
-        raise ValueError(f"by: expected two points, got {a} twice")
+    distance = math.dist(_point(a), _point(b))
+    if not (0 < distance < math.inf and 0 < length / distance < math.inf):
+        raise ValueError(f"by: expected two points that can be {length:g} apart, got {a} and {b}")
     if splat.is_dir():
         check_installed("cpu", "auto", "jinja2", "safetensors")
         if not (splat / "config.json").exists():
