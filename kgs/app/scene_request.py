@@ -10,7 +10,10 @@ from kgs.datasets.load import load_scene
 from kgs.datasets.options import MASK_MEANINGS
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
+from kgs.fit.config import DETAILS
 from kgs.json_files import is_number
+
+_FINER = 1.1  # how many times as large photos must be to be worth a line
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,12 @@ class SceneRequest:
     def title_of(self, base: Path) -> str:
         """The title of the page: as asked for, else the name of the folder in plain words."""
         return self.title or in_plain_words((base / self.scene).resolve().name)
+
+    def finer_side(self, scene: Scene) -> int | None:
+        """The longer side in pixels with `--detail high`; None where the photos of the fit are about as large."""
+        side = max(scene.train.images.shape[-2:])
+        largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
+        return largest if largest > _FINER * side else None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for config.json."""

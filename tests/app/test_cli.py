@@ -44,6 +44,16 @@ def test_fit_writes_everything(fitted):
     assert cv2.imread(str(fitted / "curve.png")) is not None
 
 
+def test_a_fit_of_fewer_pixels_than_the_photos_have_names_detail_high(folder, tmp_path, monkeypatch, capsys):
+    """Where --detail chose them; --size was a choice of the user."""
+    monkeypatch.setitem(DETAILS, "low", DETAILS["low"]._replace(size=32))
+    quick = ("--steps", 2, "--evaluations", 1, *FIT)
+    for options, expected in ((("--detail", "low"), True), (("--size", 32), False), ((), False)):
+        assert run("fit", folder, "-o", tmp_path / "out", *options, *quick) == 0
+        line = "the same command with --detail high fits 40 pixels instead of 32"
+        assert (line in capsys.readouterr().out) == expected, options
+
+
 def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
@@ -143,7 +153,7 @@ def small(tmp_path_factory):
         ("render {file} --cameras {scene}", " -o transforms_train-render"),
         ("page {missing} --cameras {scene} -o {scene}.html", "missing"),
         ("page {file} --cameras {scene} -o {out}", "--out: expected a file that ends in .html"),
-        ("nonsense", "one of demo, fit, render, eval, page, check, bench, study, got 'nonsense'"),
+        ("nonsense", "one of demo, fit, render, eval, page, scale, check, bench, study, got 'nonsense'"),
         ("bench nonsense", "one of speed, precision, extremes, got"),
         ("bench sped", "did you mean speed?"),
     ],

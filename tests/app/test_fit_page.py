@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shutil
@@ -9,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from factories import random_views
@@ -17,7 +20,7 @@ from kgs.app import fit_folder as app
 from kgs.app.cli.evaluate import evaluate
 from kgs.app.files.ownership import is_own
 from kgs.app.page import fit_page
-from kgs.app.page.fit_page import spread, write_own_page
+from kgs.app.page.fit_page import spread, write_fit_page, write_own_page
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Views, synthetic_scene
@@ -65,8 +68,10 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     text = (out / "index.html").read_text(encoding="utf-8")
     assert "<h1>room</h1>" in text
     assert "mine" not in text
-    assert "<p>Eleven photos. Drag to look around.</p>" in text
-    assert text.count(" of 11, held out</option>") == 8
+    assert "<p>Eleven photos. Drag to look around.<" in text
+    assert text.count(' of 11, held out" style=') == 8
+    assert text.count('<img alt="" src="data:image/jpeg') == 11
+    assert "--detail high" not in text  # the photos have the size of the fit
     assert "6 of 8 test photos." in text
     assert text.count('class="render"') == 6
     assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
@@ -99,6 +104,37 @@ def test_without_a_photo_held_out_training_views_are_shown(fitted: Any, rewritte
     assert "No photo was held out" in text
     assert "The training photos." in text
     assert text.count('class="render"') == 3
+
+
+def test_it_says_that_a_larger_fit_is_possible(fitted: Any, tmp_path: Path) -> None:
+    out, fit = fitted
+    shutil.copyfile(out / "config.json", tmp_path / "config.json")
+    for downscale, expected in ((1.05, None), (4.0, 128), (100.0, 1000)):
+        write_own_page(tmp_path, out, fit, replace(REQUEST, downscale=downscale))
+        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+        assert re.findall(r"--detail high takes (\d+)", text) == ([] if expected is None else [str(expected)])
+
+
+def test_thumbnails_show_photos_as_they_were_taken(fitted: Any, tmp_path: Path) -> None:
+    """Of photos that were turned for the fit, in an order of their own, and all turned by a quarter."""
+    fit = fitted[1]
+    train = fit.scene.train
+    ramp = torch.linspace(0, 1, 32).expand(3, 24, 32)  # brighter to the right
+    views = replace(train, images=ramp.expand(3, -1, -1, -1), turned=(False, True, False))
+    scene = replace(fit.scene, train=views, test=fit.scene.test.select([]))
+    for roll in (0.0, 90.0):
+        write_fit_page(tmp_path / "a.html", "a", {"": replace(fit, scene=scene)}, roll=roll)
+        text = (tmp_path / "a.html").read_text(encoding="utf-8")
+        pictures = re.findall(r'<img alt="" src="data:image/jpeg;base64,(.*?)"', text)
+        shown = [cv2.imdecode(np.frombuffer(base64.b64decode(one), np.uint8), cv2.IMREAD_GRAYSCALE) for one in pictures]
+        lying, standing = (24, 32), (32, 24)
+        for i, picture in enumerate(shown):
+            is_turned_back = i == 1
+            assert picture.shape == (lying if is_turned_back == bool(roll) else standing)
+            rows, columns = (np.diff(picture.astype(float).mean(axis)).sum() for axis in (1, 0))
+            # turned back, brighter to the top; turned clockwise, right is down, and top is right
+            wanted = {(0, 0): (0, 1), (1, 0): (-1, 0), (0, 1): (1, 0), (1, 1): (0, 1)}[is_turned_back, bool(roll)]
+            assert (round(rows / 250), round(columns / 250)) == wanted
 
 
 def fit_of(folder: Path, out: Path, **changes: Any) -> None:

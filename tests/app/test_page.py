@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from factories import batch, random_camera, random_gaussians
@@ -70,6 +73,44 @@ def test_a_page_loads_nothing_and_names_no_place_on_a_disk(tmp_path: Path) -> No
     assert "&lt;b&gt;&amp;amp;.jpg" in text
     assert "<b>" not in text
     assert str(tmp_path) not in text
+
+
+def strip_of(text: str) -> list[tuple[str, str]]:
+    """The camera and the label of each button of the strip."""
+    strip = text[text.index('class="strip"') : text.index('class="tools"')]
+    return re.findall(r'data-camera="(\d+)".*?aria-label="(.*?)"', strip)
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_the_strip_has_thumbnails_of_few_bytes(tmp_path: Path, count: int) -> None:
+    """Also of noise, which compresses worst; in the order of names, from the first to the last."""
+    names = [f"{(7 * i) % count:02d}.jpg" for i in range(count)]
+    cameras = batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(count)))
+    photos = {name: torch.rand(3, 120, 180) for name in names}
+    parts = ["test" if name < "02.jpg" else "training" for name in names]
+    page = replace(content(), photos=PagePhotos(cameras, names, parts, thumbnails=photos))
+    write_page(tmp_path / "a.html", page)
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    loaded = Links(text).loaded
+    shown = strip_of(text)
+    assert len(loaded) == len(shown) == min(count, 24)
+    assert sum(map(len, loaded)) <= 100_000
+    places = [int(label.split()[1]) for _, label in shown]
+    assert [names[int(camera)] for camera, _ in shown] == [f"{place - 1:02d}.jpg" for place in places]
+    assert (places[0], places[-1]) == (1, count)
+    assert max(places[i + 1] - places[i] for i in range(len(places) - 1)) <= 2
+    assert [label.endswith(", held out") for _, label in shown] == [place <= 2 for place in places]
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(loaded[0].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] / picture.shape[0] == pytest.approx(1.5, abs=0.03)
+    assert "Exif" in text
+
+
+def test_without_thumbnails_the_strip_has_numbers(tmp_path: Path) -> None:
+    text = write(tmp_path / "index.html")
+    assert Links(text).loaded == []
+    shown = strip_of(text)
+    assert [label for _, label in shown] == ["photo 1 of 3", "photo 2 of 3", "photo 3 of 3, held out"]
+    assert [NAMES[int(camera)] for camera, _ in shown] == sorted(NAMES)
 
 
 def test_names_that_are_no_utf8_are_shown_with_escapes(tmp_path: Path) -> None:

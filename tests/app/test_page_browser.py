@@ -34,6 +34,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.1])
 PARTS = ["training", "training", "training", "test"]
 CENTRAL = 1  # the training camera nearest the mean pose
 READY = "document.querySelector('.viewer').dataset.state === 'ready'"
+CURRENT = "document.querySelector('.strip [aria-current=true]')?.dataset.camera ?? null"
 SHOW = """(index, width, height) => {
   const canvas = document.querySelector("canvas");
   Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
@@ -85,7 +86,7 @@ def page(scene: Any, renders: Any, tmp_path_factory: Any) -> Path:
         path,
         PageContent(
             PageSplat(gaussians, BACKGROUND),
-            PagePhotos(cameras, names, PARTS, pictures),
+            PagePhotos(cameras, names, PARTS, pictures, thumbnails=dict(zip(names, renders, strict=True))),
             PageText("A test", {"": metrics}, settings=settings),
         ),
     )
@@ -171,12 +172,11 @@ def test_the_first_view_is_a_whole_photo_on_every_screen(
     browser.size(width, height)
     browser.open(page, READY)
     canvas = box(browser)[2:]
-    stage = stage_size(browser)
-    assert canvas == pytest.approx(stage, abs=1)
+    assert canvas == pytest.approx(stage_size(browser), abs=1)
     assert canvas[0] == pytest.approx(canvas[1] * SIZE[1] / SIZE[0], abs=1)
-    assert canvas[1] <= 0.8 * height
+    assert canvas[1] <= height
     assert canvas[0] >= 0.9 * width or canvas[1] >= 0.75 * height  # as large as the screen allows
-    assert browser.run("document.querySelector('select').value") == str(CENTRAL)
+    assert browser.run(CURRENT) == str(CENTRAL)
     shown = browser.picture(browser.run("(viewer.draw(), viewer.canvas.toDataURL())"))
     shown = cv2.resize(shown, SIZE[::-1], interpolation=cv2.INTER_AREA)
     assert psnr(shown, array(renders[CENTRAL])) >= 30
@@ -419,7 +419,7 @@ def test_the_distance_has_limits_and_a_drag_ends_a_quarter_beyond_the_cameras_un
         assert opened.run("viewer.eye.distance") == pytest.approx(limit * start)
     opened.run("viewer.flyTo(3)")
     opened.run("document.querySelector('.start').click()")
-    assert opened.run("document.querySelector('select').value") == str(CENTRAL)
+    assert opened.run(CURRENT) == str(CENTRAL)
     arc = opened.run("viewer.scene.arc")
     width = opened.run("viewer.turnPerPixel() * viewer.canvas.clientWidth")
     assert width == pytest.approx(arc["yaw"][1] - arc["yaw"][0])  # a drag across the stage
@@ -469,7 +469,7 @@ TOUCHES = {
     "a key": "viewer.canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))",
     "a zoom": "viewer.zoom(1.1)",
     "Start": "document.querySelector('.start').click()",
-    "a photo": "viewer.choice.dispatchEvent(new Event('change'))",
+    "a photo": "document.querySelector('.strip button').click()",
 }
 
 
@@ -554,16 +554,195 @@ def test_where_less_motion_is_wanted_play_shows_pictures(opened: Browser) -> Non
     assert (places[1] - places[0]) % 144 == 36
 
 
+def test_a_thumbnail_flies_to_its_camera(opened: Browser) -> None:
+    there = "JSON.stringify([viewer.scene.cameras[{0}].position, viewer.scene.cameras[{0}].rotation])"
+    eye = "JSON.stringify([viewer.eye.position, viewer.eye.rotation])"
+    assert opened.run(CURRENT) == str(CENTRAL)
+    left, top, width, height = box(opened, ".strip button:last-child")
+    for kind in ("Pressed", "Released"):
+        mouse(opened, kind, left + width / 2, top + height / 2, clickCount=1)
+    opened.wait(f"{eye} === {there.format(3)}")
+    assert opened.run(CURRENT) == "3"
+    assert opened.run("document.querySelector('.strip [aria-current]').getAttribute('aria-label')") == (
+        "photo 4 of 4, held out"
+    )
+    opened.run("viewer.turn(0.1, 0)")
+    assert opened.run(CURRENT) is None  # the eye is at none
+
+
+def test_the_strip_is_one_stop_of_tab_and_arrows_lead_through_it(opened: Browser) -> None:
+    stops = "[...document.querySelectorAll('.strip button')].filter((one) => one.tabIndex === 0).length"
+    focused = "document.activeElement.dataset.camera"
+    opened.run("viewer.canvas.focus()")
+    tab = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
+    press(opened, **tab)
+    assert opened.run(focused) == str(CENTRAL)
+    for key, expected in (
+        ("ArrowRight", 2),
+        ("ArrowDown", 3),
+        ("ArrowRight", 3),
+        ("Home", 0),
+        ("ArrowLeft", 0),
+        ("End", 3),
+    ):
+        press(opened, key)
+        assert opened.run(f"[{focused}, {CURRENT}]") == [str(expected)] * 2, key
+        assert opened.run(stops) == 1
+    position = opened.run("viewer.scene.cameras[3].position")
+    opened.wait(f"JSON.stringify(viewer.eye.position) === JSON.stringify({position})")
+    press(opened, **tab)
+    assert opened.run("document.activeElement.className") == "play"
+
+
+def test_thumbnails_turn_with_the_pictures(opened: Browser) -> None:
+    one = ".strip button"
+    width, height = box(opened, one)[2:]
+    assert width == pytest.approx(height * SIZE[1] / SIZE[0], abs=1)
+    opened.run("document.querySelector('.unfold').click()")
+    opened.run("document.querySelector('.quarter').click()")
+    width, height = box(opened, one)[2:]
+    assert width == pytest.approx(height * SIZE[0] / SIZE[1], abs=1)
+    assert box(opened, f"{one} img") == pytest.approx(box(opened, one), abs=1)
+    opened.run("for (let i = 0; i < 3; i++) viewer.rollQuarter()")
+    assert box(opened, f"{one} img")[2:] == pytest.approx([height * SIZE[1] / SIZE[0], height], abs=1)
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(360, 740), (390, 844), (700, 800), (844, 390), (820, 1180), (1366, 768), (1920, 1080)]
+)
+@pytest.mark.parametrize("shape", ["200 / 150", "150 / 200", "200 / 60"])
+def test_the_stage_is_as_large_as_the_window_allows(opened: Browser, width: int, height: int, shape: str) -> None:
+    """Below the title, with the panel beside or below it, and without a horizontal bar; the strip is in the window."""
+    opened.size(width, height)
+    opened.run(f"document.documentElement.style.setProperty('--aspect', '{shape}')")
+    assert opened.run("document.documentElement.scrollWidth") <= width
+    left, top, stage_width, stage_height = box(opened, ".stage")
+    panel = box(opened, ".panel")
+    is_beside = panel[0] >= left + stage_width
+    assert is_beside or panel[1] >= top + stage_height
+    assert top + stage_height <= height + 1
+    assert left >= 0
+    assert left + stage_width <= width
+    is_wide = stage_width >= width - 33
+    is_tall = top + stage_height >= height - (50 if is_beside else 215)
+    has_narrowest_panel = is_beside and panel[2] <= 18.2 * 16
+    assert is_wide or is_tall or has_narrowest_panel
+    strip = box(opened, ".strip")
+    assert strip[1] + 48 <= height
+    if width > height and shape == "150 / 200":
+        assert is_beside
+
+
+def touch(browser: Browser, is_phone: bool) -> None:
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=is_phone)
+
+
+def test_a_phone_has_one_row_of_buttons_for_fingers_and_words_for_them(opened: Browser) -> None:
+    tops = "[...document.querySelectorAll('.panel > .tools button')].map((one) => one.getBoundingClientRect().top)"
+    words = "['.mouse', '.touch'].map((name) => getComputedStyle(document.querySelector(name)).display !== 'none')"
+    assert opened.run(words) == [True, False]
+    try:
+        touch(opened, True)
+        for width in (360, 390):
+            opened.size(width, 740)
+            assert len(set(opened.run(tops))) == 1
+            opened.run("document.querySelector('.more').hidden = false")
+            small = """[...document.querySelectorAll("main button")].map((one) => one.getBoundingClientRect())
+              .filter(({ width, height }) => width < 40 || height < 40).length"""
+            assert opened.run(small) == 0
+        assert opened.run(words) == [False, True]
+        assert "Pinch to zoom" in opened.run("document.querySelector('header').innerText")
+        assert "Click" not in opened.run("document.querySelector('.viewer').innerText")
+        assert "Keys" not in opened.run("document.querySelector('.viewer').innerText")
+    finally:
+        touch(opened, False)
+
+
+def test_a_browser_without_full_screen_shows_no_button_for_it(browser: Browser, page: Path) -> None:
+    """As on an iPhone."""
+    script = "Object.defineProperty(document, 'fullscreenEnabled', { value: undefined })"
+    number = browser.call("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+    try:
+        browser.open(page, READY)
+        assert browser.run("document.querySelector('.full').getBoundingClientRect().width") == 0
+    finally:
+        browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
+    browser.open(page, READY)
+    assert browser.run("document.querySelector('.full').getBoundingClientRect().width") > 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_it_fits_a_phone_in_both_schemes(browser: Browser, page: Path, scheme: str) -> None:
     browser.size(400, 800, scheme)
     browser.open(page, READY)
     assert browser.run("document.documentElement.scrollWidth") <= 400
-    cut = """[...document.querySelectorAll("body *")].filter((one) => !one.closest(".scroll, pre, svg, details")
+    cut = """[...document.querySelectorAll("body *")].filter((one) => !one.closest(".scroll, .strip, pre, svg, details")
       && one.getBoundingClientRect().right > innerWidth + 0.5).map((one) => one.outerHTML.slice(0, 99))"""
     assert browser.run(cut) == []
     browser.run("document.querySelector('details').open = true")
     assert browser.run("document.documentElement.scrollWidth") <= 400
     channels = browser.run("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
     assert (max(channels) < 64) if scheme == "dark" else (min(channels) > 240)
+
+
+def test_the_depth_at_a_pixel_is_that_of_the_renderer(browser: Browser, scene: Any, tmp_path: Path) -> None:
+    """The median depth within 1 %, plain and antialiased, from the cameras of all photos."""
+    gaussians, cameras = scene
+    browser.size(1000, 800)
+    for antialiased in (False, True):
+        write_page(tmp_path / "index.html", bare_page(gaussians, cameras, antialiased=antialiased))
+        browser.open(tmp_path / "index.html", READY)
+        with torch.no_grad():
+            renderer = kgs.GaussianRenderer(antialiased=antialiased, backend="torch").eval()
+            depth = renderer(gaussians, cameras, outputs=("median_depth",)).median_depth[:, 0].numpy()
+        rows, columns = (axis.ravel() for axis in np.mgrid[3 : SIZE[0] : 7, 4 : SIZE[1] : 9])
+        pixels = np.stack([columns, rows], 1).tolist()
+        for index in range(4):
+            show(browser, index)
+            found = browser.run(
+                f"(({{ renderer, view, eye }}) => {pixels}.map((pixel) => "
+                "renderer.medianDepth(viewer.withNearPlane(eye), view, pixel)))(viewer)"
+            )
+            expected = depth[index, rows, columns]
+            differences = np.abs(np.array([value or 0.0 for value in found]) - expected)
+            assert (expected > 0).sum() > 25
+            # A pixel where the transmittance is just about one half can take the next Gaussian.
+            assert (differences > 0.01 * expected).sum() <= 1, (antialiased, index)
+
+
+def test_two_clicked_points_have_a_distance(opened: Browser) -> None:
+    """On a wall of Gaussians at a known depth, the points and their distance are known as well."""
+    opened.run("document.querySelector('.unfold').click(); document.querySelector('.measure').click()")
+    text = "document.querySelector('.measured').innerText"
+    assert opened.run(text).startswith("Choose two points in")
+    opened.run("viewer.renderer.medianDepth = () => 2; viewer.scene.offset = [1000, 0, -3]; viewer.draw()")
+    left, top, width, height = box(opened)
+    clicked = [(0.3, 0.4), (0.6, 0.7)]
+    for x, y in clicked:
+        for kind in ("Pressed", "Released"):
+            mouse(opened, kind, left + x * width, top + y * height, clickCount=1)
+    camera = opened.run("viewer.scene.cameras[viewer.chosen]")
+    size, focal, centre = (np.array(camera[name]) for name in ("size", "focal", "centre"))
+    points = [
+        np.array(camera["position"])
+        + 2 * np.array([*((np.array(at) * size - 0.5 - centre) / focal), 1]) @ np.array(camera["rotation"])
+        for at in clicked
+    ]
+    said = opened.run(text)
+    distance = np.linalg.norm(points[1] - points[0])
+    assert float(said.split()[0]) == pytest.approx(distance, rel=5e-3)  # a click is at a whole pixel of the page
+    words = opened.run("document.querySelector('.measured code').textContent").split()
+    assert words[:4] == ["kgs", "scale", "FOLDER", "--by"]
+    shown = [np.array([float(value) for value in word.split(",")]) for word in words[4:6]]
+    for one, expected in zip(shown, points, strict=True):
+        np.testing.assert_allclose(one, expected + np.array([1000, 0, -3]), atol=5e-3 * distance)
+    assert np.linalg.norm(shown[1] - shown[0]) == pytest.approx(float(said.split()[0]), rel=1e-4)
+    marks = (
+        "[...document.querySelectorAll('.ruler circle')].map((one) => ['cx', 'cy'].map((n) => +one.getAttribute(n)))"
+    )
+    for mark, (x, y) in zip(opened.run(marks), clicked, strict=True):
+        assert mark == pytest.approx([x * width, y * height], abs=1.5)
+    opened.run("document.querySelector('.measure').click()")
+    assert opened.run(text) == ""
+    assert opened.run("getComputedStyle(document.querySelector('.ruler circle')).display") == "none"

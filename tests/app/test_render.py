@@ -13,6 +13,7 @@ import kgs
 from kgs import GaussianRenderer, save_ply
 from kgs.app.cli.page import check_page, page
 from kgs.app.cli.render import render
+from kgs.app.page import pictures
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.image_file import ImageFile
 from kgs.errors import DataError
@@ -140,10 +141,12 @@ def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
 def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     out, decoded, plain = tmp_path / "page.html", [], ImageFile.read
     monkeypatch.setattr(ImageFile, "read", lambda file: decoded.append(file.path.name) or plain(file))
+    monkeypatch.setattr(pictures, "MOST_THUMBNAILS", 4)
     page(splat, cameras=llff, out=out)
     text = out.read_text(encoding="utf-8")
-    assert len(decoded) == 6  # of ten: there may be hundreds
-    assert all(f'alt="photo {name}"' in text for name in decoded)
+    assert len(decoded) == 6 + 4  # of ten, and those of the strip: there may be hundreds
+    assert all(f'alt="photo {name}"' in text for name in decoded[:6])
+    assert text.count('<img alt="" src="data:image/jpeg') == 4
     assert "40 × 30 pixels" in text
     assert "Whether the splat was fitted to these photos is not known here." in text
     assert f"open {out} in a browser" in capsys.readouterr().out

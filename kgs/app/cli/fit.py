@@ -117,6 +117,7 @@ def fit(
     )
     base = out
     unposed = is_unposed(scene)
+    is_free = size is None and downscale is None  # the size follows from --detail
     stages = Stages(say, unposed)
     if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
@@ -162,8 +163,11 @@ def fit(
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")
         return 128 + published.signal
+    finer = request.finer_side(loaded) if is_free else None
+    more = f"the same command with --detail high fits {finer} pixels instead of {max(height, width)}, and takes longer"
     say_next(
         f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
+        *([more] if finer else []),
         f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
         f"{as_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
         VIEWER.format(as_line(splat)),

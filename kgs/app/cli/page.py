@@ -44,7 +44,7 @@ def page(
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.ownership import writing
-    from kgs.app.page.fit_page import MOST_PICTURES, spread, write_fit_page
+    from kgs.app.page.fit_page import MOST_PICTURES, load_small, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
     from kgs.machine import check_tools, versions
@@ -70,6 +70,7 @@ def page(
             notes=["Whether the splat was fitted to these photos is not known here."],
             photos=photos,
             roll=roll,
+            small=load_small(cameras, scene, background) if photos else None,
         )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from kgs.app.console import each
 from kgs.app.files.cameras import camera_list, rolled, shown, upright
@@ -24,10 +25,8 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     :func:`kgs.app.files.cameras.rolled`.
     """
     scene = fit.scene
-    listed = camera_list([*shown(scene.train), *shown(scene.test)], scene.offset, fit.model.means)
-    write_json(folder / "cameras.json", listed)
-    poses = torch.cat([part.cameras.extrinsics for part in shown(scene.train, roll)])
-    save_glb(folder / "splat.glb", fit.model, upright(poses), scene.offset)
+    write_splat_exports(fit, folder, roll)
+    poses = _poses(fit, roll)
     depth = typical_depths(fit.model.means, scene.train.cameras)[1]
     suffix, note = film_suffix()
     near_plane = path_near_plane(fit.model.means, scene.train.cameras, fit.options.near_plane)
@@ -38,3 +37,16 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     write_preview(folder / "preview.jpg", film_fit.render, frames)
     why = write_film(folder / f"turntable{suffix}", film_fit.render, frames, depth, each)
     return [line for line in (why, note) if line]
+
+
+def write_splat_exports(fit: Fit, folder: Path, roll: float = 0.0) -> None:
+    """Write cameras.json and splat.glb; `roll` as in :func:`write_exports`."""
+    scene = fit.scene
+    listed = camera_list([*shown(scene.train), *shown(scene.test)], scene.offset, fit.model.means)
+    write_json(folder / "cameras.json", listed)
+    save_glb(folder / "splat.glb", fit.model, upright(_poses(fit, roll)), scene.offset)
+
+
+def _poses(fit: Fit, roll: float) -> Tensor:
+    """The extrinsics of the training views as they are looked at, `(V, 4, 4)`."""
+    return torch.cat([part.cameras.extrinsics for part in shown(fit.scene.train, roll)])

@@ -23,12 +23,15 @@ class PageSplat:
             near plane is farther away, see :func:`kgs.app.files.film.path_near_plane`.
         weights: returns the contribution of each Gaussian, `(N,)`; called only if Gaussians must be left out, those
             that contribute least first. None: opacity times area.
+        offset: the origin of the Gaussians' frame in the coordinates of the splat's file, `(3,)`, in which the page
+            says where points are: the `offset` of a Scene. None: zero.
     """
 
     gaussians: Gaussians
     background: Tensor
     options: RasterOptions = field(default_factory=RasterOptions)
     weights: Callable[[], Tensor] | None = None
+    offset: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,8 @@ class PagePhotos:
         parts: what each photo was used for: "training", "test", or another word.
         pictures: some of the photos with their renders.
         pictures_note: a sentence that says which photos these are.
+        thumbnails: some of the photos, RGB in [0, 1], `(3, H, W)`, by their names; a click on one flies to its camera.
+            Without any there are numbers instead.
     """
 
     cameras: PinholeCamera
@@ -51,6 +56,7 @@ class PagePhotos:
     parts: Sequence[str]
     pictures: Sequence[Picture] = ()
     pictures_note: str = ""
+    thumbnails: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from kgs.app.console import each
 from kgs.app.files.cameras import shown
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
-from kgs.datasets.scene import Views
+from kgs.datasets.load import load_scene
+from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
 from kgs.fit.fit import Fit
@@ -23,11 +25,12 @@ from kgs.json_files import read_json
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
-from .pictures import Picture
+from .pictures import Picture, in_strip
 from .write import write_page
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
+_SMALL_PIXELS = 192  # of the shorter side of a photo that becomes a thumbnail
 _BORDER = 0.03  # of the shorter side of a photo: the band whose mean is the ground of the viewer
 
 
@@ -39,10 +42,12 @@ def write_fit_page(
     beside: Views | None = None,
     words: tuple[str, str] = ("training", "test"),
     notes: Sequence[str] = (),
+    remarks: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
     report: Path | None = None,
     photos: bool = True,
     roll: float = 0.0,
+    small: Views | None = None,
 ) -> str:
     """Write the page of one or more fits of a scene; the viewer shows the last of them.
 
@@ -54,10 +59,12 @@ def write_fit_page(
             or training views if there are no test views.
         words: what training and test views are called.
         notes: sentences to show below the one that says how good the fit is.
+        remarks: sentences to show under Details.
         settings: the content of config.json.
         report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
         photos: whether the page shows photos, renders and their differences.
         roll: degrees by which all pictures are turned clockwise, see :func:`kgs.app.files.cameras.rolled`.
+        small: some of the views with pixels, for the thumbnails. None: those of the scene.
 
     Returns:
         What the viewer shows less than the model, in words; "" for nothing.
@@ -73,6 +80,8 @@ def write_fit_page(
         word = training_word
     photographed = beside or views.select(spread(len(views), MOST_PICTURES))
     pictured = shown(photographed, roll) if photos else []
+    parts = [*shown(scene.train, roll), *shown(scene.test, roll)]
+    thumbnailed = [] if not photos else parts if small is None else shown(small, roll)
     with torch.no_grad():
         gaussians = fit.model()
     runs = {run: one.metrics for run, one in fits.items()}
@@ -83,19 +92,21 @@ def write_fit_page(
             background=_ground(photographed, scene.background),
             options=fit.options,
             weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
+            offset=scene.offset,
         ),
         photos=PagePhotos(
-            cameras=_all_cameras(*shown(scene.train, roll), *shown(scene.test, roll)),
+            cameras=_all_cameras(*parts),
             names=[*scene.train.names, *scene.test.names],
             parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
             pictures=_pictures(pictured, fits),
             pictures_note=_pictures_note(sum(map(len, pictured)), len(views), word),
+            thumbnails=_thumbnails(thumbnailed),
         ),
         text=PageText(
             title,
             runs=runs,
             notes=notes,
-            remarks=_remarks(runs),
+            remarks=[*_remarks(runs), *remarks],
             settings=_settings(settings or {}),
             report=_report_facts(_read_report(report)),
             left_out=left_out(first_run.get("needs") or {}),
@@ -104,13 +115,44 @@ def write_fit_page(
     return write_page(path, content)
 
 
-def write_own_page(folder: Path, out: Path, fit: Fit, request: SceneRequest) -> None:
-    """Write the page of a fit into a folder that has its other files; `out` is where they belong."""
+def load_small(path: str | PathLike[str], scene: Scene, background: str) -> Views:
+    """Load the photos of the strip of thumbnails, in a small size.
+
+    Args:
+        path: the folder of the scene.
+        scene: the scene without its photos; all views are training views.
+        background: "black" or "white".
+    """
+    count = len(in_strip(scene.train.names))
+    whole = load_scene(path, count, hold_out=0, photos=False).train
+    shrink = max(1.0, min(whole.images.shape[-2:]) / _SMALL_PIXELS)
+    return load_scene(path, count, shrink, hold_out=0, background=background).train
+
+
+def write_own_page(
+    folder: Path,
+    out: Path,
+    fit: Fit,
+    request: SceneRequest,
+    config: Path | None = None,
+    remarks: Sequence[str] = (),
+) -> None:
+    """Write the page of a fit into a folder that has its other files.
+
+    Args:
+        folder: for the page.
+        out: where the files of the fit belong.
+        fit: with metrics.
+        request: how the scene was loaded.
+        config: config.json of the fit; None: that in `folder`.
+        remarks: sentences to show under Details.
+    """
     write_fit_page(
         folder / PAGE,
         request.title_of(out),
         {"": fit},
-        settings=read_json(folder / "config.json"),
+        remarks=[*remarks, *_finer_note(fit.scene, request)],
+        settings=read_json(config or folder / "config.json"),
         report=fit.scene.root / CAMERAS_REPORT,
         photos=request.photos,
         roll=request.roll,
@@ -128,6 +170,13 @@ def _pictures(parts: Sequence[Views], fits: Mapping[str, Fit]) -> list[Picture]:
         caption = f"{name}: {', '.join(values)}" if values else name
         pictures.append(Picture(name, views.images[i], renders, caption))
     return pictures
+
+
+def _thumbnails(parts: Sequence[Views]) -> dict[str, Tensor]:
+    """The photos of the strip by their names."""
+    photos = {name: image for views in parts for name, image in zip(views.names, views.images, strict=True)}
+    names = list(photos)
+    return {names[i]: photos[names[i]] for i in in_strip(names)}
 
 
 def _read_report(path: Path | None) -> dict[str, Any]:
@@ -218,6 +267,14 @@ def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
     mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
     most = f"{poses['most_degrees']:.2f} degrees and {100 * poses['most_depths']:.2f} %"
     return [f"The fit moved the training cameras by {mean} in the mean, and by at most {most}."]
+
+
+def _finer_note(scene: Scene, request: SceneRequest) -> list[str]:
+    """That a larger fit of the same photos is possible, as a sentence; [] if it is not."""
+    finer = request.finer_side(scene)
+    side = max(scene.train.images.shape[-2:])
+    words = f"The photos were fitted with {side} pixels on their longer side; kgs fit --detail high takes {finer}."
+    return [words] if finer else []
 
 
 def _all_cameras(*parts: Views) -> PinholeCamera:

@@ -10,10 +10,13 @@ import numpy as np
 from torch import Tensor
 
 from kgs.app.files.images import eight_bits
+from kgs.datasets.splits import select_evenly
 
 GAIN = 4  # factor by which differences are amplified
 _LONGER_SIDES = (1008, 756, 504, 378, 252)  # pixels; the first one with which all images fit is used
 _JPEG_QUALITY = 90
+MOST_THUMBNAILS = 24
+_THUMBNAIL_SIZES = ((96, 80), (96, 65), (80, 60), (64, 50), (48, 40))  # height in pixels, and quality, likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,38 @@ def encoded(pictures: Sequence[Picture], most_bytes: int) -> list[dict[str, Any]
     return rows
 
 
+def in_strip(names: Sequence[str]) -> list[int]:
+    """Indices of the photos in the strip: up to `MOST_THUMBNAILS`, spread evenly, in the order of their names."""
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    return [order[k] for k in select_evenly(len(order), min(len(order), MOST_THUMBNAILS))] if order else []
+
+
+def thumbnails(photos: Sequence[Tensor], most_bytes: int) -> list[dict[str, Any]]:
+    """Encode photos in the largest size in which their data URIs fit into `most_bytes`, or in the smallest one.
+
+    Args:
+        photos: RGB in [0, 1], each `(3, H, W)`.
+        most_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
+
+    Returns:
+        For each photo its data URI (photo), and its width and height in pixels.
+    """
+    rows = list[dict[str, Any]]()
+    for height, quality in _THUMBNAIL_SIZES:
+        rows = [_thumbnail(photo.detach().cpu().float(), height, quality) for photo in photos]
+        if sum(len(row["photo"]) for row in rows) <= most_bytes:
+            break
+    return rows
+
+
+def _thumbnail(photo: Tensor, height: int, quality: int) -> dict[str, Any]:
+    rows, columns = photo.shape[-2:]
+    shrink = min(1.0, height / rows)
+    width = max(1, round(columns * shrink))
+    height = max(1, round(rows * shrink))
+    return {"photo": _data_uri(photo, max(width, height), quality), "width": width, "height": height}
+
+
 def _encoded(picture: Picture, side: int) -> dict[str, Any]:
     photo = picture.photo.detach().cpu().float()
     renders = []
@@ -73,7 +108,7 @@ def _size(row: dict[str, Any]) -> int:
     return len(row["photo"]) + renders
 
 
-def _data_uri(image: Tensor, side: int) -> str:
+def _data_uri(image: Tensor, side: int, quality: int = _JPEG_QUALITY) -> str:
     """An image `(3, H, W)` as JPEG, reduced to at most `side` pixels."""
     array = eight_bits(image)
     height, width = array.shape[:2]
@@ -81,7 +116,7 @@ def _data_uri(image: Tensor, side: int) -> str:
     if shrink < 1:
         size = max(1, round(width * shrink)), max(1, round(height * shrink))
         array = np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_AREA), np.uint8)
-    done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ValueError(f"image: expected one that can be encoded as JPEG, got {width}x{height} pixels")
     return "data:image/jpeg;base64," + base64.b64encode(content.tobytes()).decode()

@@ -296,6 +296,53 @@ class SplatRenderer {
     return 4 * sum / (255 * pixels.length);
   }
 
+  // The low-pass filter in square pixels of the canvas. On a canvas larger than the photo it is enlarged too: it shows
+  // the fitted image, enlarged.
+  lowPassOf(view) {
+    return this.settings.lowPass * Math.max(1, view.scale ** 2);
+  }
+
+  // The depth, at a pixel of the canvas, of the first Gaussian behind which the transmittance is below one half, as
+  // kgs.GaussianRenderer computes it (median_depth); null if there is none.
+  medianDepth(camera, view, pixel) {
+    const { geometry } = this.splat;
+    const sorted = this.order.sort(geometry, camera.rotation, camera.position, camera.nearPlane);
+    const limits = this.tangentLimits(camera);
+    let transmittance = 1;
+    for (let k = sorted.length - 1; k >= 0; k--) {
+      const start = FLOATS_PER_GAUSSIAN * sorted[k];
+      const [alpha, depth] = this.alphaAt(camera, view, pixel, geometry.subarray(start, start + 10), limits);
+      if (alpha < 1 / 255) continue;
+      transmittance *= 1 - alpha;
+      if (transmittance < 0.5) return depth;
+    }
+    return null;
+  }
+
+  // The alpha of a Gaussian at a pixel, as in the shaders, and its depth.
+  alphaAt(camera, view, pixel, gaussian, [least, largest]) {
+    const { rotation, position } = camera;
+    const [x, y, z, opacity, cxx, cxy, cxz, cyy, cyz, czz] = gaussian;
+    const relative = [x - position[0], y - position[1], z - position[2]];
+    const depth = dot(rotation[2], relative);
+    const rows = [0, 1].map((axis) => {  // of the Jacobian times the rotation
+      const slope = clamped(dot(rotation[axis], relative) / depth, least[axis], largest[axis]);
+      return rotation[axis].map((value, i) => view.focal[axis] * (value - slope * rotation[2][i]) / depth);
+    });
+    const spread = rows.map(([a, b, c]) => [
+      cxx * a + cxy * b + cxz * c, cxy * a + cyy * b + cyz * c, cxz * a + cyz * b + czz * c,
+    ]);
+    const lowPass = this.lowPassOf(view);
+    const [sharpX, xy, sharpY] = [dot(rows[0], spread[0]), dot(rows[0], spread[1]), dot(rows[1], spread[1])];
+    const determinant = (sharpX + lowPass) * (sharpY + lowPass) - xy * xy;
+    const fainter = this.settings.antialiased ? Math.sqrt(Math.max(0, sharpX * sharpY - xy * xy) / determinant) : 1;
+    const [dx, dy] = pixel.map((value, axis) => {
+      return value - view.centre[axis] - view.focal[axis] * dot(rotation[axis], relative) / depth;
+    });
+    const square = ((sharpY + lowPass) * dx * dx - 2 * xy * dx * dy + (sharpX + lowPass) * dy * dy) / determinant;
+    return [Math.min(0.99, fainter * opacity * Math.exp(-0.5 * square)), depth];
+  }
+
   // Blends Gaussians over a target, in the order of their indices.
   drawGaussians(camera, view, target, indices) {
     const { gl, settings } = this;
@@ -303,8 +350,7 @@ class SplatRenderer {
     this.splatProgram.use({ geometry: GEOMETRY, harmonics: HARMONICS }, {
       rotation: camera.rotation, position: camera.position, nearPlane: camera.nearPlane, leastTangent, largestTangent,
       focal: view.focal, centre: view.centre, size: [target.width, target.height],
-      // On a canvas larger than the photo, the low-pass filter is enlarged too: it shows the fitted image, enlarged.
-      lowPass: settings.lowPass * Math.max(1, view.scale ** 2), antialiased: Number(settings.antialiased),
+      lowPass: this.lowPassOf(view), antialiased: Number(settings.antialiased),
     });
     gl.uniform1i(this.splatProgram.location("texelsPerRow"), TEXELS_PER_ROW);
     gl.uniform1i(this.splatProgram.location("coefficients"), this.splat.coefficients);

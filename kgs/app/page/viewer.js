@@ -58,12 +58,14 @@ function target({ position, rotation, distance }) {
 }
 
 class Viewer {
-  // `scene` is what `viewer_scene` of kgs/app/page/cameras.py returns.
+  // `scene` is what `viewer_scene` of kgs/app/page/cameras.py returns, and `offset`, the origin of its coordinates in
+  // those of the splat's file.
   constructor(frame, renderer, scene) {
     this.frame = frame;
     this.canvas = frame.querySelector("canvas");
     this.overlay = frame.querySelector("svg");
-    this.choice = frame.querySelector("select");  // of a camera; it can be used with the keyboard
+    this.strip = frame.querySelector(".strip");  // of thumbnails
+    this.thumbnails = new Map([...this.strip.children].map((button) => [Number(button.dataset.camera), button]));
     this.renderer = renderer;
     this.scene = scene;
     this.redrawRequested = false;
@@ -77,6 +79,7 @@ class Viewer {
     this.playButton = frame.querySelector(".play");
     this.place(scene.first);
     this.listen(frame);
+    this.ruler = new Ruler(this, frame);
     new ResizeObserver(() => this.requestDraw()).observe(this.canvas);
     this.draw();
     if (!wantsLessMotion()) this.flyTour(this.slowRound());
@@ -89,9 +92,25 @@ class Viewer {
     const { rotation, position, distance, size, focal, centre } = this.scene.cameras[index];
     this.eye = { rotation, position, distance, size, focal, centre };
     this.usualDistance = distance;
-    this.choice.value = index;
+    this.chosen = index;
+    this.mark(index);
     this.usualCoverage = null;  // not measured yet
     this.roamedTo = null;  // the last direction in which the splat was found to cover twice what is enough
+  }
+
+  // Marks the thumbnail of the photo that the eye is at, or none, and brings it into the strip's view.
+  mark(index) {
+    this.strip.querySelector("[aria-current]")?.removeAttribute("aria-current");
+    const button = this.thumbnails.get(index);
+    if (!button) return;
+    button.setAttribute("aria-current", "true");
+    for (const other of this.thumbnails.values()) other.tabIndex = other === button ? 0 : -1;
+    const { strip } = this;
+    strip.scrollTo({
+      left: button.offsetLeft - (strip.clientWidth - button.offsetWidth) / 2,
+      top: button.offsetTop - (strip.clientHeight - button.offsetHeight) / 2,
+      behavior: wantsLessMotion() ? "instant" : "smooth",
+    });
   }
 
   // Moves the eye to a camera smoothly.
@@ -149,6 +168,7 @@ class Viewer {
     });
     observer.observe(this.canvas);
     this.flight++;
+    this.mark(null);
     this.tour = tour;
     const pose = (index) => ({ ...begin, ...poses[(start + index) % poses.length] });
     const eyeAt = (seconds) => {
@@ -190,6 +210,7 @@ class Viewer {
   change(values) {
     this.flight++;
     this.endTour();
+    this.mark(null);
     this.eye = { ...this.eye, ...values };
     this.requestDraw();
   }
@@ -218,7 +239,7 @@ class Viewer {
     const ahead = eye.rotation[2];
     if (this.roamedTo && dot(ahead, this.roamedTo) > Math.cos(ROAMING_STEP / 2)) return true;
     const coverage = (from) => this.renderer.coverage(this.withNearPlane(from), this.viewOf(from));
-    this.usualCoverage ??= coverage(this.scene.cameras[this.choice.value]);
+    this.usualCoverage ??= coverage(this.scene.cameras[this.chosen]);
     const farther = Math.max(1, eye.distance / this.usualDistance);
     const least = Math.min(LEAST_COVERAGE, LEAST_PART * this.usualCoverage) / farther ** 2;
     const covered = coverage(eye);
@@ -278,7 +299,9 @@ class Viewer {
       },
     };
     this.change(turned(this.eye));
-    this.frame.style.setProperty("--aspect", this.eye.size.join(" / "));
+    document.documentElement.style.setProperty("--aspect", this.eye.size.join(" / "));
+    this.strip.style.setProperty("--quarters", this.quarters);
+    this.strip.classList.toggle("on-side", this.quarters % 2 === 1);
   }
 
   // -- Drawing.
@@ -329,6 +352,7 @@ class Viewer {
     this.renderer.resize(...this.view.sides);
     this.renderer.draw(this.withNearPlane(eye), this.view);
     this.drawPyramids();
+    this.ruler.draw();
   }
 
   // -- The pyramids that mark the cameras.
@@ -382,11 +406,25 @@ class Viewer {
     return pixel.map((value) => value.toFixed(1)).join(" ");
   }
 
+  // The point of the splat that a pixel of the page shows, in the world; null where the splat lets more than half of the
+  // light through.
+  pointAt(clientX, clientY) {
+    const { left, top } = this.canvas.getBoundingClientRect();
+    const { ratio, focal, centre } = this.view;
+    const { rotation: [right, down, forward], position } = this.eye;
+    const pixel = [clientX - left, clientY - top].map((value) => ratio * value - 0.5);  // integer pixel centres
+    const depth = this.renderer.medianDepth(this.withNearPlane(this.eye), this.view, pixel);
+    if (depth === null) return null;
+    const [x, y] = pixel.map((value, axis) => depth * (value - centre[axis]) / focal[axis]);
+    return add(add(add(position, right, x), down, y), forward, depth);
+  }
+
   // -- Input.
 
   listen(frame) {
     this.listenToPointers(frame.querySelector(".stage"));  // which holds the canvas and, over it, the pyramids
     this.listenToKeys();
+    this.listenToStrip();
     this.listenToTools(frame);
   }
 
@@ -444,16 +482,34 @@ class Viewer {
     });
   }
 
+  // Tab leads to one thumbnail, and arrow keys from it to the others.
+  listenToStrip() {
+    const buttons = [...this.thumbnails.values()];
+    if (buttons.length && !buttons.some((button) => button.tabIndex === 0)) buttons[0].tabIndex = 0;
+    this.thumbnails.forEach((button, index) => button.addEventListener("click", () => this.flyTo(index)));
+    this.strip.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      const here = buttons.indexOf(event.target);
+      const [right, down] = ARROWS[event.key] ?? [0, 0];
+      const next = { Home: 0, End: buttons.length - 1 }[event.key] ?? clamped(here + right + down, 0, buttons.length - 1);
+      if (next === here) return;
+      event.preventDefault();
+      buttons[next].focus();
+      buttons[next].click();
+    });
+  }
+
   listenToTools(frame) {
-    this.choice.addEventListener("change", () => this.flyTo(Number(this.choice.value)));
     frame.querySelector(".start").addEventListener("click", () => this.flyTo(this.scene.first));
-    const addSwitch = (name, toggle) => {
+    const addSwitch = (name, toggle, state = "aria-pressed") => {
       const button = frame.querySelector(name);
-      button.addEventListener("click", () => button.setAttribute("aria-pressed", String(toggle())));
+      button.addEventListener("click", () => button.setAttribute(state, String(toggle())));
     };
     addSwitch(".play", () => this.playOrEnd());
     addSwitch(".roam", () => this.isRoaming = !this.isRoaming);
     addSwitch(".pyramids", () => !this.overlay.toggleAttribute("hidden"));
+    addSwitch(".unfold", () => !frame.querySelector(".more").toggleAttribute("hidden"), "aria-expanded");
+    frame.querySelector(".quarter").addEventListener("click", () => this.rollQuarter());
     const full = frame.querySelector(".full");
     full.hidden = !document.fullscreenEnabled;
     full.addEventListener("click", () => {

@@ -18,10 +18,11 @@ from .cameras import training_cameras, viewer_scene
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .data import Packed, pack
 from .figures import facts, measure_table, psnr_of_views, verdict, without_folders
-from .pictures import GAIN, encoded
+from .pictures import GAIN, encoded, in_strip, thumbnails
 
 MOST_BYTES = 8_000_000  # of a page
 _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
+_THUMBNAIL_BYTES = 100_000  # of all thumbnails
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
 _NUMBERS = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
 _LISTED = 24  # photos whose file names are under Details
@@ -29,6 +30,7 @@ _FILES = [
     "style.css",
     "viewer.css",
     "renderer.js",
+    "ruler.js",
     "viewer.js",
     "pictures.js",
     "splat.vert.glsl",
@@ -79,13 +81,15 @@ class _Page:
         import jinja2
 
         runs = list(content.text.runs.values())
-        self._scene = viewer_scene(
+        scene = viewer_scene(
             content.photos.cameras,
             content.photos.names,
             content.photos.parts,
             content.splat.gaussians.means,
             psnr_of_views(runs[-1]) if runs else {},
         )
+        offset = content.splat.offset
+        self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
         self._settings = _viewer_settings(content.splat, content.photos)
         self._context = _context(content, self._scene)
         loader = jinja2.PackageLoader("kgs.app.page", ".")
@@ -131,6 +135,8 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "title": without_folders(text.title),
         "lead": f"{_in_words(len(cameras))}. Drag to look around.",
+        "strip": _strip(photos, cameras),
+        "has_photos": bool(photos.pictures or photos.thumbnails),
         "version": __version__,
         "aspect": f"{width} / {height}",
         "scene": scene,
@@ -150,6 +156,26 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
         "versions": facts(first_run.get("versions") or {"kgs": __version__}),
         "files": {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES},
     }
+
+
+def _strip(photos: PagePhotos, cameras: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The photos to fly to, in the order of names: index of the camera, label, number, and thumbnail if any."""
+    names = [camera["name"] for camera in cameras]
+    small = photos.thumbnails
+    shown = [i for i, name in enumerate(names) if not small or name in small]
+    chosen = [shown[k] for k in in_strip([names[i] for i in shown])]
+    pictures = thumbnails([small[names[i]] for i in chosen], _THUMBNAIL_BYTES) if small else [{} for _ in chosen]
+    places = {name: place for place, name in enumerate(sorted(names), 1)}
+    return [
+        {
+            "index": i,
+            "label": cameras[i]["label"],
+            "number": places[names[i]],
+            "held_out": cameras[i]["part"] == "test",
+            **picture,
+        }
+        for i, picture in zip(chosen, pictures, strict=True)
+    ]
 
 
 def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:

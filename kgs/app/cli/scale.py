@@ -1,0 +1,116 @@
+"""`kgs scale`: gives a splat and its cameras the unit of a known length."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kgs.app.console import as_line, say, say_next
+from kgs.errors import DataError, printable
+
+from .options import Existing, Out
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_FILES = ("splat.ply", "splat.glb", "cameras.json", "index.html")
+
+
+def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
+    """Scale a splat and its cameras, so that two points are a known length apart.
+
+    Measure, on the page of a fit under More, gives the points. The unit of the length is then that of the splat.
+
+    For example:
+      kgs scale fern-3 --by 0.1,0.2,3.5 -0.4,0.2,3.6 1.25 -o fern-metres
+      kgs scale splat.ply --by 0,0,0 0,0,1 2.5 -o metres.ply
+
+    Args:
+        splat: the folder of the results of kgs fit, or a 3DGS PLY file.
+        by: two points, each as x,y,z in the coordinates of the PLY file, and their distance in the unit that is wanted.
+        out: folder for splat.ply, splat.glb, cameras.json and index.html; for a PLY file the PLY file to write.
+    """
+    import torch
+
+    a, b, length = by
+    factor = length / math.dist(_point(a), _point(b))
+    if splat.is_dir():
+        _scale_folder(splat, out, factor, length)
+    else:
+        _scale_ply(splat, out, factor, torch.tensor(_point(a), dtype=torch.float64))
+    say(f"{printable(out)}: {factor:.6g} times as large")
+    if splat.is_dir():
+        say_next(f"open {as_line(out / 'index.html')} in a browser")
+
+
+def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None:
+    """Write the files of a fit in the new unit; the fit stays as it is."""
+    from kgs.app.files.exports import write_splat_exports
+    from kgs.app.files.outputs import check_folder
+    from kgs.app.files.ownership import writing
+    from kgs.app.page.fit_page import write_own_page
+    from kgs.app.saved_fit import load_fit
+    from kgs.fit.scale import scaled
+    from kgs.machine import check_packages
+    from kgs.ply import save_ply
+
+    check_packages("jinja2")
+    request, fit = load_fit(folder, say=say)
+    fit = scaled(fit, factor)
+    note = f"The splat was scaled by {factor:.6g} after the fit, for a length of {length:g}; settings are those before."
+    check_folder(out, _FILES, fit.scene.root)
+    with writing(out, "scale", _FILES):
+        save_ply(out / "splat.ply", fit.model, offset=fit.scene.offset)
+        write_splat_exports(fit, out, request.roll)
+        write_own_page(out, folder, fit, request, config=folder / "config.json", remarks=[note])
+
+
+def _scale_ply(ply: Path, out: Path, factor: float, near: "Tensor") -> None:
+    """Write a scaled PLY file; positions are read relative to a point near them, because float32 holds few digits."""
+    from kgs.app.files.ownership import writing
+    from kgs.fit.scale import scaled_model
+    from kgs.ply import load_ply, save_ply
+
+    model = scaled_model(load_ply(ply, origin=near), factor)
+    with writing(out.parent, "scale", [out.name]):
+        save_ply(out, model, offset=factor * near)
+
+
+def _point(text: str) -> list[float]:
+    """Three numbers with commas between them; a ValueError where there are none."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise ValueError(f"by: expected a point as 1.5,-2,0.25, got {text!r}")
+    return values
+
+
+def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) -> None:
+    """Check the arguments of `kgs scale`."""
+    from kgs.app.files.outputs import NOT_OWN, check_folder
+    from kgs.app.files.ownership import is_own, read_list
+
+    from .checks import check_installed
+
+    a, b, length = by
+    if not (math.isfinite(length) and length > 0):
+        raise ValueError(f"by: expected a length above 0, got {length:g}")
+    distance = math.dist(_point(a), _point(b))
+    if not (0 < distance < math.inf and 0 < length / distance < math.inf):
+        raise ValueError(f"by: expected two points that can be {length:g} apart, got {a} and {b}")
+    if splat.is_dir():
+        check_installed("cpu", "auto", "jinja2", "safetensors")
+        if not (splat / "config.json").exists():
+            raise DataError(splat / "config.json", "", "cannot be read: expected the folder of the results of kgs fit")
+        check_folder(out, _FILES, make=False)
+        if "fit" in read_list(out):
+            raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+        return
+    check_installed("cpu", "auto")
+    if out.suffix.lower() != ".ply":
+        raise ValueError(f"out: expected a file that ends in .ply, got {str(out)!r}")
+    if out.exists() and not is_own(out):
+        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
+    if not out.absolute().parent.is_dir():
+        raise DataError(out, "", "expected a file in a folder that is there")
