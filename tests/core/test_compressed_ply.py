@@ -145,7 +145,9 @@ def test_renders_of_the_file_are_those_of_the_model(tmp_path: Path) -> None:
     save_compressed_ply(tmp_path / "a.ply", model)
     camera = random_camera(60, 80, 0, torch.float32)
     with torch.no_grad():
-        one, two = (kgs.GaussianRenderer()(each(), camera).image for each in (model, as_model(decode(tmp_path / "a.ply"))))
+        one, two = (
+            kgs.GaussianRenderer()(each(), camera).image for each in (model, as_model(decode(tmp_path / "a.ply")))
+        )
     assert -10 * math.log10(float(((one - two) ** 2).mean())) > 50
 
 

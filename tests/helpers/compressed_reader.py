@@ -47,16 +47,16 @@ def decode(path: Path) -> dict[str, NDArray[np.float64]]:
         place += size * count
     assert place == len(body)
     assert len(tables["chunk"]) == math.ceil(len(tables["vertex"]) / 256)
-    found: dict[str, list[Any]] = {
-        key: [] for key in ("means", "quats", "log_scales", "opacities", "sh_dc", "sh_rest")
-    }
+    found: dict[str, list[Any]] = {key: [] for key in ("means", "quats", "log_scales", "opacities", "sh_dc", "sh_rest")}
     for i, vertex in enumerate(tables["vertex"]):
         chunk = tables["chunk"][i // 256]
         found["means"].append(_vector(vertex["packed_position"], chunk, "xyz"))
         found["log_scales"].append(_vector(vertex["packed_scale"], chunk, ("scale_x", "scale_y", "scale_z")))
         found["quats"].append(_rotation(int(vertex["packed_rotation"])))
         color = int(vertex["packed_color"])
-        rgb = [_between(chunk, name, (color >> shift & 255) / 255) for name, shift in zip("rgb", (24, 16, 8))]
+        rgb = [
+            _between(chunk, name, (color >> shift & 255) / 255) for name, shift in zip("rgb", (24, 16, 8), strict=True)
+        ]
         found["sh_dc"].append([[(value - 0.5) / 0.28209479177387814 for value in rgb]])
         found["opacities"].append((color & 255) / 255)
         if "sh" in tables:
