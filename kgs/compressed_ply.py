@@ -1,7 +1,7 @@
 """Splats as compressed PLY files of PlayCanvas, a quarter of the bytes of a plain PLY, for viewers in browsers.
 
 More viewers read this layout than SOG, the other compressed one: SuperSplat, PlayCanvas, Spark and Babylon.js read
-both, GaussianSplats3D only this one. Files of SOG take 0.67 to 0.86 of its bytes (docs/results/viewers).
+both, GaussianSplats3D only this one. Files of SOG take 0.68 to 0.86 of its bytes (docs/results/viewers).
 
 Source: PlayCanvas, "Compressing Gaussian Splats", 2024, https://blog.playcanvas.com/compressing-gaussian-splats; how
 codes become numbers again was compared in the readers of playcanvas 2.23.3 and GaussianSplats3D 0.4.7.

@@ -243,7 +243,7 @@ def _find_vertex(path: Path, header: _Header) -> int:
 def _count_harmonics(path: Path, vertex: _Element) -> int:
     """The number of properties f_rest."""
     if "packed_position" in vertex.codes:
-        raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
+        raise DataError(path, "", "a compressed splat, which kgs cannot read: take the plain PLY that it was made from")
     count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
     if count not in _REST_COUNTS:
         raise DataError(path, "f_rest", f"expected {_REST_COUNTS} properties of that name, got {count}")

@@ -85,3 +85,11 @@ def test_a_fit_writes_it_in_the_axes_of_the_ply_where_floats_can_hold_them(
     expected = model.means.detach().double() + (0 if far else offset)
     np.testing.assert_allclose(found, expected.numpy(), atol=0.005)
     assert header(tmp_path / "splat.compressed.ply")[0][2] == "element chunk 1"
+
+
+def test_a_fit_without_gaussians_has_none(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(exports, "write_film", lambda *_: "")
+    none = torch.zeros(0, 3)
+    scene = Scene(random_views(2), random_views(1), none, none, "none", torch.zeros(3).double(), torch.zeros(3), Path())
+    exports.write_exports(Fit(scene, random_model(0), kgs.RasterOptions()), tmp_path)
+    assert not (tmp_path / "splat.compressed.ply").exists()

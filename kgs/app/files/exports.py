@@ -22,6 +22,9 @@ from kgs.ply import float32_moves
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none, or no MP4.
 
+    Without Gaussians there is no compressed PLY. In map coordinates its origin is that of the scene, see
+    :func:`kgs.ply.float32_moves`.
+
     `roll` turns the pictures of the film, and with them what is up in the glTF file, see
     :func:`kgs.app.files.cameras.rolled`.
     """
@@ -29,9 +32,10 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     listed = camera_list([*shown(scene.train), *shown(scene.test)], scene.offset, fit.model.means)
     write_json(folder / "cameras.json", listed)
     poses = torch.cat([part.cameras.extrinsics for part in shown(scene.train, roll)])
-    means = fit.model.means.detach().cpu().double() + scene.offset
-    moves = float32_moves(means.numpy(), fit.model.log_scales.detach().cpu().numpy())
-    save_compressed_ply(folder / "splat.compressed.ply", fit.model, None if moves else scene.offset)
+    if len(fit.model):
+        means = fit.model.means.detach().cpu().double() + scene.offset
+        moves = float32_moves(means.numpy(), fit.model.log_scales.detach().cpu().numpy())
+        save_compressed_ply(folder / "splat.compressed.ply", fit.model, None if moves else scene.offset)
     save_glb(folder / "splat.glb", fit.model, upright(poses), scene.offset)
     depth = typical_depths(fit.model.means, scene.train.cameras)[1]
     suffix, note = film_suffix()
