@@ -12,6 +12,7 @@ from .version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .camera import PosedCamera, pinhole_cameras
+    from .compressed_ply import save_compressed_ply
     from .densify import Densifier, DensifyReport
     from .drop import DropGaussian, drop_gaussian
     from .geometry import camera_extent
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization", "project", "composite"]
 __all__ += ["Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering", "PosedCamera", "pinhole_cameras"]
 __all__ += ["GaussianModel", "Densifier", "DensifyReport", "camera_extent", "save_ply", "load_ply"]
+__all__ += ["save_compressed_ply"]
 __all__ += ["DataError", "TrainingDiverged"]
 
 # so that the command `kgs` can answer before torch is loaded
@@ -32,6 +34,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "kgs.camera": ("PosedCamera", "pinhole_cameras"),
+        "kgs.compressed_ply": ("save_compressed_ply",),
         "kgs.densify": ("Densifier", "DensifyReport"),
         "kgs.drop": ("DropGaussian", "drop_gaussian"),
         "kgs.geometry": ("camera_extent",),

@@ -78,7 +78,7 @@ def save_ply(
     if invalid.any():
         raise ValueError(f"model: expected values that are finite in float32, got others in {names[invalid.argmax()]}")
     position = "float"
-    if _float32_moves(means, values["log_scales"]):
+    if float32_moves(means, values["log_scales"]):
         position = "double"
         table = np.hstack([means.astype("<f8").view("<f4"), table[:, 3:]])
     comments = [f"kgs sh_degree {model.sh_degree}"]
@@ -142,7 +142,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
     parts = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
     means32, sh_dc, sh_rest, opacity_logits, log_scales, quats = parts
-    if _float32_moves(means, log_scales.numpy()):
+    if float32_moves(means, log_scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
         warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
     return GaussianModel(
@@ -189,7 +189,7 @@ def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
     return int(sh_degree)
 
 
-def _float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[Any]]) -> bool:
+def float32_moves(means: NDArray[np.float64], log_scales: NDArray[np.floating[Any]]) -> bool:
     """Whether float32 would move more than a tenth of the Gaussians by over a thousandth of their largest axis."""
     with np.errstate(over="ignore"):
         shifts = np.abs(means.astype(np.float32) - means).max(axis=1)
@@ -243,7 +243,7 @@ def _find_vertex(path: Path, header: _Header) -> int:
 def _count_harmonics(path: Path, vertex: _Element) -> int:
     """The number of properties f_rest."""
     if "packed_position" in vertex.codes:
-        raise DataError(path, "", "a compressed splat, which cannot be read: export it as plain PLY")
+        raise DataError(path, "", "a compressed splat, which kgs cannot read: take the plain PLY that it was made from")
     count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
     if count not in _REST_COUNTS:
         raise DataError(path, "f_rest", f"expected {_REST_COUNTS} properties of that name, got {count}")

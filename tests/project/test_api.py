@@ -20,7 +20,7 @@ INVENTORY = {
     "kgs": """
         DataError Densifier DensifyReport DropGaussian GaussianModel GaussianRenderer Gaussians PosedCamera
         ProjectedGaussians Rendering RasterOptions TrainingDiverged camera_extent pinhole_cameras composite
-        drop_gaussian load_ply project rasterization save_ply
+        drop_gaussian load_ply project rasterization save_compressed_ply save_ply
     """,
     "kgs.losses": "TargetMoments photometric_loss target_moments",
     "kgs.datasets": "Scene Views load_scene synthetic_scene",
@@ -88,6 +88,7 @@ SIGNATURES = {
     "kgs.Gaussians": "means, quats, scales, opacities, colors",
     "kgs.PosedCamera": "model, extrinsics",
     "kgs.save_ply": "path, model",
+    "kgs.save_compressed_ply": "path, model",
     "kgs.load_ply": "path",
     "kgs.losses.photometric_loss": "image, target, dssim_weight=0.2",
     "kgs.datasets.load_scene": "path, train_views=None, downscale=None",

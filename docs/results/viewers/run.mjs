@@ -1,5 +1,6 @@
 // Opens OUT/splat.ply of a fit in other viewers, in Chromium without a window, and takes pictures:
 //   npm install && node run.mjs OUT PICTURES [VIEWER...]
+// PLY=splat.compressed.ply opens that file of OUT instead.
 import { createServer } from "node:http";
 import { readFile, mkdir } from "node:fs/promises";
 import { extname, join, normalize } from "node:path";
@@ -8,6 +9,7 @@ import puppeteer from "puppeteer-core";
 import { start } from "./view.mjs";
 
 const [out, pictures, ...names] = process.argv.slice(2);
+const ply = process.env.PLY ?? "splat.ply";
 const here = fileURLToPath(new URL(".", import.meta.url));
 const supersplat = join(here, "node_modules/@playcanvas/supersplat-viewer/public");
 const kinds = { ".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript", ".css": "text/css",
@@ -63,8 +65,8 @@ for (const name of names.length ? names : ["supersplat", "mkkellogg", "spark", "
     page.on("console", (line) => line.type() === "error" && problems.push(line.text()));
     await page.setViewport({ width: WIDTH, height: HEIGHT });
     const own = name === "supersplat"
-      ? `${root}/supersplat/index.html?webgl&noui&noanim&content=/data/splat.ply&settings=/settings/${how}`
-      : `${root}/viewer.html?viewer=${name.replace("Linear", "&linear")}&how=${how}`;
+      ? `${root}/supersplat/index.html?webgl&noui&noanim&content=/data/${ply}&settings=/settings/${how}`
+      : `${root}/viewer.html?viewer=${name.replace("Linear", "&linear")}&how=${how}&ply=${ply}`;
     await page.goto(own, { waitUntil: "load", timeout: 120000 });
     if (name === "supersplat") await new Promise((done) => setTimeout(done, 20000));
     else await page.waitForFunction('document.title === "ready"', { timeout: 120000 }).catch((error) => problems.push(String(error)));

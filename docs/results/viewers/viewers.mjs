@@ -1,6 +1,6 @@
 // The viewers, each as its own documentation starts it. `view`: position, target, up, fov (radians); null: its defaults.
 
-const PLY = "/data/splat.ply";
+const PLY = `/data/${new URLSearchParams(location.search).get("ply") ?? "splat.ply"}`;
 const DEGREES = 180 / Math.PI;
 const pause = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
 

@@ -25,6 +25,19 @@ def check_roll(roll: float) -> None:
         raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
+def check_file(out: Path, ending: str) -> None:
+    """Raise a ValueError or DataError unless a result can be written to this file, and is no file of the user's."""
+    from kgs.app.files.outputs import NOT_OWN
+    from kgs.app.files.ownership import is_own
+
+    if out.suffix != ending:
+        raise ValueError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
+    if out.exists() and not is_own(out):
+        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
+    if not out.absolute().parent.is_dir():
+        raise DataError(out, "", "expected a file in a folder that is there")
+
+
 def check_installed(device: str, backend: str, *packages: str) -> None:
     """Raise a ModuleNotFoundError if a package is not installed, a ValueError if the device cannot be used."""
     for package in (*_ALWAYS, *packages, *(["numba"] if backend == "numba" else [])):

@@ -33,8 +33,8 @@ def demo(
       kgs demo -o demo1 --compare --seed 1
 
     Args:
-        out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply and .glb, cameras.json and
-            turntable.webm (.mp4 where there is an encoder).
+        out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply, .compressed.ply and .glb, cameras.json
+            and turntable.webm (.mp4 where there is an encoder).
         steps: training steps; all of the demo takes half a minute on 2 cores with the default.
         size: height and width of the pictures.
         compare: fit a second time without DropGaussian, from the same initial points. For most seeds the two differ

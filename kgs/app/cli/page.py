@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs.app.console import as_line, say, say_next
-from kgs.errors import DataError, printable
+from kgs.errors import printable
 from kgs.fit.config import Backend, Background
 
 from .inputs import load_cameras, load_splat
@@ -84,19 +84,12 @@ def check_page(
     cameras: Path, out: Path, downscale: float | None, roll: float, device: str, backend: str, **_: Any
 ) -> None:
     """Check the arguments of `kgs page`."""
-    from kgs.app.files.outputs import NOT_OWN
-    from kgs.app.files.ownership import is_own
     from kgs.datasets.options import check_options
 
-    from .checks import check_installed, check_roll, check_scene
+    from .checks import check_file, check_installed, check_roll, check_scene
 
     check_roll(roll)
     check_options(downscale, None)
     check_installed(device, backend, "jinja2")
-    if out.suffix != ".html":
-        raise ValueError(f"out: expected a file that ends in .html, got {str(out)!r}")
-    if out.exists() and not is_own(out):
-        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
-    if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "expected a file in a folder that is there")
+    check_file(out, ".html")
     check_scene(cameras)

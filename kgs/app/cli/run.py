@@ -27,6 +27,7 @@ _COMMANDS = {
     "eval": ("kgs.app.cli.evaluate", "evaluate"),
     "page": ("kgs.app.cli.page", "page"),
     "scale": ("kgs.app.cli.scale", "scale"),
+    "export": ("kgs.app.cli.export", "export"),
     "check": ("kgs.app.cli.check", "check"),
     "bench speed": ("kgs.app.cli.bench", "speed"),
     "bench precision": ("kgs.app.cli.bench", "precision"),

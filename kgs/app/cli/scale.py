@@ -12,7 +12,7 @@ from .options import Existing, Out
 if TYPE_CHECKING:
     from torch import Tensor
 
-_FILES = ("splat.ply", "splat.glb", "cameras.json", "index.html")
+_FILES = ("splat.ply", "splat.compressed.ply", "splat.glb", "cameras.json", "index.html")
 
 
 def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
@@ -27,7 +27,7 @@ def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
     Args:
         splat: the folder of the results of kgs fit, or a 3DGS PLY file.
         by: two points, each as x,y,z in the coordinates of the PLY file, and their distance in the unit that is wanted.
-        out: folder for splat.ply, splat.glb, cameras.json and index.html; for a PLY file the PLY file to write.
+        out: folder for splat.ply, splat.compressed.ply, splat.glb, cameras.json and index.html; for a PLY file the PLY file to write.
     """
     import torch
 

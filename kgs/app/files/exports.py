@@ -1,4 +1,4 @@
-"""Writes a fit for other programs, besides its PLY file: cameras, glTF, a film, a still."""
+"""Writes a fit for other programs, besides its PLY file: cameras, compressed PLY, glTF, a film, a still."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +12,12 @@ from kgs.app.files.encoders import film_suffix
 from kgs.app.files.film import path_near_plane, write_film
 from kgs.app.files.glb import save_glb
 from kgs.app.files.preview import write_preview
+from kgs.compressed_ply import save_compressed_ply
 from kgs.datasets.scene import pinholes
 from kgs.fit.fit import Fit
 from kgs.geometry import typical_depths
 from kgs.json_files import write_json
+from kgs.ply import float32_moves
 
 
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
@@ -40,11 +42,19 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
 
 
 def write_splat_exports(fit: Fit, folder: Path, roll: float = 0.0) -> None:
-    """Write cameras.json and splat.glb; `roll` as in :func:`write_exports`."""
+    """Write cameras.json, splat.glb and splat.compressed.ply; `roll` as in :func:`write_exports`.
+
+    Without Gaussians there is no compressed PLY. In map coordinates its origin is that of the scene, see
+    :func:`kgs.ply.float32_moves`.
+    """
     scene = fit.scene
     listed = camera_list([*shown(scene.train), *shown(scene.test)], scene.offset, fit.model.means)
     write_json(folder / "cameras.json", listed)
     save_glb(folder / "splat.glb", fit.model, upright(_poses(fit, roll)), scene.offset)
+    if len(fit.model):
+        means = fit.model.means.detach().cpu().double() + scene.offset
+        moves = float32_moves(means.numpy(), fit.model.log_scales.detach().cpu().numpy())
+        save_compressed_ply(folder / "splat.compressed.ply", fit.model, None if moves else scene.offset)
 
 
 def _poses(fit: Fit, roll: float) -> Tensor:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
-EXPORTS = ("cameras.json", "splat.glb", "preview.jpg", *FILMS)  # for other programs, and for messengers
+# for other programs, and for messengers
+EXPORTS = ("cameras.json", "splat.compressed.ply", "splat.glb", "preview.jpg", *FILMS)
 NOT_OWN = "was not written by kgs, or was changed since (a copy: cp -a keeps what tells that it was not)"
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
