@@ -27,7 +27,8 @@ def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
     Args:
         splat: the folder of the results of kgs fit, or a 3DGS PLY file.
         by: two points, each as x,y,z in the coordinates of the PLY file, and their distance in the unit that is wanted.
-        out: folder for splat.ply, splat.compressed.ply, splat.glb, cameras.json and index.html; for a PLY file the PLY file to write.
+        out: folder for splat.ply, splat.compressed.ply, splat.glb, cameras.json and index.html; for a PLY file the PLY
+            file to write.
     """
     import torch
 
