@@ -26,6 +26,7 @@ _COMMANDS = {
     "render": ("kgs.app.cli.render", "render"),
     "eval": ("kgs.app.cli.evaluate", "evaluate"),
     "page": ("kgs.app.cli.page", "page"),
+    "clean": ("kgs.app.cli.clean", "clean"),
     "check": ("kgs.app.cli.check", "check"),
     "bench speed": ("kgs.app.cli.bench", "speed"),
     "bench precision": ("kgs.app.cli.bench", "precision"),
