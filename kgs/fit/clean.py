@@ -28,9 +28,8 @@ from .fit import Fit
 KINDS = ("giants", "needles", "floaters")
 MAX_STRENGTH = 100.0
 TOLERANCE = 0.05  # dB that a training view may lose at strength 1
-AGREEMENT = 50.0  # dB that renders of before and after have in common at strength 1, where there are no photos
 # Limits at strength 1.
-GIANT = 30.0  # largest axis, over what is typical at that distance from the middle
+GIANT = 30.0  # largest axis, over what is typical at its distance from the middle
 NEEDLE = 10.0  # largest axis over the second
 LONG = 10.0  # largest axis of a needle, over what is typical there
 SEEN_THROUGH = 0.2  # how much farther, over its depth, the view shows something behind it
@@ -79,8 +78,8 @@ class Cleaned:
         fit: with the Gaussians that are left.
         removed: how many were removed, by kind.
         needed: how many strays stay because a training view needs them.
-        before: of each training view, the PSNR of the render before, in dB. Without photos `kgs.metrics.evaluate.BEST`.
-        after: the same of the render after; without photos, the PSNR of that against the render before.
+        before: the PSNR of each training view before, in dB; `kgs.metrics.evaluate.BEST` stands for infinity.
+        after: the same after.
     """
 
     fit: Fit
@@ -99,11 +98,12 @@ def find_strays(
 ) -> Strays:
     """Find floaters, giants and needles.
 
-    A size or spacing is typical if it is the median over the splat; at more than the median distance from the middle
-    (the median of the centres), as many times more, because a splat is coarser far out. With s the root of the
+    A size or spacing is typical if it is the median over the splat; at k times the median distance from the middle (the
+    median of the centres), k > 1, it is k times the median, because a splat is coarser far out. With s the root of the
     strength,
 
-    - a giant has a largest axis of more than `GIANT` / s times the typical one,
+    - a giant has a largest axis of more than `GIANT` / s times the typical one, and k times that far out, where a few
+      large ones are the background,
     - a needle has a largest axis of more than `NEEDLE` / s times its second, and more than `LONG` / s times the typical
       one: short ones draw the edges of things,
     - a floater is not confirmed by two cameras, and is seen through by one, or near one, or isolated. A camera confirms
@@ -135,7 +135,7 @@ def find_strays(
     largest = axes[:, 0]
     farther = _farther(means)
     relative = largest / (_median(largest) * farther)
-    giants = relative > GIANT / root
+    giants = relative > GIANT / root * farther
     needles = (largest > NEEDLE / root * axes[:, 1]) & (relative > LONG / root)
     spacing = _spacing(means)
     floaters = (spacing > ISOLATED / root * _median(spacing) * farther) & (spacing > APART / root * largest)
@@ -153,27 +153,23 @@ def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
     The candidates are those of :func:`find_strays`, in the order of how much a view changes without them: the squared
     change of its image over its squared error, in the view where that is largest. As many are removed, least first, as
     lower the PSNR of no training view by more than `TOLERANCE` times the strength; each number that is tried is
-    rendered. Of a scene that was loaded without photos, the renders before and after must agree to `AGREEMENT` dB less
-    10 log10 of the strength: the PSNR of a photo of 31 dB falls by 0.05 dB then, if the two differences have nothing in
-    common.
+    rendered.
 
     Args:
-        fit: a splat with the cameras, and the photos if there are any, that it was fitted to.
+        fit: a splat with the cameras and photos that it was fitted to.
         strength: above 0, at most `MAX_STRENGTH`.
         stage: shows the progress, as `tqdm` does.
 
     Raises:
-        ValueError: the strength is out of range, or no Gaussian would be left.
+        ValueError: the scene was loaded without photos, the strength is out of range, or no Gaussian would be left.
     """
     check_strength(strength)
     views = fit.scene.train
+    if views.images.is_meta:
+        raise ValueError("fit: expected a scene with its photos, got one that was loaded without them")
     cameras = [views.camera(i) for i in range(len(views))]
     strays = find_strays(fit.model, strength, views.cameras, [fit.median_depth(camera) for camera in cameras])
-    images = [fit.render(camera).clamp(0.0, 1.0) for camera in cameras] if views.images.is_meta else []
-    before = _levels(fit, images)
-    least = [level - TOLERANCE * strength for level in before]
-    if images:
-        least = [AGREEMENT - 10.0 * math.log10(strength)] * len(images)
+    before = _levels(fit)
     candidates = strays.any.nonzero()[:, 0]
     order = candidates[_changes(fit, strays.any, stage).argsort()]
     cleaned = fit
@@ -185,8 +181,8 @@ def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
         rows = torch.ones_like(strays.any)
         rows[order[:count]] = False
         part = replace(fit, model=fit.model.select(rows))
-        levels = _levels(part, images)
-        if all(level >= limit for level, limit in zip(levels, least, strict=True)):
+        levels = _levels(part)
+        if all(old - new <= TOLERANCE * strength for old, new in zip(before, levels, strict=True)):
             cleaned = part
             after = levels
             fewest = count
@@ -213,7 +209,8 @@ def check_left(count: int) -> None:
 
 def _median(values: Tensor) -> Tensor:
     """The median of some numbers; 0 of none."""
-    return values.median() if len(values) else values.new_zeros(())
+    middle: Tensor = values.median() if len(values) else values.new_zeros(())
+    return middle
 
 
 def _farther(means: Tensor) -> Tensor:
@@ -259,21 +256,17 @@ def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float
     return near
 
 
-def _levels(fit: Fit, images: Sequence[Tensor]) -> list[float]:
-    """The PSNR of each training view against its photo, or against one of the images if these are given."""
+def _levels(fit: Fit) -> list[float]:
+    """The PSNR of each training view."""
     views = fit.scene.train
-    if not images:
-        return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
-    renders = (fit.render(views.camera(i)).clamp(0.0, 1.0) for i in range(len(views)))
-    errors = [float((render - image).square().mean()) for render, image in zip(renders, images, strict=True)]
-    return [comparable(-10.0 * math.log10(error) if error else None) for error in errors]
+    return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
 
 
 def _changes(fit: Fit, rows: Tensor, stage: Stage) -> Tensor:
     """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
 
-    The largest over the views of the squared change, summed over the pixels that count, over the squared error of the
-    view: without photos, over 1. An image is affine in the opacity of one Gaussian, so its change is the gradient by a
+    The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
+    the view. An image is affine in the opacity of one Gaussian, so its change is the gradient by a
     factor of that opacity; sums of the gradients times random signs, squared, are the sums of their squares in the
     mean.
     """
@@ -295,6 +288,6 @@ def _changes(fit: Fit, rows: Tensor, stage: Stage) -> Tensor:
             image.backward(signs)
             if factors.grad is not None:
                 squares += factors.grad.square()
-        error = 1.0 if views.images.is_meta else 10.0 ** (-0.1 * comparable(fit.psnr(views.select([i]))))
+        error = 10.0 ** (-0.1 * comparable(fit.psnr(views.select([i]))))
         changes = torch.maximum(changes, squares / (_SIGNS * error))
     return changes[rows]

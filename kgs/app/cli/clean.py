@@ -54,7 +54,6 @@ def clean(
     """
     from kgs.app.files.ownership import writing
     from kgs.app.saved_fit import load_fit
-    from kgs.datasets.folders import has_photos
     from kgs.fit.clean import check_left, check_strength, find_strays
     from kgs.fit.clean import clean as clean_fit
     from kgs.machine import check_tools
@@ -64,9 +63,11 @@ def clean(
     place = check_tools(device, backend)
     fit = None
     if splat.is_dir():
-        fit = load_fit(splat, device, backend, say)[1]
+        request, fit = load_fit(splat, device, backend, say)
+        downscale = request.downscale
+        background = "white" if request.background == "white" else "black"
     elif cameras is not None:
-        scene = load_cameras(cameras, downscale, has_photos(cameras), background=background)
+        scene = load_cameras(cameras, downscale, photos=True, background=background)
         fit = load_splat(splat, scene, place, backend)
     if fit is not None:
         _check_some(splat, fit.model)
@@ -94,8 +95,10 @@ def clean(
     if cleaned.needed:
         say(f"{cleaned.needed} others stay: without them a training view would lose more than it may")
     _say_levels(fit, cleaned)
-    scene_of = splat if fit.scene.root.resolve() == splat.resolve() else fit.scene.root
-    say_next(as_line("kgs", "page", out, "--cameras", scene_of, "-o", out.with_suffix(".html")))
+    options = [] if downscale is None else ["--downscale", f"{downscale:g}"]
+    if background != "black":
+        options += ["--background", background]
+    say_next(as_line("kgs", "page", out, "--cameras", fit.scene.root, "-o", out.with_suffix(".html"), *options))
 
 
 def _check_some(splat: Path, model: "GaussianModel") -> None:
@@ -125,11 +128,6 @@ def _say_levels(fit: "Fit", cleaned: "Cleaned") -> None:
     from statistics import fmean
 
     names = fit.scene.train.names
-    if fit.scene.train.images.is_meta:
-        least = min(cleaned.after)
-        name = printable(names[cleaned.after.index(least)])
-        say(f"no photos: renders before and after were compared; the least PSNR is {least:.1f} dB ({name})")
-        return
     losses = [before - after for before, after in zip(cleaned.before, cleaned.after, strict=True)]
     name = printable(names[losses.index(max(losses))])
     before = fmean(cleaned.before)
@@ -156,7 +154,7 @@ def check_clean(
     from kgs.app.files.ownership import is_own, read_list
     from kgs.datasets.options import check_options
 
-    from .checks import check_installed, check_layout, check_results
+    from .checks import check_installed, check_results, check_scene
 
     check_options(downscale, None)
     check_installed(device, backend)
@@ -168,7 +166,7 @@ def check_clean(
     if out.exists() and (not is_former or out.resolve() == splat.resolve()):
         raise DataError(out, "", "is no former result of kgs clean, or SPLAT itself: choose another file")
     if cameras is not None:
-        check_layout(cameras)
+        check_scene(cameras)
     if splat.is_dir():
         for name, value in (("cameras", cameras), ("downscale", downscale)):
             if value is not None:
