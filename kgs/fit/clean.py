@@ -209,8 +209,7 @@ def check_left(count: int) -> None:
 
 def _median(values: Tensor) -> Tensor:
     """The median of some numbers; 0 of none."""
-    middle: Tensor = values.median() if len(values) else values.new_zeros(())
-    return middle
+    return values.median() if len(values) else values.new_zeros(())
 
 
 def _farther(means: Tensor) -> Tensor:
@@ -218,7 +217,8 @@ def _farther(means: Tensor) -> Tensor:
     if not len(means):
         return means.new_ones(0)
     distances = (means - means.median(dim=0).values).norm(dim=1)
-    return (distances / _median(distances)).nan_to_num(nan=1.0).clamp_min(1.0)
+    relative: Tensor = distances / _median(distances)
+    return relative.nan_to_num(nan=1.0).clamp_min(1.0)
 
 
 def _spacing(means: Tensor) -> Tensor:
