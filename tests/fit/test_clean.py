@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kgs import GaussianModel, pinhole_cameras
-from kgs.datasets.scene import Scene, Views
+from kgs.datasets.scene import Scene, Views, pinholes
 from kgs.fit import Fit
 from kgs.fit.clean import TOLERANCE, check_left, clean, find_strays
 from kgs.types import RasterOptions
@@ -178,3 +178,13 @@ def test_a_few_gaussians_in_one_place_are_no_strays(n):
 def test_no_gaussian_left_is_refused():
     with pytest.raises(ValueError, match="^strength: "):
         check_left(0)
+
+
+def test_a_camera_that_sees_no_gaussian_decides_nothing(each_backend):
+    fit = as_fit(wall(NEEDLE))
+    views = fit.scene.train
+    turned = views.cameras.extrinsics.clone()
+    turned[1] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ turned[1]
+    views = replace(views, cameras=pinholes(views.cameras.intrinsics, turned, SIZE))
+    cleaned = clean(replace(fit, scene=replace(fit.scene, train=views)), 4.0)
+    assert cleaned.before[1] == cleaned.after[1]
