@@ -153,7 +153,7 @@ def small(tmp_path_factory):
         ("render {file} --cameras {scene}", " -o transforms_train-render"),
         ("page {missing} --cameras {scene} -o {scene}.html", "missing"),
         ("page {file} --cameras {scene} -o {out}", "--out: expected a file that ends in .html"),
-        ("nonsense", "one of demo, fit, render, eval, page, scale, export, check, bench, study, got 'nonsense'"),
+        ("nonsense", "one of demo, fit, render, eval, page, clean, scale, export, check, bench, study, got 'nonsense'"),
         ("bench nonsense", "one of speed, precision, extremes, got"),
         ("bench sped", "did you mean speed?"),
     ],

@@ -80,6 +80,21 @@ def check_scene(scene: Path) -> None:
         raise DataError(scene, "", "has camera poses but no photos: expected them in images/, or where its files say")
 
 
+def check_results(out: Path) -> None:
+    """Raise a DataError unless this is the folder of the results of a fit."""
+    from kgs.app.files.staging import Staging
+    from kgs.json_files import read_json
+
+    staging = Staging(out)
+    config = out / "config.json"
+    if not staging.finished.exists():
+        if not config.exists() and staging.unfinished.exists():
+            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        if not config.exists():
+            raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
+        read_json(config)
+
+
 def check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
     """Check a folder of unposed photos, and the options about them; only `downscale` needs the photos' headers.
 

@@ -60,20 +60,11 @@ def evaluate(
 
 def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: str, **_: Any) -> None:
     """Check the arguments of `kgs eval`."""
-    from kgs.app.files.staging import Staging
-    from kgs.json_files import read_json
     from kgs.metrics.weights import weight_files
 
-    from .checks import check_installed
+    from .checks import check_installed, check_results
 
     check_installed(device, backend, "jinja2")
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    staging = Staging(out)
-    config = out / "config.json"
-    if not staging.finished.exists():
-        if not config.exists() and staging.unfinished.exists():
-            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
-        if not config.exists():
-            raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
-        read_json(config)
+    check_results(out)

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from kgs.fit.fit import Fit
 
 
-def load_cameras(cameras: Path, downscale: float | None, **options: Any) -> "Scene":
-    """The scene without its photos, of which there may be hundreds; all views are training views."""
+def load_cameras(cameras: Path, downscale: float | None, photos: bool = False, **options: Any) -> "Scene":
+    """The scene without its photos, of which there may be hundreds, or with them; all views are training views."""
     from kgs.datasets import load_scene
 
-    scene = load_scene(cameras, None, downscale, hold_out=0, photos=False, **options)
+    scene = load_scene(cameras, None, downscale, hold_out=0, photos=photos, **options)
     for note in scene.notes:
         say(note)
     return scene

@@ -26,6 +26,7 @@ _COMMANDS = {
     "render": ("kgs.app.cli.render", "render"),
     "eval": ("kgs.app.cli.evaluate", "evaluate"),
     "page": ("kgs.app.cli.page", "page"),
+    "clean": ("kgs.app.cli.clean", "clean"),
     "scale": ("kgs.app.cli.scale", "scale"),
     "export": ("kgs.app.cli.export", "export"),
     "check": ("kgs.app.cli.check", "check"),

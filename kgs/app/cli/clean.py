@@ -1,0 +1,176 @@
+"""`kgs clean`: a splat without floaters, giants and needles."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kgs.app.console import VIEWER, as_line, each, say, say_next
+from kgs.errors import DataError, printable
+from kgs.fit.config import Backend, Background
+
+from .inputs import load_cameras, load_splat
+from .options import Existing, Out
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kgs.fit.clean import Cleaned
+    from kgs.fit.fit import Fit
+    from kgs.model import GaussianModel
+
+
+def clean(
+    splat: Existing,
+    /,
+    *,
+    out: Out = Path("clean.ply"),
+    strength: float = 1.0,
+    cameras: Existing | None = None,
+    downscale: float | None = None,
+    background: Background = "black",
+    device: str = "cpu",
+    backend: Backend = "auto",
+) -> None:
+    """Remove floaters, giants and needles from a splat: what shows from beside the photos alone.
+
+    A floater is a Gaussian that one photo shows and another sees through, or one near a camera, or an isolated one; a
+    giant is far larger than the others; a needle is long and thin. Each photo is rendered before and after: what is
+    removed lowers the PSNR of none by more than 0.05 dB times the strength.
+
+    For example:
+      kgs clean fern-3 -o fern-clean.ply
+      kgs clean lego.ply --cameras lego -o lego-clean.ply --strength 4 --background white
+
+    Args:
+        splat: the folder of the results of kgs fit, or a 3DGS PLY file.
+        out: the PLY file to write.
+        strength: above 0, up to 100. The sizes from which a Gaussian is removed are divided by its root.
+        cameras: of a PLY file, the scene (folder of LLFF, COLMAP, Blender or nerfstudio) that it was fitted to. Unless
+            given, floaters are the isolated ones alone, and no photo is compared.
+        downscale: with --cameras, reduce the photos by this factor.
+        background: with --cameras, the colour behind the splat, and behind photos with transparency.
+        device: cpu, cuda, ...
+        backend: auto: that of the fit, or the fastest that is installed. kgs fit --help-all describes the others.
+    """
+    from kgs.app.files.ownership import writing
+    from kgs.app.saved_fit import load_fit
+    from kgs.fit.clean import check_left, check_strength, find_strays
+    from kgs.fit.clean import clean as clean_fit
+    from kgs.machine import check_tools
+    from kgs.ply import save_ply
+
+    check_strength(strength)
+    place = check_tools(device, backend)
+    fit = None
+    if splat.is_dir():
+        request, fit = load_fit(splat, device, backend, say)
+        downscale = request.downscale
+        background = "white" if request.background == "white" else "black"
+    elif cameras is not None:
+        scene = load_cameras(cameras, downscale, photos=True, background=background)
+        fit = load_splat(splat, scene, place, backend)
+    if fit is not None:
+        _check_some(splat, fit.model)
+        cleaned = clean_fit(fit, strength, each)
+        model = cleaned.fit.model
+        removed = cleaned.removed
+        fitted = len(fit.model)
+        offset = fit.scene.offset
+    else:
+        whole, offset = _load_alone(splat)
+        _check_some(splat, whole)
+        strays = find_strays(whole, strength)
+        model = whole.select(~strays.any)
+        check_left(len(model))
+        removed = strays.counts(strays.any)
+        fitted = len(whole)
+    with writing(out.parent, "clean", [out.name]):
+        save_ply(out, model, offset=offset)
+    kinds = ", ".join(f"{count} {kind}" for kind, count in removed.items())
+    say(f"{printable(out)}: {len(model)} of {fitted} Gaussians; removed: {kinds}")
+    if fit is None:
+        say("no photo was compared, and floaters are the isolated ones alone: --cameras SCENE names the photos")
+        say_next(VIEWER.format(as_line(out)))
+        return
+    if cleaned.needed:
+        say(f"{cleaned.needed} others stay: without them a training view would lose more than it may")
+    _say_levels(fit, cleaned)
+    options = [] if downscale is None else ["--downscale", f"{downscale:g}"]
+    if background != "black":
+        options += ["--background", background]
+    say_next(as_line("kgs", "page", out, "--cameras", fit.scene.root, "-o", out.with_suffix(".html"), *options))
+
+
+def _check_some(splat: Path, model: "GaussianModel") -> None:
+    """Refuse a splat without Gaussians."""
+    if not len(model):
+        raise DataError(splat, "Gaussians", "expected at least one, got none")
+
+
+def _load_alone(ply: Path) -> tuple["GaussianModel", "Tensor"]:
+    """A splat without cameras, and the offset of its frame: 0, unless float32 would move its Gaussians."""
+    import torch
+
+    from kgs.ply import load_ply
+
+    offset = torch.zeros(3, dtype=torch.float64)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = load_ply(ply)
+    if caught:
+        offset = model.means.detach().double().median(dim=0).values
+        model = load_ply(ply, origin=offset)
+    return model, offset
+
+
+def _say_levels(fit: "Fit", cleaned: "Cleaned") -> None:
+    """What training and test views lost."""
+    from statistics import fmean
+
+    names = fit.scene.train.names
+    losses = [before - after for before, after in zip(cleaned.before, cleaned.after, strict=True)]
+    name = printable(names[losses.index(max(losses))])
+    before = fmean(cleaned.before)
+    after = fmean(cleaned.after)
+    say(f"train: PSNR {after:.2f}, before {before:.2f}; none lost more than {max(0.0, *losses):.3f} dB ({name})")
+    test = fit.scene.test
+    if len(test):
+        levels = [one.psnr(test) for one in (cleaned.fit, fit)]
+        if None not in levels:
+            say(f" test: PSNR {levels[0]:.2f}, before {levels[1]:.2f}")
+
+
+def check_clean(
+    splat: Path,
+    out: Path,
+    strength: float,
+    cameras: Path | None,
+    downscale: float | None,
+    device: str,
+    backend: str,
+    **_: Any,
+) -> None:
+    """Check the arguments of `kgs clean`."""
+    from kgs.app.files.ownership import is_own, read_list
+    from kgs.datasets.options import check_options
+
+    from .checks import check_installed, check_results, check_scene
+
+    check_options(downscale, None)
+    check_installed(device, backend)
+    if out.suffix != ".ply":
+        raise ValueError(f"out: expected a file that ends in .ply, got {str(out)!r}")
+    if not out.absolute().parent.is_dir():
+        raise DataError(out, "", "expected a file in a folder that is there")
+    is_former = is_own(out) and out.name in read_list(out.parent).get("clean", {})
+    if out.exists() and (not is_former or out.resolve() == splat.resolve()):
+        raise DataError(out, "", "is no former result of kgs clean, or SPLAT itself: choose another file")
+    if cameras is not None:
+        check_scene(cameras)
+    if splat.is_dir():
+        for name, value in (("cameras", cameras), ("downscale", downscale)):
+            if value is not None:
+                raise ValueError(f"{name}: expected a PLY file as SPLAT, got a folder, which has its own scene")
+        check_results(splat)
+    elif cameras is None and downscale is not None:
+        raise ValueError("downscale: expected --cameras with it, got none")

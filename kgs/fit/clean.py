@@ -1,0 +1,293 @@
+"""Removes floaters, giants and needles from a splat, as far as the training views do not need them.
+
+Few photos leave much of a splat undetermined: a Gaussian that one photo alone shows can stand anywhere on its ray, and
+one that is long or large enough shows from elsewhere what it never had to show. From the cameras of the photos such
+Gaussians look right; from beside them they are streaks and fog.
+
+Source: the squared change of an image without one Gaussian is a diagonal entry of J^T J, which random signs estimate
+(M. F. Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1990).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kgs.camera import move_camera
+from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
+from kgs.metrics.evaluate import comparable
+from kgs.model import GaussianModel
+from kgs.progress import Stage, silent
+from kgs.renderer import GaussianRenderer
+
+from .fit import Fit
+
+KINDS = ("giants", "needles", "floaters")
+MAX_STRENGTH = 100.0
+TOLERANCE = 0.05  # dB that a training view may lose at strength 1
+# Limits at strength 1.
+GIANT = 30.0  # largest axis, over what is typical at its distance from the middle
+NEEDLE = 10.0  # largest axis over the second
+LONG = 10.0  # largest axis of a needle, over what is typical there
+SEEN_THROUGH = 0.2  # how much farther, over its depth, the view shows something behind it
+CONFIRMED = 0.05  # how much a depth and that of the view differ at most
+NEAR = 0.3  # distance to a camera, over the 1st percentile of depths
+ISOLATED = 10.0  # distance to the nearest three, over what is typical there
+APART = 3.0  # the same, over its own largest axis
+_SIGNS = 8  # images of random signs for each view
+_PARTS = 200  # the removed are as many as possible, to this part of the candidates
+
+
+@dataclass(frozen=True, eq=False)
+class Strays:
+    """Which Gaussians of a splat are floaters, giants or needles; one may be several.
+
+    Args:
+        giants: bool `(N,)`.
+        needles: bool `(N,)`.
+        floaters: bool `(N,)`.
+    """
+
+    giants: Tensor
+    needles: Tensor
+    floaters: Tensor
+
+    @property
+    def any(self) -> Tensor:
+        """Those of at least one kind, bool `(N,)`."""
+        return self.giants | self.needles | self.floaters
+
+    def counts(self, rows: Tensor) -> dict[str, int]:
+        """How many of the Gaussians at `rows`, bool `(N,)`, are of each kind; one of several counts for the first."""
+        found = dict[str, int]()
+        for kind in KINDS:
+            mask: Tensor = getattr(self, kind)
+            found[kind] = int((mask & rows).sum())
+            rows = rows & ~mask
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """A fit without strays, and what was removed.
+
+    Args:
+        fit: with the Gaussians that are left.
+        removed: how many were removed, by kind.
+        needed: how many strays stay because a training view needs them.
+        before: the PSNR of each training view before, in dB; `kgs.metrics.evaluate.BEST` stands for infinity.
+        after: the same after.
+    """
+
+    fit: Fit
+    removed: dict[str, int]
+    needed: int
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+
+
+@torch.no_grad()
+def find_strays(
+    model: GaussianModel,
+    strength: float = 1.0,
+    cameras: PinholeCamera | None = None,
+    depths: Sequence[Tensor] = (),
+) -> Strays:
+    """Find floaters, giants and needles.
+
+    A size or spacing is typical if it is the median over the splat; at k times the median distance from the middle (the
+    median of the centres), k > 1, it is k times the median, because a splat is coarser far out. With s the root of the
+    strength,
+
+    - a giant has a largest axis of more than `GIANT` / s times the typical one, and k times that far out, where a few
+      large ones are the background,
+    - a needle has a largest axis of more than `NEEDLE` / s times its second, and more than `LONG` / s times the typical
+      one: short ones draw the edges of things,
+    - a floater is not confirmed by two cameras, and is seen through by one, or near one, or isolated. A camera confirms
+      a Gaussian whose centre it has in its image, at a depth within `CONFIRMED` of its median depth there; it sees
+      through it if its median depth is more than `SEEN_THROUGH` / s farther. Near is closer to the centre of a camera
+      than `NEAR` s times the 1st percentile of the depths of the confirmed. A Gaussian is isolated if the root mean
+      squared distance to its three nearest is more than `ISOLATED` / s times the typical one, and more than `APART` /
+      s times its own largest axis.
+
+    Convention:
+        Depth is z in the camera's frame (OpenCV axes), in world units; integer pixel centres.
+
+    Args:
+        model: N Gaussians.
+        strength: above 0, at most `MAX_STRENGTH`; 1 is cautious.
+        cameras: C cameras in the frame of the Gaussians, those of the photos; None: floaters are the isolated alone.
+        depths: of each camera the median depth of the splat, each `(H, W)`, 0 where there is nothing.
+
+    Raises:
+        ValueError: the strength is out of range, or there is not one depth for each camera.
+    """
+    check_strength(strength)
+    if len(depths) != (0 if cameras is None else cameras.batch_size):
+        expected = 0 if cameras is None else cameras.batch_size
+        raise ValueError(f"depths: expected one for each of {expected} cameras, got {len(depths)}")
+    root = math.sqrt(strength)
+    means = model.means.detach().double().cpu()
+    axes = model.log_scales.detach().double().cpu().exp().sort(dim=1, descending=True).values
+    largest = axes[:, 0]
+    farther = _farther(means)
+    relative = largest / (_median(largest) * farther)
+    giants = relative > GIANT / root * farther
+    needles = (largest > NEEDLE / root * axes[:, 1]) & (relative > LONG / root)
+    spacing = _spacing(means)
+    floaters = (spacing > ISOLATED / root * _median(spacing) * farther) & (spacing > APART / root * largest)
+    if cameras is not None:
+        confirmed, seen_through = _evidence(means, cameras, depths, SEEN_THROUGH / root)
+        floaters |= (seen_through > 0) | _near(means, cameras, confirmed >= 2, NEAR * root)
+        floaters &= confirmed < 2
+    place = model.means.device
+    return Strays(giants.to(place), needles.to(place), floaters.to(place))
+
+
+def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
+    """The fit without the floaters, giants and needles that its training views do not need.
+
+    The candidates are those of :func:`find_strays`, in the order of how much a view changes without them: the squared
+    change of its image over its squared error, in the view where that is largest. As many are removed, least first, as
+    lower the PSNR of no training view by more than `TOLERANCE` times the strength; each number that is tried is
+    rendered.
+
+    Args:
+        fit: a splat with the cameras and photos that it was fitted to.
+        strength: above 0, at most `MAX_STRENGTH`.
+        stage: shows the progress, as `tqdm` does.
+
+    Raises:
+        ValueError: the scene was loaded without photos, the strength is out of range, or no Gaussian would be left.
+    """
+    check_strength(strength)
+    views = fit.scene.train
+    if views.images.is_meta:
+        raise ValueError("fit: expected a scene with its photos, got one that was loaded without them")
+    cameras = [views.camera(i) for i in range(len(views))]
+    strays = find_strays(fit.model, strength, views.cameras, [fit.median_depth(camera) for camera in cameras])
+    before = _levels(fit)
+    candidates = strays.any.nonzero()[:, 0]
+    order = candidates[_changes(fit, strays.any, stage).argsort()]
+    cleaned = fit
+    after = before
+    fewest = 0
+    most = len(order)
+    count = most  # all of them, and then by halves
+    while most - fewest >= max(1, len(order) // _PARTS):
+        rows = torch.ones_like(strays.any)
+        rows[order[:count]] = False
+        part = replace(fit, model=fit.model.select(rows))
+        levels = _levels(part)
+        if all(old - new <= TOLERANCE * strength for old, new in zip(before, levels, strict=True)):
+            cleaned = part
+            after = levels
+            fewest = count
+        else:
+            most = count - 1
+        count = (fewest + most + 1) // 2
+    check_left(len(cleaned.model))
+    removed = torch.zeros_like(strays.any)
+    removed[order[:fewest]] = True
+    return Cleaned(cleaned, strays.counts(removed), len(order) - fewest, tuple(before), tuple(after))
+
+
+def check_strength(strength: float) -> None:
+    """Raise a ValueError unless this is a strength."""
+    if not 0.0 < strength <= MAX_STRENGTH:
+        raise ValueError(f"strength: expected a number above 0, at most {MAX_STRENGTH:g}, got {strength}")
+
+
+def check_left(count: int) -> None:
+    """Raise a ValueError if no Gaussian is left."""
+    if not count:
+        raise ValueError("strength: expected one at which a Gaussian is left, got one at which all are strays")
+
+
+def _median(values: Tensor) -> Tensor:
+    """The median of some numbers; 0 of none."""
+    return values.median() if len(values) else values.new_zeros(())
+
+
+def _farther(means: Tensor) -> Tensor:
+    """Distances from the median of the centres `(N, 3)` over their median, at least 1, `(N,)`."""
+    if not len(means):
+        return means.new_ones(0)
+    distances = (means - means.median(dim=0).values).norm(dim=1)
+    relative: Tensor = distances / _median(distances)
+    return relative.nan_to_num(nan=1.0).clamp_min(1.0)
+
+
+def _spacing(means: Tensor) -> Tensor:
+    """The root mean squared distance to the three nearest centres, `(N,)`; 0 where there is no such thing."""
+    if len(means) <= NEIGHBOURS or bool((means == means[0]).all()):
+        return means.new_zeros(len(means))
+    return log_spacing(means).exp()
+
+
+def _evidence(means: Tensor, cameras: PinholeCamera, depths: Sequence[Tensor], behind: float) -> tuple[Tensor, Tensor]:
+    """How many cameras confirm each Gaussian, and how many see through it, both int64 `(N,)`.
+
+    `behind` is how much farther the median depth is where a camera sees through.
+    """
+    pixels, own_depths = project_points(means, cameras)
+    confirmed = torch.zeros(len(means), dtype=torch.int64)
+    seen_through = torch.zeros_like(confirmed)
+    for view, depth in enumerate(depths):
+        own = own_depths[:, view]
+        x, y, inside = nearest_pixels(pixels[:, view], own, *depth.mT.shape)
+        shown = depth.double()[y, x]
+        confirmed += inside & ((own - shown).abs() <= CONFIRMED * shown)
+        seen_through += inside & (shown > (1.0 + behind) * own)
+    return confirmed, seen_through
+
+
+def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float) -> Tensor:
+    """Which are closer to a camera than a share of the 1st percentile of the confirmed depths, bool `(N,)`."""
+    near = torch.zeros_like(confirmed)
+    if not bool(confirmed.any()):
+        return near
+    limit = share * typical_depths(means[confirmed], cameras)[0]
+    for centre in camera_centers(cameras.extrinsics):
+        near |= (means - centre).norm(dim=1) < limit
+    return near
+
+
+def _levels(fit: Fit) -> list[float]:
+    """The PSNR of each training view."""
+    views = fit.scene.train
+    return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
+
+
+def _changes(fit: Fit, rows: Tensor, stage: Stage) -> Tensor:
+    """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
+
+    The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
+    the view. An image is affine in the opacity of one Gaussian, so its change is the gradient by a
+    factor of that opacity; sums of the gradients times random signs, squared, are the sums of their squares in the
+    mean.
+    """
+    views = fit.scene.train
+    renderer = GaussianRenderer(options=fit.options, backend=fit.backend).eval()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        gaussians = fit.model()
+    changes = torch.zeros_like(gaussians.opacities)
+    for i in stage(range(len(views)), "strays", "view"):
+        camera = move_camera(views.camera(i), fit.device)
+        squares = torch.zeros_like(changes)
+        for _ in range(_SIGNS):
+            factors = torch.ones_like(changes).requires_grad_()
+            image = renderer(replace(gaussians, opacities=factors * gaussians.opacities), camera).image
+            signs = 2.0 * torch.randint(0, 2, image.shape, generator=generator).to(image) - 1.0
+            if views.counted is not None:
+                signs *= views.counted[i].to(image)
+            image.backward(signs)
+            if factors.grad is not None:
+                squares += factors.grad.square()
+        error = 10.0 ** (-0.1 * comparable(fit.psnr(views.select([i]))))
+        changes = torch.maximum(changes, squares / (_SIGNS * error))
+    return changes[rows]

@@ -1,0 +1,139 @@
+"""`kgs clean`: what it writes and says, of a finished fit, of a PLY file with cameras and of one alone."""
+
+import math
+import os
+
+import numpy as np
+import pytest
+import torch
+from command import one_line, run
+
+from kgs import GaussianModel, load_ply, save_ply
+
+FIT = ("--init", "scene", "--max-gaussians", 1000, "--steps", 30, "--keep-all")
+
+
+@pytest.fixture(scope="module")
+def fitted(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "fit"
+    assert run("fit", folder, "-o", out, *FIT) == 0
+    return out
+
+
+def planted(path, out, offset=0.0):
+    """The splat with a giant of degree 1 that hardly shows, all of it shifted."""
+    model = load_ply(path)
+    values = {name: value.detach().clone() for name, value in model.named_parameters()}
+    extra = {name: value[:1].clone() for name, value in values.items()}
+    extra["log_scales"] += 10.0
+    extra["opacity_logits"].fill_(-9.0)
+    extra["means"] = values["means"].median(dim=0, keepdim=True).values
+    values = {name: torch.cat([value, extra[name]]) for name, value in values.items()}
+    values["sh_rest"] = torch.full((len(values["means"]), 3, 3), 0.01)
+    save_ply(out, GaussianModel(**values, antialiased=True), offset=torch.full((3,), offset, dtype=torch.float64))
+    return model
+
+
+def rows_of(path):
+    """The rows of a file's vertices, as bytes."""
+    content = path.read_bytes()
+    count = int(content.partition(b"element vertex ")[2].split(b"\n")[0])
+    table = content.partition(b"end_header\n")[2]
+    size = len(table) // count
+    return [table[i * size : (i + 1) * size] for i in range(count)]
+
+
+def test_a_fit_loses_no_more_than_it_may_and_its_rows_stay_as_they_are(fitted, tmp_path, capsys):
+    before = (fitted / "splat.ply").read_bytes()
+    assert run("clean", fitted, "-o", tmp_path / "clean.ply") == 0
+    said = capsys.readouterr().out
+    assert "train: PSNR" in said
+    assert " test: PSNR" in said
+    assert (fitted / "splat.ply").read_bytes() == before
+    whole = rows_of(fitted / "splat.ply")
+    kept = rows_of(tmp_path / "clean.ply")
+    assert len(kept) <= len(whole)
+    assert set(kept) <= set(whole)
+    assert run("clean", fitted, "-o", tmp_path / "clean.ply", "--strength", 0.5) == 0  # in place of the former
+
+
+def test_a_file_keeps_its_degree_and_its_tag(fitted, folder, tmp_path, capsys):
+    model = planted(fitted / "splat.ply", tmp_path / "planted.ply")
+    assert run("clean", tmp_path / "planted.ply", "--cameras", folder, "-o", tmp_path / "clean.ply") == 0
+    said = capsys.readouterr().out
+    assert "1 giants" in said
+    assert "train: PSNR" in said
+    cleaned = load_ply(tmp_path / "clean.ply")
+    assert (cleaned.sh_degree, cleaned.antialiased) == (1, True)
+    assert len(cleaned) <= len(model)
+    assert bool(cleaned.log_scales.max() <= model.log_scales.max())
+
+
+def test_far_from_the_origin_positions_stay(fitted, tmp_path, capsys):
+    """Without cameras; the file has doubles."""
+    planted(fitted / "splat.ply", tmp_path / "planted.ply", 4e6)
+    assert run("clean", tmp_path / "planted.ply", "-o", tmp_path / "clean.ply") == 0
+    streams = capsys.readouterr()
+    assert "no photo was compared" in streams.out
+    assert streams.err == ""
+    origin = torch.full((3,), 4e6, dtype=torch.float64)
+    whole, cleaned = (load_ply(tmp_path / name, origin=origin) for name in ("planted.ply", "clean.ply"))
+    assert len(whole) // 2 < len(cleaned) < len(whole)
+    distances = torch.cdist(cleaned.means.double(), whole.means.double()).amin(1)
+    np.testing.assert_allclose(distances.detach(), 0.0, atol=1e-6)
+
+
+def strays_alone(path):
+    """Needles close together, and small ones all around, far from each other."""
+    n = 20
+    angles = 2 * math.pi * torch.arange(n) / n
+    ring = torch.stack([angles.cos(), angles.sin(), 0 * angles], 1)
+    z = 1 - 2 * (torch.arange(n) + 0.5) / n
+    turns = math.pi * (1 + 5**0.5) * torch.arange(n)
+    radius = (1 - z * z).sqrt()
+    sphere = 10 * torch.stack([radius * turns.cos(), radius * turns.sin(), z], 1)
+    scales = torch.tensor([[1.0, 0.001, 0.001]]).repeat(n, 1), torch.full((n, 3), 0.01)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(2 * n, 1)
+    zeros = torch.zeros(2 * n, 1, 3)
+    model = GaussianModel(
+        torch.cat([ring, sphere]), quats, torch.cat(scales).log(), zeros[:, 0, 0], zeros, zeros[:, 1:]
+    )
+    save_ply(path, model)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("{splat} --strength -1", "--strength: expected"),
+        ("{splat} --strength nan", "--strength: expected"),
+        ("{splat} --strength 101", "--strength: expected"),
+        ("{missing}", "missing"),
+        ("{empty}", "empty.ply: Gaussians: expected at least one"),
+        ("{strays} --strength 100", "--strength: expected one at which a Gaussian is left"),
+        ("{scene}", "config.json"),
+        ("{fit} --cameras {scene}", "--cameras: expected a PLY file as SPLAT"),
+        ("{fit} --downscale 2", "--downscale: expected a PLY file as SPLAT"),
+        ("{splat} --downscale 2", "--downscale: expected --cameras"),
+        ("{splat} --cameras {fit}/test", "{fit}/test"),
+        ("{splat} --cameras {missing}", "missing"),
+        ("{splat} --device foo", "--device: expected"),
+        ("{scene}/transforms_train.json", "not a PLY file"),
+        ("{splat} -o {out}", "--out: expected a file that ends in .ply"),
+        ("{splat} -o {fit}/splat.ply", "choose another file"),
+        ("{splat} -o {fit}/none/splat.ply", "expected a file in a folder that is there"),
+    ],
+)
+def test_mistakes_are_one_line_and_nothing_is_written(fitted, folder, tmp_path, capsys, words, said):
+    places = {"missing": tmp_path / "missing", "scene": folder, "fit": fitted, "out": tmp_path / "out"}
+    places |= {"splat": fitted / "splat.ply", "empty": tmp_path / "empty.ply", "strays": tmp_path / "strays.ply"}
+    strays_alone(tmp_path / "strays.ply")
+    save_ply(tmp_path / "empty.ply", load_ply(tmp_path / "strays.ply").select(torch.arange(0)))
+    before = sorted(os.listdir(tmp_path))
+    at_fit = {path: path.stat().st_mtime_ns for path in fitted.rglob("*")}
+    given = [word.format(**places) for word in words.split()]
+    if "-o" not in given:
+        given += ["-o", str(tmp_path / "clean.ply")]
+    assert run("clean", *given) == 2
+    assert said.format(**places) in one_line(capsys)
+    assert sorted(os.listdir(tmp_path)) == before
+    assert {path: path.stat().st_mtime_ns for path in fitted.rglob("*")} == at_fit
