@@ -117,8 +117,8 @@ class FitConfig:
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3
             if the colours of the training views depend on the direction, else 0.
-        same_exposure: take all training photos as equally exposed. Else, where they differ, each has a gain in each
-            channel, which is estimated before the fit and held.
+        exposure: whether each training photo has a gain in each channel, which is estimated before the fit and held.
+            auto: where photos differ by a factor of 1.3 or more, and gains explain it. each: always. same: never.
         refine_poses: optimise the poses of the training cameras too. It helps if they are half a degree or more off;
             accurate poses get slightly worse. The mean and the spread of the poses stay, and so do test cameras.
         coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1].
@@ -154,7 +154,7 @@ class FitConfig:
     drop_schedule: Literal["linear", "constant"] = "linear"
     undropped_steps: _Count = 50
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
-    same_exposure: bool = False
+    exposure: Literal["auto", "each", "same"] = "auto"
     refine_poses: bool = False
     coarse: _Share = 0.0
     seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed has to fit torch's 64 bits
@@ -224,7 +224,7 @@ PAPER = FitConfig(
     drop=0.2,
     undropped_steps=0,
     sh_degree=3,
-    same_exposure=True,
+    exposure="same",
     init_points=10_000,
     draw="uniform",
     training_background="scene",

@@ -6,8 +6,11 @@ each channel. The logarithms of the factors, with a mean of zero over the photos
 
     log color(patch, view) = log color(patch) + log gain(view)
 
-over all patches and views, weighted anew against outliers. Shading, reflections and noise give gains, too, which make a
-fit worse: gains are used where they explain much of what the patches differ by.
+over all patches and views, weighted anew against outliers.
+
+A fit with gains shows the scene in the mean exposure. Held-out photos have others, so that their PSNR falls even where
+it rises after an affine fit of colours; and shading, reflections and noise give gains, too. Unless they are asked for,
+gains are used only where photos differ much, and gains explain it (docs/photos.md has measurements).
 """
 
 from dataclasses import replace
@@ -22,8 +25,8 @@ from kgs.init_points.patches import PatchColors
 
 from .plan import Plan
 
-LEAST_RATIO = 1.03  # between the gains of two photos in a channel, for gains to be used
-MOST_LEFT = 0.7  # of the median difference of a patch's colours, after the gains, for gains to be used
+LEAST_RATIO = 1.3  # between the gains of two photos in a channel, for gains to be used
+MOST_LEFT = 0.6  # of the median difference of a patch's colours, after the gains, for gains to be used
 MIN_PATCHES = 200
 USABLE = 0.03, 0.97  # colours beyond are black or saturated
 ROUNDS = 8  # of the weights
@@ -34,19 +37,20 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
     """Decide whether the training photos differ in exposure or white balance, and by how much.
 
     Args:
-        plan: of the fit; nothing is decided with `same_exposure`.
-        points: its initial points; nothing is decided without patches.
+        plan: of the fit.
+        points: its initial points; without patches there are no gains.
 
     Returns:
-        The plan. If the photos differ, its `needs` have under "exposure" a dict: "gains", three numbers for each
+        The plan. If gains are used, its `needs` have under "exposure" a dict: "gains", three numbers for each
         training view, with a geometric mean of 1; "left", the share of the patches' differences that they leave; and
         "n", the number of patches.
     """
-    if plan.config.same_exposure or points.patches is None or len(points.patches) < MIN_PATCHES:
+    how = plan.config.exposure
+    if how == "same" or points.patches is None or len(points.patches) < MIN_PATCHES:
         return plan
     gains, left = estimate_gains(points.patches)
     ratio = float((gains.amax(0) / gains.amin(0)).max())
-    if ratio < LEAST_RATIO or left > MOST_LEFT:
+    if how == "auto" and (ratio < LEAST_RATIO or left > MOST_LEFT):
         return plan
     rows = [[round(value, 4) for value in row] for row in gains.tolist()]
     exposure = {"gains": rows, "left": round(left, 3), "n": len(points.patches)}

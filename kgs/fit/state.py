@@ -246,7 +246,7 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     elif planned != steps or done > planned:
         expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
         raise ValueError(f"steps: expected {expected} got {steps}")
-    new = {"same_exposure": False}  # of fits from before there was this entry
+    new = {"exposure": "auto"}  # of fits from before there was this entry
     _compare_settings(new | saved["config"] | {"backend": saved["backend"]}, asked)
     for part in ("training", "test"):
         for what, sums in scene[part].items():

@@ -63,11 +63,13 @@ def test_gains_are_used_only_where_photos_differ(tiny_plan):
     assert decide_exposure(tiny_plan, points_with(patches(equal, noise=0.1))) == tiny_plan
     assert decide_exposure(tiny_plan, points_with(patches(count=MIN_PATCHES - 1))) == tiny_plan
     assert decide_exposure(tiny_plan, points_with(None)) == tiny_plan
-    same = replace(tiny_plan, config=replace(tiny_plan.config, same_exposure=True))
+    same = replace(tiny_plan, config=replace(tiny_plan.config, exposure="same"))
     assert decide_exposure(same, points_with(patches())) == same
     assert decide_exposure(tiny_plan, points_with(patches(1 + 0.04 * (GAINS - 1), noise=0.1))) == tiny_plan
     warm = torch.ones(4, 3)
     warm[0, 0] = 1.1 * LEAST_RATIO
+    each = replace(tiny_plan, config=replace(tiny_plan.config, exposure="each"))
+    assert "exposure" in decide_exposure(each, points_with(patches(equal))).needs
     needs = decide_exposure(tiny_plan, points_with(patches(warm))).needs["exposure"]
     torch.testing.assert_close(torch.tensor(needs["gains"]), centred(warm), rtol=5e-3, atol=0.0)
 
@@ -103,7 +105,7 @@ def test_a_fit_of_photos_that_differ_is_as_good_as_of_photos_that_do_not(arc, ex
     """Held-out views, after an affine fit of their colours; without gains they lose much."""
     truth = centred(GAINS[[0, 1, 2, 3, 1, 2]])
     torch.testing.assert_close(fit.scene.train.gains, truth, rtol=0.05, atol=0.0)
-    same = fit_scene(exposed, replace(CONFIG, same_exposure=True))
+    same = fit_scene(exposed, replace(CONFIG, exposure="same"))
     assert same.scene.train.gains is None
     levels = [evaluate(f.render, arc.test, recolor=True)["psnr"] for f in (fit, same, fit_scene(arc, CONFIG))]
     assert levels[0] > levels[2] - 1.0
