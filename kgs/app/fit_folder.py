@@ -247,8 +247,9 @@ def train(
 ) -> tuple[Fit, int]:
     """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
 
-    `live` shows the splat. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit and the number of that
-    signal, or 0. If a checkpoint cannot be written (a full disk), a note says so, and training goes on.
+    `live` shows the splat. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit
+    and the number of that signal, or 0. If a checkpoint cannot be written (a full disk), a note says so, and training
+    goes on.
     """
     saved = time.monotonic()
     times = trainer.plan.times
