@@ -26,8 +26,8 @@ T = TypeVar("T")
 class LivePage:
     """A page on this machine with the splat of a fit, until the end of its `with` block. It changes no bit of the fit.
 
-    Nothing is copied or computed while no page is open. A splat is copied between two steps; threads of the server do
-    the rest.
+    No step costs anything while no page is open. A splat is copied between two steps; threads of the server do the
+    rest.
 
     Args:
         trainer: before its next step.
@@ -47,7 +47,7 @@ class LivePage:
         self._steps = trainer.plan.times.steps
         self._begin = time.monotonic()
         self._shown = float("-inf")  # time of the last splat
-        self._seconds = 0.0  # that copies took
+        self._seconds = 0.0  # processor time that copies took
         self._server = LiveServer(partial(_alone, live_page, trainer.result(), gaussians, title, roll))
         self._server.show(self._words(trainer.step, len(trainer.model)), partial(_alone, plain, gaussians))
         self.url = self._server.url
@@ -82,9 +82,9 @@ class LivePage:
 
     def _show(self, model: GaussianModel, text: str) -> None:
         self._shown = time.monotonic()
-        begin = time.perf_counter()
+        begin = time.thread_time()
         gaussians = _copied(model)
-        self._seconds += time.perf_counter() - begin
+        self._seconds += time.thread_time() - begin
         self._server.show(text, partial(_alone, plain, gaussians))
 
     def _words(self, step: int, count: int) -> str:

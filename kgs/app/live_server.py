@@ -103,7 +103,7 @@ class LiveServer:
 
     @contextmanager
     def newer_than(self, version: int) -> Iterator[list[bytes]]:
-        """Wait for what is newer, and yield it as live.js reads it; [] if nothing comes for a while.
+        """Wait for what is newer, and yield it as live.js reads it; [] if nothing comes, or not for a while.
 
         It has been sent when the block ends.
         """
@@ -111,7 +111,7 @@ class LiveServer:
         with self._changed:
             self._busy += 1
             self._waiting += 1
-            self._changed.wait_for(lambda: self._news["version"] > version, _WAIT)
+            self._changed.wait_for(lambda: self._news["version"] > version or self._news["isOver"], _WAIT)
             self._waiting -= 1
             self._asked = time.monotonic()
             news = dict(self._news)
