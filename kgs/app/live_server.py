@@ -51,7 +51,7 @@ class LiveServer:
         page: the HTML.
         port: on which it listens.
         url: of the page.
-        seconds: processor time that the splats took until now.
+        seconds: processor time that all answers took until now.
     """
 
     def __init__(self, page: Callable[[], bytes]) -> None:
@@ -107,7 +107,6 @@ class LiveServer:
 
         It has been sent when the block ends.
         """
-        begin = time.thread_time()
         with self._changed:
             self._busy += 1
             self._waiting += 1
@@ -128,8 +127,12 @@ class LiveServer:
             with self._changed:
                 self._busy -= 1
                 self._told = max(self._told, news["version"])
-                self.seconds += time.thread_time() - begin
                 self._changed.notify_all()
+
+    def count(self, seconds: float) -> None:
+        """Add the processor time of an answer."""
+        with self._changed:
+            self.seconds += seconds
 
 
 class _Once(Generic[T]):
@@ -164,6 +167,14 @@ class _Handler(BaseHTTPRequestHandler):
     def __init__(self, live: LiveServer, *request: Any) -> None:
         self._live = live
         super().__init__(*request)
+
+    def handle(self) -> None:
+        """Answer, and count the time."""
+        begin = time.thread_time()
+        try:
+            super().handle()
+        finally:
+            self._live.count(time.thread_time() - begin)
 
     def do_GET(self) -> None:
         """Answer with the page or the splat."""

@@ -122,7 +122,7 @@ def live_page(fit: Fit, gaussians: Gaussians, title: str, roll: float = 0.0) -> 
 
     Args:
         fit: as far as it is.
-        gaussians: a copy of its Gaussians.
+        gaussians: a copy of some of its Gaussians.
         title: of the page.
         roll: degrees by which all pictures are turned clockwise.
     """
