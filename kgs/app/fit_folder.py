@@ -5,7 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -18,7 +18,8 @@ from kgs.app.files.outputs import check_folder, png_names, write_png
 from kgs.app.files.ownership import is_own
 from kgs.app.files.results_folder import CHECKPOINT, complete_move, is_finished, locked, replaced_files
 from kgs.app.files.staging import Staging
-from kgs.app.page.fit_page import write_own_page
+from kgs.app.live import LivePage
+from kgs.app.page.fit_page import PAGE, write_own_page
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
 from kgs.fit.checkpoint import previous, save_checkpoint
@@ -57,6 +58,7 @@ def fit_folder(
     *,
     resume: bool = False,
     lpips: Lpips | None = None,
+    live: bool = False,
     say: Callable[[str], None] = say,
     stages: Stages | None = None,
 ) -> Published:
@@ -72,6 +74,7 @@ def fit_folder(
         request: how the scene was loaded, for config.json, and how the page shows it.
         resume: continue from the folder's checkpoint, if there is one.
         lpips: the perceptual metric, or None to leave it out.
+        live: show the splat during the fit on a page on this machine, see :class:`kgs.app.live.LivePage`.
         say: called with each line for the user.
         stages: names the stages as they begin.
 
@@ -91,7 +94,7 @@ def fit_folder(
     _check_size(scene, config, lpips)
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene, names)
-    with locked(out):
+    with locked(out), ExitStack() as until_the_end:
         complete_move(out)
         staging = Staging(out)
         trainer, source = _trainer(scene, config, plan, out, resume, say, stages)
@@ -104,7 +107,8 @@ def fit_folder(
                 save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
             write_json(new / "config.json", _settings(trainer, request))
             stages.begin("fit")
-            fit, stopped_by = train(trainer, new / CHECKPOINT)
+            page = until_the_end.enter_context(_live_page(trainer, request, out, say)) if live else None
+            fit, stopped_by = train(trainer, new / CHECKPOINT, live=page)
             is_trained = True
             stages.begin("film")
             fit = _write_results(fit, new, names, request, lpips)
@@ -131,6 +135,9 @@ def fit_folder(
             staging.seal()
             complete_move(out)
         notes.say_new()
+        if page is not None:
+            how = f"was stopped at step {trainer.step}" if stopped_by else "is done"
+            page.end = f"The fit {how}. Its page: {(folder / PAGE).resolve()}"
     return Published(fit, stopped_by, folder)
 
 
@@ -178,6 +185,19 @@ def _trainer(
     return Trainer(scene, decide(plan, points), points), out
 
 
+def _live_page(
+    trainer: Trainer, request: SceneRequest, out: Path, say: Callable[[str], None]
+) -> AbstractContextManager[LivePage | None]:
+    """The page that shows the fit at work, and a line that says where; None if the system gives no port."""
+    try:
+        page = LivePage(trainer, request.title_of(out), request.roll)
+    except OSError as error:
+        say(f"there is no live page: {error}")
+        return nullcontext()
+    say(f"open {page.url} in a browser on this machine: the splat as it grows, until the fit ends")
+    return page
+
+
 class _Notes:
     """Says the notes of a trainer, each once."""
 
@@ -221,11 +241,14 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     return replace(fit, metrics=metrics, notes=(*fit.notes, *notes))
 
 
-def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> tuple[Fit, int]:
+def train(
+    trainer: Trainer, checkpoint: Path | None, title: str = "fit", live: LivePage | None = None
+) -> tuple[Fit, int]:
     """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
 
-    SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit and the number of that
-    signal, or 0. If a checkpoint cannot be written (a full disk), a note says so, and training goes on.
+    `live` shows the splat. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit
+    and the number of that signal, or 0. If a checkpoint cannot be written (a full disk), a note says so, and training
+    goes on.
     """
     saved = time.monotonic()
     times = trainer.plan.times
@@ -245,10 +268,14 @@ def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> tupl
             advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")
             if trainer.step in times.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
                 save()
+            if live is not None:
+                live.after_step(trainer)
             return bool(stopped)
 
         fit = prune(trainer.fit(after_step))
         save(fit.part)
+    if live is not None:
+        live.after_training(fit)
     return fit, stopped[0] if stopped else 0
 
 

@@ -86,10 +86,10 @@ class Browser:
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 
-    def open(self, path: Path, ready: str = "true") -> None:
-        """Load a file, and wait until an expression is true."""
+    def open(self, path: Path | str, ready: str = "true") -> None:
+        """Load a file, or what is at a URL, and wait until an expression is true."""
         self.problems, self.requests, self.loaded = [], [], False
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
         while not self.loaded:
             self._read()
         self.wait(ready)

@@ -50,6 +50,7 @@ def fit(
     photos: bool = True,
     roll: float = 0.0,
     lpips_weights: Existing | None = None,
+    live: bool = False,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
     """Turn a folder of photos into a splat, a page to look at it, and a film.
@@ -83,6 +84,7 @@ def fit(
         photos: --no-photos leaves the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
+        live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
         config: every number of the fit.
     """
     from kgs.app.files.ownership import is_own
@@ -147,7 +149,7 @@ def fit(
         raise ValueError(f"downscale: {reason}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
-        published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, stages=stages)
+        published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, live=live, stages=stages)
     metrics = published.fit.metrics
     say(as_text(metrics))
     posed = out if unposed else scene

@@ -18,7 +18,7 @@ Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_A_FIT = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "lpips_weights", "mask_means", "frames", "title")
+_RARE = ("downscale", "lpips_weights", "mask_means", "frames", "title", "live")
 
 
 def has_short_help(command: Callable[..., Any]) -> bool:

@@ -102,16 +102,13 @@ def pack(
     Raises:
         ValueError: not even one Gaussian fits.
     """
-    values = {name: value.detach().cpu().double().numpy() for name, value in vars(gaussians).items()}
-    if values["colors"].ndim == 2:
-        values["colors"] = (values["colors"][:, None] - 0.5) / SH_C0
-    finite = finite_gaussians(gaussians).cpu().numpy()
-    visible = np.flatnonzero(finite & (values["opacities"] >= RasterOptions.alpha_threshold))
-    rows = visible[~_strays(values["means"][visible], cameras)]
+    values, visible = _visible(gaussians)
+    values = {name: value.astype(np.float64) for name, value in values.items()}
+    near = ~_strays(values["means"], cameras)
+    rows = visible[near]
     strays = len(visible) - len(rows)
     words = [f"all but {strays} stray Gaussian{'s' if strays > 1 else ''}"] if strays else []
-    values = {name: value[rows] for name, value in values.items()}
-    values["colors"] = values["colors"].clip(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)
+    values = {name: value[near] for name, value in values.items()}
     degree = SH_SIZES.index(values["colors"].shape[1])
     packed = Packed({}, b"")
     reductions = list[str]()
@@ -129,6 +126,31 @@ def pack(
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
     words += [*reductions, f"{count} of {len(rows)} Gaussians"]
     return packed._replace(left_out=", ".join(words))
+
+
+def plain(gaussians: Gaussians) -> Packed:
+    """Gaussians for a viewer on the same machine: ten times as fast as :func:`pack`, in three times the bytes or more.
+
+    Invisible Gaussians are left out, and the order is kept. `columns` of the layout has the names of the columns only;
+    of each in turn, the content has a float32 (little-endian) for each Gaussian.
+    """
+    values, rows = _visible(gaussians)
+    degree = SH_SIZES.index(values["colors"].shape[1])
+    columns = dict(_numbers(values, degree))
+    content = b"".join(column.astype("<f4").tobytes() for column in columns.values())
+    return Packed({"count": len(rows), "degree": degree, "columns": list(columns)}, content)
+
+
+def _visible(gaussians: Gaussians) -> tuple[dict[str, NDArray[Any]], NDArray[np.intp]]:
+    """The values of the visible Gaussians, with harmonics that a viewer can draw, and which rows these are."""
+    values = {name: value.detach().cpu().numpy() for name, value in vars(gaussians).items()}
+    if values["colors"].ndim == 2:
+        values["colors"] = (values["colors"][:, None].astype(np.float64) - 0.5) / SH_C0
+    finite = finite_gaussians(gaussians).cpu().numpy()
+    rows = np.flatnonzero(finite & (values["opacities"].astype(np.float64) >= RasterOptions.alpha_threshold))
+    values = {name: value[rows] for name, value in values.items()}
+    values["colors"] = values["colors"].clip(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)
+    return values, rows
 
 
 def _strays(means: Array, cameras: PinholeCamera) -> NDArray[np.bool_]:
@@ -191,33 +213,42 @@ def _gzip(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
 
 def _columns(values: dict[str, Array], pixels_per_unit: float, bits: int, degree: int) -> Iterator[Column]:
     """All numbers of the Gaussians in fixed point, the harmonics last."""
-    means = values["means"]
     largest_step = 2 * PIXEL_ERROR / math.sqrt(3) / max(pixels_per_unit, 1e-12)
     least_bits, most_bits = _POSITION_BITS
-    for name, column in zip("xyz", means.T, strict=True):
-        span = float(np.ptp(column)) if len(column) else 0.0
-        needed = math.ceil(math.log2(span / largest_step + 2))
-        yield _spread_out(name, column, min(most_bits, max(least_bits, needed)))
+    for name, column in _numbers(values, degree):
+        if name in ("x", "y", "z"):
+            span = float(np.ptp(column)) if len(column) else 0.0
+            needed = math.ceil(math.log2(span / largest_step + 2))
+            yield _spread_out(name, column, min(most_bits, max(least_bits, needed)))
+        elif name == "largest":
+            yield Column(name, 1, 0.0, 1.0, column.astype(np.uint64))
+        else:
+            is_of_higher_degree = name.startswith("sh") and not name.startswith("sh0")
+            yield _fixed_point(name, column, COARSE if is_of_higher_degree else bits)
+
+
+def _numbers(values: dict[str, Array], degree: int) -> Iterator[tuple[str, Array]]:
+    """All numbers of the Gaussians by the names of their columns, the harmonics last."""
+    yield from zip("xyz", values["means"].T, strict=True)
 
     for axis, column in enumerate(np.log(values["scales"].clip(_MIN_SCALE)).T):
-        yield _fixed_point(f"scale{axis}", column, bits)
+        yield f"scale{axis}", column
 
     norms = np.linalg.norm(values["quats"], axis=1, keepdims=True)
     quats = np.where(norms > 0, values["quats"] / np.where(norms > 0, norms, 1.0), [1.0, 0.0, 0.0, 0.0])
     largest = np.abs(quats).argmax(axis=1)
     quats = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
     others = quats[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    yield Column("largest", 1, 0.0, 1.0, largest.astype(np.uint64))
+    yield "largest", largest
     for i, column in enumerate(others.T):
-        yield _fixed_point(f"quat{i}", column, bits)
+        yield f"quat{i}", column
 
-    yield _fixed_point("opacity", values["opacities"], bits)
+    yield "opacity", values["opacities"]
 
     for k in range(SH_SIZES[degree]):
         for channel in range(3):
             column = values["colors"][:, k, channel]
-            roots = np.sign(column) * np.sqrt(np.abs(column))
-            yield _fixed_point(f"sh{k}{'rgb'[channel]}", roots, COARSE if k else bits)
+            yield f"sh{k}{'rgb'[channel]}", np.sign(column) * np.sqrt(np.abs(column))
 
 
 def _fixed_point(name: str, values: Array, bits: int) -> Column:

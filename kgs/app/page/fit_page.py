@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,12 @@ from kgs.errors import DataError
 from kgs.fit.fit import Fit
 from kgs.fit.prune import contributions, left_out
 from kgs.json_files import read_json
+from kgs.types import Gaussians
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
 from .pictures import Picture, in_strip
-from .write import write_page
+from .write import live_html, write_page
 
 PAGE = "index.html"
 MOST_PICTURES = 6  # photos that are shown beside their renders
@@ -94,10 +96,8 @@ def write_fit_page(
             weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
             offset=scene.offset,
         ),
-        photos=PagePhotos(
-            cameras=_all_cameras(*parts),
-            names=[*scene.train.names, *scene.test.names],
-            parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
+        photos=replace(
+            _photos(scene, words, roll),
             pictures=_pictures(pictured, fits),
             pictures_note=_pictures_note(sum(map(len, pictured)), len(views), word),
             thumbnails=_thumbnails(thumbnailed),
@@ -156,6 +156,32 @@ def write_own_page(
         report=fit.scene.root / CAMERAS_REPORT,
         photos=request.photos,
         roll=request.roll,
+    )
+
+
+def live_page(fit: Fit, gaussians: Gaussians, title: str, roll: float = 0.0) -> bytes:
+    """The HTML of the page that shows a fit at work, see :func:`kgs.app.page.write.live_html`.
+
+    Args:
+        fit: as far as it is.
+        gaussians: a copy of some of its Gaussians.
+        title: of the page.
+        roll: degrees by which all pictures are turned clockwise.
+    """
+    scene = fit.scene
+    views = scene.test if len(scene.test) else scene.train
+    photographed = views.select(spread(len(views), MOST_PICTURES))
+    splat = PageSplat(gaussians, _ground(photographed, scene.background), fit.options)
+    return live_html(PageContent(splat, _photos(scene, ("training", "test"), roll), PageText(title)))
+
+
+def _photos(scene: Scene, words: tuple[str, str], roll: float) -> PagePhotos:
+    """The photos of a scene, none of which is shown."""
+    training_word, test_word = words
+    return PagePhotos(
+        cameras=_all_cameras(*shown(scene.train, roll), *shown(scene.test, roll)),
+        names=[*scene.train.names, *scene.test.names],
+        parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
     )
 
 

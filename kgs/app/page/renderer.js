@@ -13,16 +13,19 @@ async function unzipped(base64) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// The splat as the content of two textures, from its layout and base64-encoded content.
+// A splat from its layout and base64-encoded content.
 async function decodeSplat(layout, base64) {
-  const planes = await unzipped(base64);
-  const columns = decodeColumns(layout, planes);
-  const coefficients = (layout.degree + 1) ** 2;
+  return splatOf(layout, decodeColumns(layout, await unzipped(base64)));
+}
+
+// The splat as the content of two textures, from its columns.
+function splatOf({ count, degree }, columns) {
+  const coefficients = (degree + 1) ** 2;
   return {
-    count: layout.count,
+    count,
     coefficients,
-    geometry: geometryTexels(columns, layout.count),
-    harmonics: harmonicsTexels(columns, layout.count, coefficients),
+    geometry: geometryTexels(columns, count),
+    harmonics: harmonicsTexels(columns, count, coefficients),
   };
 }
 
@@ -203,9 +206,7 @@ class SplatRenderer {
   constructor(canvas, splat, shaders, settings) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
     if (!gl) throw new Error("this browser has no WebGL2");
-    Object.assign(this, { canvas, gl, splat, settings });
-    this.order = new DepthOrder(splat.count);
-    this.everyGaussian = Uint32Array.from({ length: splat.count }, (_, i) => i);
+    Object.assign(this, { canvas, gl, settings, textures: [] });
     const hasFloatTargets = Boolean(gl.getExtension("EXT_color_buffer_float"));  // otherwise blending has 8 bits
     const bytes = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
     const halfFloats = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
@@ -213,8 +214,7 @@ class SplatRenderer {
     this.screenProgram = new Program(gl, shaders.screenVertex, shaders.screenFragment);
     this.picture = new Target(gl, PICTURE, hasFloatTargets ? halfFloats : bytes);
     this.sample = new Target(gl, SAMPLE, bytes);
-    this.upload(GEOMETRY, gl.RGBA32F, splat.geometry);
-    this.upload(HARMONICS, gl.RGBA16F, splat.harmonics);
+    this.take(splat);
     this.addBuffer(0);  // the corners of a quadrilateral
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
     gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
@@ -223,11 +223,23 @@ class SplatRenderer {
     gl.vertexAttribDivisor(1, 1);
   }
 
-  // A texture of four floats per texel.
-  upload(unit, format, values) {
+  // Draws this splat from now on.
+  take(splat) {
     const { gl } = this;
+    this.splat = splat;
+    this.order = new DepthOrder(splat.count);
+    this.everyGaussian = Uint32Array.from({ length: splat.count }, (_, i) => i);
+    this.upload(GEOMETRY, gl.RGBA32F, splat.geometry);
+    this.upload(HARMONICS, gl.RGBA16F, splat.harmonics);
+  }
+
+  // A texture of four floats per texel, in the place of the one that the unit had.
+  upload(unit, format, values) {
+    const { gl, textures } = this;
+    gl.deleteTexture(textures[unit] ?? null);
+    textures[unit] = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.bindTexture(gl.TEXTURE_2D, textures[unit]);
     const rows = values.length / 4 / TEXELS_PER_ROW;
     gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXELS_PER_ROW, rows, 0, gl.RGBA, gl.FLOAT, values);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);

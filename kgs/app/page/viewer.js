@@ -336,6 +336,14 @@ class Viewer {
     return { ...eye, nearPlane: nearPlane + share * (farNearPlane - nearPlane) };
   }
 
+  // Shows another splat of the scene from where the eye is.
+  take(splat) {
+    this.renderer.take(splat);
+    this.usualCoverage = null;
+    this.roamedTo = null;
+    this.requestDraw();
+  }
+
   // Draws with the next frame of the browser, once.
   requestDraw() {
     if (this.redrawRequested) return;
@@ -542,11 +550,9 @@ async function openViewer() {
       show("failed", `The viewer cannot run here: ${error.message}.`);
     }
   };
-  let splat;
-  const newRenderer = () => new SplatRenderer(canvas, splat, shaders, settings);
+  const newRenderer = (splat) => new SplatRenderer(canvas, splat, shaders, settings);
   await attempt(async () => {
-    splat = await decodeSplat(layout, content);
-    window.viewer = new Viewer(frame, newRenderer(), scene);
+    window.viewer = new Viewer(frame, newRenderer(await decodeSplat(layout, content)), scene);
   });
   // Browsers release the graphics context of pages in the background, and restore it later.
   canvas.addEventListener("webglcontextlost", (event) => {
@@ -554,9 +560,9 @@ async function openViewer() {
     show("lost", "The browser has released the graphics of this page for now.");
   });
   canvas.addEventListener("webglcontextrestored", () => attempt(() => {
-    viewer.renderer = newRenderer();
+    viewer.renderer = newRenderer(viewer.renderer.splat);
     viewer.draw();
   }));
 }
 
-openViewer();
+const opened = openViewer();

@@ -1,6 +1,7 @@
 """Writes the page: one HTML file that contains everything it needs and loads nothing from the network."""
 
 import base64
+import gzip
 import json
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -33,6 +34,7 @@ _FILES = [
     "ruler.js",
     "viewer.js",
     "pictures.js",
+    "live.js",
     "splat.vert.glsl",
     "splat.frag.glsl",
     "screen.vert.glsl",
@@ -74,10 +76,19 @@ def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -
     return packed.left_out
 
 
+def live_html(content: PageContent) -> bytes:
+    """A page with the viewer alone, without a splat: it asks the server that it came from, see kgs/app/live_server.py.
+
+    Cameras and lenses are those of `content`, whose Gaussians only say where the scene is.
+    """
+    no_splat = Packed({"count": 0, "degree": 0, "columns": []}, gzip.compress(b""))
+    return _Page(content, "live.html.jinja").html(no_splat)
+
+
 class _Page:
     """Makes the HTML of a page, first without its splat, which is packed into what the rest leaves."""
 
-    def __init__(self, content: PageContent) -> None:
+    def __init__(self, content: PageContent, template: str = "page.html.jinja") -> None:
         import jinja2
 
         runs = list(content.text.runs.values())
@@ -94,7 +105,7 @@ class _Page:
         self._context = _context(content, self._scene)
         loader = jinja2.PackageLoader("kgs.app.page", ".")
         environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
-        self._template = environment.get_template("page.html.jinja")
+        self._template = environment.get_template(template)
 
     def html(self, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
         """The whole file.
