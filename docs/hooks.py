@@ -15,6 +15,7 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).parents[1]
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 PACKAGES = {"kgs": "kgs", "losses": "kgs/losses", "datasets": "kgs/datasets"}
+FRAME = '<iframe src="banana.html" title="The page of a fit" loading="lazy"></iframe>'
 _installed = tempfile.TemporaryDirectory()
 
 
@@ -47,7 +48,9 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Gives the wide tables of results the whole width, and links to notebooks their place on the site."""
+    """Gives the wide tables of results the whole width, links to notebooks their place on the site, and shows a page."""
+    if page.file.src_uri == "index.md":
+        markdown = re.sub(r"!\[the page of a fit\]\(page\.jpg\)", FRAME, markdown)
     if page.file.src_uri.startswith("results/"):
         page.meta["hide"] = ["toc"]
     return markdown.replace("](../notebooks/", "](notebooks/").replace("](../README.md", "](index.md")
