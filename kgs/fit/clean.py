@@ -24,6 +24,7 @@ from kgs.progress import Stage, silent
 from kgs.renderer import GaussianRenderer
 
 from .fit import Fit
+from .prune import training_levels
 
 KINDS = ("giants", "needles", "floaters")
 MAX_STRENGTH = 100.0
@@ -169,7 +170,7 @@ def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
         raise ValueError("fit: expected a scene with its photos, got one that was loaded without them")
     cameras = [views.camera(i) for i in range(len(views))]
     strays = find_strays(fit.model, strength, views.cameras, [fit.median_depth(camera) for camera in cameras])
-    before = _levels(fit)
+    before = training_levels(fit)
     candidates = strays.any.nonzero()[:, 0]
     order = candidates[_changes(fit, strays.any, stage).argsort()]
     cleaned = fit
@@ -181,7 +182,7 @@ def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
         rows = torch.ones_like(strays.any)
         rows[order[:count]] = False
         part = replace(fit, model=fit.model.select(rows))
-        levels = _levels(part)
+        levels = training_levels(part)
         if all(old - new <= TOLERANCE * strength for old, new in zip(before, levels, strict=True)):
             cleaned = part
             after = levels
@@ -256,19 +257,12 @@ def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float
     return near
 
 
-def _levels(fit: Fit) -> list[float]:
-    """The PSNR of each training view."""
-    views = fit.scene.train
-    return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
-
-
 def _changes(fit: Fit, rows: Tensor, stage: Stage) -> Tensor:
     """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
 
     The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
-    the view. An image is affine in the opacity of one Gaussian, so its change is the gradient by a
-    factor of that opacity; sums of the gradients times random signs, squared, are the sums of their squares in the
-    mean.
+    the view. An image is affine in the opacity of one Gaussian, so its change is the gradient by a factor of that
+    opacity; sums of the gradients times random signs, squared, are the sums of their squares in the mean.
     """
     views = fit.scene.train
     renderer = GaussianRenderer(options=fit.options, backend=fit.backend).eval()

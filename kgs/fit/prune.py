@@ -39,11 +39,11 @@ def prune(fit: Fit) -> Fit:
         max_bytes=fit.options.max_bytes,
         backend=fit.backend,
     )
-    levels = _levels(fit)
+    levels = training_levels(fit)
     for limit in WEIGHTS:
         rows = weights > limit
         pruned = _part(fit, rows, model.sh_degree)
-        if _is_close(_levels(pruned), levels):
+        if _is_close(training_levels(pruned), levels):
             break
     pruned = _with_fewest_harmonics(fit, pruned, levels)
     record = {
@@ -73,7 +73,7 @@ def _with_fewest_harmonics(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
         lower = _part(fit, rows, degree)
         renders = map(lower.render, cameras)
         same = all(bool(((now - before).abs() <= QUANTUM).all()) for now, before in zip(renders, images, strict=True))
-        if same and _is_close(_levels(lower), levels):
+        if same and _is_close(training_levels(lower), levels):
             break
     return lower
 
@@ -82,8 +82,8 @@ def _is_close(levels: list[float], others: list[float]) -> bool:
     return all(abs(level - other) <= TOLERANCE for level, other in zip(levels, others, strict=True))
 
 
-def _levels(fit: Fit) -> list[float]:
-    """The PSNR of each training view."""
+def training_levels(fit: Fit) -> list[float]:
+    """The PSNR of each training view in dB; `kgs.metrics.evaluate.BEST` stands for infinity."""
     views = fit.scene.train
     return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
 
