@@ -93,7 +93,7 @@ def _solve(weights: Tensor, logs: Tensor) -> Tensor:
     own = torch.diag(weights.sum(0) + PRIOR)
     matrix = own - weights.T @ (weights / totals) + 1 / count
     right = (weights * logs).sum(0) - (weights / totals).T @ (weights * logs).sum(1)
-    found = torch.linalg.solve(matrix, right)
+    found: Tensor = torch.linalg.solve(matrix, right)
     return found - found.mean()
 
 
