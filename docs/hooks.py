@@ -48,7 +48,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Gives the wide tables of results the whole width, links to notebooks their place on the site, and shows a page."""
+    """Gives wide tables of results the whole width and links to notebooks their place; the first page has a viewer."""
     if page.file.src_uri == "index.md":
         markdown = re.sub(r"!\[the page of a fit\]\(page\.jpg\)", FRAME, markdown)
     if page.file.src_uri.startswith("results/"):
