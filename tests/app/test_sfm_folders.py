@@ -12,7 +12,7 @@ import torch
 from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
-from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
+from photo_folders import close, planes, write_photos, write_planes
 
 from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import writing
@@ -133,13 +133,6 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
     said = " ".join(notes_on(folder))
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         assert name in said
-
-
-def test_photos_of_several_lenses(folder, refused):
-    for i, (image, film) in enumerate(zip(planes(), (26, 26, 13), strict=True)):
-        jpeg = cv2.imencode(".jpg", image)[1].tobytes()
-        (folder / f"{i}.jpg").write_bytes(with_exif(jpeg, exif(film=film)))
-    refused(folder, "one focal length, got 2", "13 mm: 2.jpg", "26 mm: 0.jpg, 1.jpg", "without zoom")
 
 
 @pytest.mark.slow
