@@ -98,6 +98,7 @@ def test_groups_links_and_the_table():
     assert groups_of(NAMES, PAIRS) == [["a", "b", "c"]]
     assert groups_of(NAMES, PAIRS | {("a", "c"): 29, ("b", "c"): 29}) == [["a", "b"], ["c"]]
     assert weakest_link(NAMES, PAIRS) == ("b", "c")
+    assert weakest_link(NAMES, PAIRS | {("a", "left out"): 300}) == ("b", "c")
     assert [line.split() for line in table(NAMES, PAIRS).splitlines()[2:]] == [
         ["1", "a", ".", "200", "40"],
         ["2", "b", "200", ".", "90"],

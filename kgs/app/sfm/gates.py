@@ -147,10 +147,14 @@ def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
 
 
 def weakest_link(names: Sequence[str], pairs: Pairs) -> tuple[str, str]:
-    """The pair with the fewest matches among those that hold the photos together (a maximum spanning tree)."""
+    """The pair with the fewest matches among those that hold the photos together (a maximum spanning tree).
+
+    `pairs` may have photos besides those in `names`.
+    """
     group = {name: {name} for name in names}
     weakest = (names[0], names[1])
-    for pair in sorted(pairs, key=lambda pair: -pairs[pair]):
+    inside = [pair for pair in pairs if set(pair) <= group.keys()]
+    for pair in sorted(inside, key=lambda pair: -pairs[pair]):
         if group[pair[0]] is not group[pair[1]]:
             weakest = pair
             joined = group[pair[0]] | group[pair[1]]
