@@ -121,7 +121,8 @@ class FitConfig:
             auto: where photos differ by a factor of 1.3 or more, and gains explain it. each: always. same: never.
         refine_poses: optimise the poses of the training cameras too. It helps if they are half a degree or more off;
             accurate poses get slightly worse. The mean and the spread of the poses stay, and so do test cameras.
-        coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1].
+        coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1]. Unless
+            given: 0, and half of them for unposed photos at the size that kgs fit chooses.
         seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
         init: kind of initial points. dense: points of depth maps, made from the training images by a plane sweep in
             some seconds per view. sift: points of matched keypoints. random: random points in the space that at least
@@ -156,7 +157,7 @@ class FitConfig:
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
     exposure: Literal["auto", "each", "same"] = "auto"
     refine_poses: bool = False
-    coarse: _Share = 0.0
+    coarse: Annotated[float | None, _Range(0, 1)] = None
     seed: Annotated[int, _Range(-(2**59), 2**59, "()")] = 0  # ten times a seed has to fit torch's 64 bits
     init: Literal["dense", "sift", "random", "scene", "model-points", "file"] = "dense"
     init_file: Path | None = None
@@ -225,6 +226,7 @@ PAPER = FitConfig(
     undropped_steps=0,
     sh_degree=3,
     exposure="same",
+    coarse=0.0,
     init_points=10_000,
     draw="uniform",
     training_background="scene",
@@ -251,13 +253,14 @@ class Detail(NamedTuple):
     entries: dict[str, Any]
 
 
-# low: fewer steps, a third of them on a quarter of the pixels, and fewer points. high: four times the pixels, of which
-# half of the steps use a quarter. docs/recipe.md says what each gains and costs.
+# low: fewer steps, a third of them on a quarter of the pixels, and fewer points. high: more pixels and points; half of
+# the steps use a quarter of the pixels. docs/recipe.md says what each gains and costs.
 DETAILS = {
     "low": Detail(378, {"steps": 700, "coarse": 0.3, "init_points": 12_000}),
-    "normal": Detail(504, {}),
+    "normal": Detail(800, {}),
     "high": Detail(1000, {"coarse": 0.5, "init_points": 80_000}),
 }
+COARSE = 0.5  # of unposed photos at the size of normal detail
 # A fit, its page and its film within a minute on two cores.
 DEMO_STEPS = 350
 DEMO = FitConfig(steps=DEMO_STEPS, coarse=0.3, init_points=12_000, max_gaussians=16_000, evaluations=4)

@@ -92,7 +92,7 @@ def with_pace(config: FitConfig, views: int) -> FitConfig:
     if recipe.opacity_decay is None:
         pace = FEW if few and steps <= FADING_STEPS else MANY
         recipe = replace(recipe, opacity_decay=pace.opacity_decay)
-    return replace(config, steps=steps, recipe=recipe)
+    return replace(config, steps=steps, coarse=config.coarse or 0.0, recipe=recipe)
 
 
 def timetable(config: FitConfig) -> Timetable:
@@ -116,7 +116,7 @@ def timetable(config: FitConfig) -> Timetable:
         reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
         drop=steps - min(config.undropped_steps, round(0.1 * steps)),
-        coarse=round(config.coarse * steps),
+        coarse=round((config.coarse or 0.0) * steps),
     )
 
 

@@ -14,6 +14,8 @@ from kgs.app.files.outputs import write_png
 from kgs.app.files.ownership import writing
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
+from kgs.errors import DataError
+from kgs.fit.config import COARSE, DETAILS
 from kgs.json_files import write_json
 
 SIZE = (72, 96)
@@ -94,6 +96,27 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     assert run("fit", tmp_path / "photos4", "-o", out, *FIT) == 0  # again, in the folder that it made
     out.rename(tmp_path / "moved")
     assert run("eval", tmp_path / "moved") == 0
+
+
+def test_half_of_the_steps_are_coarse_at_the_size_that_the_command_chooses(folder, tmp_path, monkeypatch):
+    seen = []
+
+    def fit_folder(scene, config, *args, **kwargs):
+        seen.append(config.coarse)
+        raise DataError(tmp_path, "", "enough")
+
+    monkeypatch.setattr("kgs.app.fit_folder.fit_folder", fit_folder)
+    photos = folder(4)
+    cases = [
+        ([], COARSE),
+        (["--coarse", 0], 0.0),
+        (["--size", 48], None),
+        (["--detail", "low"], DETAILS["low"].entries["coarse"]),
+        (["--preset", "paper"], 0.0),
+    ]
+    for options, _ in cases:
+        assert run("fit", photos, "-o", tmp_path / "out", *options) == 2
+    assert seen == [coarse for _, coarse in cases]
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def test_more_than_three_views_take_more_steps_and_fade_more_slowly(views, steps
     config = with_pace(FitConfig(), views)
     assert (config.steps, config.recipe.opacity_decay) == (steps, 0.9925 if views <= 3 else 0.995)
     assert with_pace(FitConfig(steps=1001), views).recipe.opacity_decay == 0.995
-    given = FitConfig(steps=7, recipe=Recipe(opacity_decay=0.5))
+    given = FitConfig(steps=7, coarse=0.0, recipe=Recipe(opacity_decay=0.5))
     assert with_pace(given, views) == given
 
 
@@ -105,6 +105,7 @@ def test_numpys_numbers_and_paths_as_text_become_pythons():
 
 def test_the_coarse_share_is_counted_in_steps():
     assert timetable(FitConfig(steps=2000)).coarse == 0
+    assert with_pace(FitConfig(), 6).coarse == 0
     assert timetable(FitConfig(steps=1000, coarse=0.5)).coarse == 500
 
 

@@ -11,7 +11,7 @@ import tyro
 
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.errors import DataError, printable
-from kgs.fit.config import DETAILS, PRESETS, Background, FitConfig
+from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig
 
 from .options import Existing, Out
 
@@ -66,7 +66,7 @@ def fit(
         views: number of training views, spread over those that are not held out. Unless given: all of them.
         hold_out: every Nth photo is held out for testing; 0: none. Unless given: what the files say, or every eighth;
             unposed: none.
-        size: reduce the photos to this many pixels on their longer side. Unless given: 504 for unposed photos on a CPU,
+        size: reduce the photos to this many pixels on their longer side. Unless given: 800 for unposed photos on a CPU,
             else their own size. Or field: that of published tables. Or a folder of photos in several sizes, as
             images_4.
         downscale: reduce the photos by this factor instead.
@@ -123,6 +123,8 @@ def fit(
     stages = Stages(say, unposed)
     if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
+        if config.coarse is None:
+            config = replace(config, coarse=COARSE)
     if preset == "paper" and size is None and downscale is None and not unposed:
         size = "field"
     if unposed:
