@@ -6,7 +6,7 @@ each channel. The logarithms of the factors, with a mean of zero over the photos
 
     log color(patch, view) = log color(patch) + log gain(view)
 
-over all patches and views, weighted anew against outliers.
+over all patches and views, reweighted against outliers.
 
 A fit with gains shows the scene in the mean exposure. Held-out photos have others, so that their PSNR falls even where
 it rises after an affine fit of colours; and shading, reflections and noise give gains, too. Unless they are asked for,

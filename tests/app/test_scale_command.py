@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from command import one_line, run
-from factories import random_gaussians
+from factories import as_model, random_gaussians
 
 import kgs
 from kgs.app.files.ownership import is_own
@@ -79,14 +79,7 @@ def test_the_page_is_scaled_too_and_says_so(fitted: Path, metres: Path) -> None:
 def test_a_splat_far_from_the_origin_keeps_its_digits(tmp_path: Path) -> None:
     """In map coordinates, where float32 would hold steps of half a metre."""
     gaussians = random_gaussians(50, 0, torch.float32, sh_degree=1)
-    model = kgs.GaussianModel(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales.log(),
-        gaussians.opacities.logit(),
-        gaussians.colors[:, :1],
-        gaussians.colors[:, 1:],
-    )
+    model = as_model(gaussians)
     far = torch.tensor([4e6, -5e6, 300.0], dtype=torch.float64)
     kgs.save_ply(tmp_path / "a.ply", model, offset=far)
     a, b = "4000000,-5000000,300", "4000000,-5000003,304"

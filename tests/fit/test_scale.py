@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from factories import random_gaussians, random_views
+from factories import as_model, random_gaussians, random_views
 
-import kgs
 from kgs.datasets import Scene
 from kgs.fit.fit import Fit
 from kgs.fit.scale import scaled, scaled_model
@@ -22,14 +21,7 @@ FACTORS = (0.01, 3.7, 1000.0)
 def fit(tmp_path: Any) -> Fit:
     """Gaussians with harmonics before cameras of a scene whose origin is far away, some before the near plane."""
     gaussians = random_gaussians(300, 0, torch.float32, sh_degree=2)
-    model = kgs.GaussianModel(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales.log(),
-        gaussians.opacities.logit(),
-        gaussians.colors[:, :1],
-        gaussians.colors[:, 1:],
-    )
+    model = as_model(gaussians)
     views = random_views(3, 30, 40)
     offset = torch.tensor([10.0, -20.0, 5.0], dtype=torch.float64)
     scene = Scene(

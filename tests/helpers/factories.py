@@ -18,6 +18,7 @@ from kgs.datasets import Views
 
 __all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
 __all__ += [
+    "as_model",
     "other_defaults",
     "pinhole",
     "posed",
@@ -131,6 +132,18 @@ def posed(
 
 
 # -- Gaussians -----------------------------------------------------------------------------------------------------
+
+
+def as_model(gaussians: Gaussians) -> GaussianModel:
+    """A model of Gaussians that have harmonics."""
+    return GaussianModel(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales.log(),
+        gaussians.opacities.logit(),
+        gaussians.colors[:, :1],
+        gaussians.colors[:, 1:],
+    )
 
 
 def random_gaussians(

@@ -121,7 +121,7 @@ def fit(
     unposed = is_unposed(scene)
     is_free = size is None and downscale is None  # the size follows from --detail
     stages = Stages(say, unposed)
-    if size is None and downscale is None and (detail != "normal" or (unposed and config.device == "cpu")):
+    if is_free and (detail != "normal" or (unposed and config.device == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
             config = replace(config, coarse=COARSE)

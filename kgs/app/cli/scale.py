@@ -92,7 +92,7 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
     from kgs.app.files.outputs import NOT_OWN, check_folder
     from kgs.app.files.ownership import is_own, read_list
 
-    from .checks import check_installed
+    from .checks import check_installed, check_results
 
     a, b, length = by
     if not (math.isfinite(length) and length > 0):
@@ -102,8 +102,7 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
         raise ValueError(f"by: expected two points that can be {length:g} apart, got {a} and {b}")
     if splat.is_dir():
         check_installed("cpu", "auto", "jinja2", "safetensors")
-        if not (splat / "config.json").exists():
-            raise DataError(splat / "config.json", "", "cannot be read: expected the folder of the results of kgs fit")
+        check_results(splat)
         check_folder(out, _FILES, make=False)
         if "fit" in read_list(out):
             raise DataError(out, "", "holds the results of kgs fit: choose another folder")
