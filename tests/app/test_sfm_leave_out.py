@@ -100,10 +100,11 @@ def folder_of(folder: Path, images, films=None) -> list[Path]:
 def test_copies_and_photos_of_another_shape(tmp_path):
     whole = list(planes())
     images = [*whole, whole[1], whole[0][:120], 255 - whole[2]]
-    left = unlike_others(open_photos(folder_of(tmp_path, images, films=[26, 26, 26, 26, 26, 13])))
+    left = unlike_others(open_photos(folder_of(tmp_path, images, films=[26, 26, 26, 26, 0, 13])))
     assert left.keys() == {"3.jpg", "4.jpg"}
     assert "same photo as 1.jpg" in left["3.jpg"]
     assert "240x120, not 240x180" in left["4.jpg"]
+    assert unlike_others(open_photos(folder_of(tmp_path, images, films=[26] * 6))).keys() == {"3.jpg"}
 
 
 def test_each_focal_length_of_the_exif_is_a_lens(tmp_path):
@@ -113,6 +114,53 @@ def test_each_focal_length_of_the_exif_is_a_lens(tmp_path):
     assert [photo.lens for photo in photos] == [1, 0, 0, 0, 0]
     focal = 26 / np.hypot(36, 24) * np.hypot(240, 180)
     assert [lens.focal_length for lens in lenses_of(photos)] == pytest.approx([focal, focal / 2])
+
+
+def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
+    """With a lens and a mask of its own, upright or lying, reduced or not."""
+    whole = list(planes())
+    high = np.ascontiguousarray(np.rot90(whole[2][30:150]))
+    images = [*whole, whole[0][:, 30:210], whole[1][30:150], high, cv2.resize(whole[2][:90], (720, 270))]
+    films = [26, 26, 0, 26, 26, 26, 26]
+    paths = folder_of(tmp_path, images, films)
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((120, 240), np.uint8)
+    mask[:, :120] = 255
+    cv2.imwrite(str(tmp_path / "masks" / "4.png"), mask)
+    photos = read_photos(open_photos(paths, tmp_path / "masks"), silent)
+    assert [photo.size for photo in photos] == [photos[0].size] * 7
+    assert [photo.whole is None for photo in photos] == [True] * 3 + [False] * 4
+    assert len({photo.lens for photo in photos[:3]}) == 1
+    assert len({photo.lens for photo in photos}) == 4  # 240x120 is there upright and lying
+    width, height = photos[0].size
+    scale = height / 120
+    grey = cv2.cvtColor(cv2.imread(str(paths[4])), cv2.COLOR_BGR2GRAY)
+    middle = cv2.resize(grey[:, 40:200], (width, height), interpolation=cv2.INTER_AREA)
+    assert np.abs(photos[4].grey().astype(int) - middle).max() <= 2
+    assert np.abs(photos[5].pixels.astype(int) - np.rot90(photos[5].upright().pixels, -1)).max() == 0
+    assert (photos[4].mask[:, : width // 2] == 255).all()
+    assert (photos[4].mask[:, width // 2 + 1 :] == 0).all()
+    assert photos[4].focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(240, 120) * scale)
+    assert photos[5].focal == pytest.approx(photos[4].focal)
+
+
+def test_a_wide_photo_beside_others_is_placed(tmp_path):
+    """A third of its height is missing: the cameras are those of the whole photos."""
+    pytest.importorskip("pycolmap")
+    whole = list(planes())
+    report = {}
+    for name, images in (("whole", whole), ("wide", [whole[0], whole[1][22:158], whole[2]])):
+        (tmp_path / name).mkdir()
+        folder_of(tmp_path / name, images, films=[30, 32 if name == "wide" else 30, 30])
+        lines = []
+        report[name] = pose_photos(tmp_path / name, tmp_path / f"out-{name}", say=lines.append)
+    assert any(line.startswith("1.jpg: only its middle") for line in lines)
+    assert report["wide"]["left_out"] == {}
+    focals = [photo["focal_px"] for photo in report["wide"]["photos"].values()]
+    assert focals[1] / focals[0] == pytest.approx(180 / 136, rel=0.03)
+    loaded = {name: load_scene(tmp_path / f"out-{name}", hold_out=0).train.cameras.extrinsics for name in report}
+    turns = [poses[1, :3, :3] @ poses[0, :3, :3].T for poses in loaded.values()]
+    assert float(degrees_between(*turns)) < 0.5
 
 
 def test_a_zoomed_photo_gets_a_lens_of_its_own(tmp_path):

@@ -1,7 +1,7 @@
 """Decides which photos are left out, so that one unsuitable photo does not stop the others.
 
-A photo is left out if it is a copy, or of another shape than most; if it shows another place, or the same from the same
-place as another one; or if its camera cannot be trusted: each solver has to place it, it has to see enough points, and
+A photo is left out if it is a copy, or of another shape than most and no Exif says its focal length; if it shows another
+place, or the same from the same place as another one; or if its camera cannot be trusted: each solver has to place it, it has to see enough points, and
 both have to agree about it and its lens. At least three photos remain, or nothing is left out and the gates refuse all.
 """
 
@@ -17,7 +17,7 @@ from .read import OpenPhoto, by_shape
 
 
 def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
-    """Photos that are copies, or of another shape than most, and why.
+    """Photos that are copies, or of another shape than most without a focal length in their Exif, and why.
 
     Raises:
         DataError: most photos are panoramas, there are fewer than `FEWEST` without copies, or no shape is that of most.
@@ -42,19 +42,24 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
         reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
         raise DataError(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
     return left | {
-        photo.name: f"its shape is {name}, not {usual}: it is cropped, or by another camera"
-        for name, group in shapes.items()
-        if name != usual
-        for photo in group
+        photo.name: f"its shape is {name}, not {usual}, and no Exif says its focal length: is it cropped?"
+        for photo, name in _of_unknown_lens(shapes, usual)
     }
 
 
 def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
-    """The largest group if it has at least `FEWEST` photos, or is the only one, and is larger than any other."""
+    """The largest group, or None if others would be left out, and it has too few photos or no more than another one."""
+    usual = max(groups, key=lambda name: len(groups[name]))
     sizes = sorted((len(group) for group in groups.values()), reverse=True)
-    if len(sizes) > 1 and (sizes[0] < FEWEST or sizes[0] == sizes[1]):
+    if _of_unknown_lens(groups, usual) and (sizes[0] < FEWEST or sizes[0] == sizes[1]):
         return None
-    return max(groups, key=lambda name: len(groups[name]))
+    return usual
+
+
+def _of_unknown_lens(groups: Mapping[str, list[OpenPhoto]], usual: str) -> list[tuple[OpenPhoto, str]]:
+    """The photos of other groups, and the name of each one's group, whose Exif says no focal length."""
+    others = [(photo, name) for name, group in groups.items() for photo in group if name != usual]
+    return [(photo, name) for photo, name in others if not photo.focal_ratio]
 
 
 def _listed(groups: Mapping[str, list[OpenPhoto]]) -> str:

@@ -35,7 +35,7 @@ from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_ph
 from .video import take_frames
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 
-SETTINGS = 6  # increased by every change after which the same photos give other files
+SETTINGS = 7  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
@@ -61,7 +61,8 @@ def pose_photos(
         -y: the cameras' common up. The median depth of a point in the photos that see it is 1.
 
     Args:
-        folder: at least 3 photos of one scene and one shape. Folders in it are not looked into. Or a video, or a folder
+        folder: at least 3 photos of one scene. Of those of a rarer shape the middle is taken if their Exif says a focal
+            length, else they are left out. Folders in it are not looked into. Or a video, or a folder
             with one and without photos.
         out: the folder for the results, created if it does not exist.
         masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one. What
@@ -160,6 +161,9 @@ def find_cameras(
         path.mkdir(parents=True)
     with _one_thread(), report_full_disk(new):
         photos = read_photos(opened, stage)
+        for photo in photos:
+            if photo.whole:
+                say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
         unsharp = [photo.name for photo in blurred(photos)]
         if unsharp:
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")

@@ -1,7 +1,7 @@
 """Reads photos as a phone wrote them: decoded, turned upright, reduced to one size, with what Exif says of the lens.
 
 Upright and lying photos are one lens's: for the solvers, those of the rarer kind lie on their side. Photos whose focal
-length differs, by a zoom or another phone, are of a lens of their own.
+length differs, by a zoom or another phone, are of a lens of their own. Of photos of a rarer shape the middle is taken.
 """
 
 import hashlib
@@ -129,6 +129,7 @@ class Photo:
     mask: NDArray[np.uint8] | None = None  # `(H, W)`, 255 where the photo is kept, 0 elsewhere; None: all is
     is_turned: bool = False  # whether it is upright only after a quarter turn counterclockwise
     lens: int = 0  # the number of its lens; 0 took most photos
+    whole: tuple[int, int] | None = None  # width and height of all of it, as `size`, where its sides are cut off
 
     @property
     def name(self) -> str:
@@ -144,8 +145,9 @@ class Photo:
     @property
     def focal(self) -> float | None:
         """The focal length in pixels that Exif gives, None if it does not."""
-        ratio = self.exif.focal_ratio(*(self.size[::-1] if self.is_turned else self.size))
-        return ratio * max(self.size) if ratio else None
+        width, height = self.whole or self.size
+        ratio = self.exif.focal_ratio(*((height, width) if self.is_turned else (width, height)))
+        return ratio * max(width, height) if ratio else None
 
     def upright(self) -> Self:
         """The photo as it is looked at."""
@@ -195,39 +197,68 @@ def _open(path: Path, mask: Mask | None) -> OpenPhoto:
 def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     """Decode photos, turn them as their Exif says, and reduce them to the size of the smallest or to 1600 pixels.
 
-    The photos have one shape, or that and its upright or lying counterpart; of these two the rarer is turned.
+    All get the shape of most, or that and its upright or lying counterpart; of these two the rarer is turned. Of photos
+    of another shape the middle is taken, so that the lens stays centred.
 
     Raises:
         DataError: a photo cannot be decoded.
     """
     lying = [photo.size[0] > photo.size[1] for photo in opened]
     most_lie = 2 * sum(lying) >= len(opened)
-    width, height = min(sorted(photo.size, reverse=most_lie) for photo in opened)
+    usual = max(by_shape(opened).values(), key=len)[0].size
+    parts = {photo.name: _middle(photo.size, usual) for photo in opened}
+    width, height = min(sorted(part, reverse=most_lie) for part in parts.values())
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     lenses = _lens_numbers(opened)
     photos = []
     for photo in stage(opened, "photos", "photo"):
         pixels = photo.image.read()
-        is_turned = (photo.size[0] > photo.size[1]) != most_lie and width != height
-        upright_size = size[::-1] if is_turned else size
-        stored = upright_size[::-1] if photo.exif.is_sideways else upright_size
+        lies = photo.size[0] > photo.size[1]
+        is_turned = lies != most_lie and photo.size[0] != photo.size[1] and width != height
+        part = size[::-1] if is_turned else size
+        whole = _larger(part, photo.size, parts[photo.name])
+        stored = whole[::-1] if photo.exif.is_sideways else whole
         if pixels.shape[1::-1] != stored:
             pixels = np.asarray(cv2.resize(pixels, stored, interpolation=cv2.INTER_AREA), np.float32)
         upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
-        mask = _mask(photo, upright_size)
+        mask = _mask(photo, whole)
         quarters = -1 if is_turned else 0  # clockwise
         photos.append(
             Photo(
                 photo.path,
                 photo.exif,
-                np.ascontiguousarray(np.rot90(upright, quarters)),
-                None if mask is None else np.ascontiguousarray(np.rot90(mask, quarters)),
+                np.ascontiguousarray(np.rot90(_cut(upright, part), quarters)),
+                None if mask is None else np.ascontiguousarray(np.rot90(_cut(mask, part), quarters)),
                 is_turned,
                 lenses[photo.name],
+                None if whole == part else whole[::-1] if is_turned else whole,
             )
         )
     return photos
+
+
+def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of the largest part of an image that has this shape, or its upright or lying counterpart."""
+    if _same_shape(size, shape):
+        return size
+    width, height = size
+    long, short = max(shape), min(shape)
+    ratio = long / short if width > height else short / long
+    return min(width, round(height * ratio)), min(height, round(width / ratio))
+
+
+def _larger(part: tuple[int, int], size: tuple[int, int], middle: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of an image of which `part` is what `middle` is of `size`."""
+    return round(part[0] * size[0] / middle[0]), round(part[1] * size[1] / middle[1])
+
+
+def _cut(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """The middle of an image."""
+    height, width = image.shape[:2]
+    left = (width - size[0]) // 2
+    top = (height - size[1]) // 2
+    return image[top : top + size[1], left : left + size[0]]
 
 
 def _mask(photo: OpenPhoto, size: tuple[int, int]) -> NDArray[np.uint8] | None:
@@ -267,10 +298,18 @@ def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
 
 
 def _lens_numbers(photos: list[OpenPhoto]) -> dict[str, int]:
-    """The number of each photo's lens by its name; 0 took most, and those whose Exif says no focal length."""
-    numbers = dict.fromkeys((photo.name for photo in photos), 0)
-    groups = sorted(by_lens(photos).values(), key=len, reverse=True)
-    return numbers | {photo.name: number for number, group in enumerate(groups) for photo in group}
+    """The number of each photo's lens by its name; 0 took most.
+
+    Photos of each shape have lenses of their own, one for each focal length of the Exif. The first of them took also
+    those whose Exif says none.
+    """
+    lenses = list[list[OpenPhoto]]()
+    for group in by_shape(photos).values():
+        unknown = [photo for photo in group if not photo.focal_ratio]
+        first, *others = sorted(by_lens(group).values(), key=len, reverse=True) or [[]]
+        lenses += [[*first, *unknown], *others]
+    lenses.sort(key=len, reverse=True)
+    return {photo.name: number for number, lens in enumerate(lenses) for photo in lens}
 
 
 def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
