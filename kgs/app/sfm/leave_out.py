@@ -1,8 +1,9 @@
 """Decides which photos are left out, so that one unsuitable photo does not stop the others.
 
-A photo is left out if it is a copy, or of another shape than most and no Exif says its focal length; if it shows another
-place, or the same from the same place as another one; or if its camera cannot be trusted: each solver has to place it, it has to see enough points, and
-both have to agree about it and its lens. At least three photos remain, or nothing is left out and the gates refuse all.
+A photo is left out if it is a copy, or of another shape than most while no Exif says its focal length; if it shows
+another place, or the same from the same place as another one; or if its camera cannot be trusted: each solver has to
+place it, it has to see enough points, and both have to agree about it and its lens. At least three photos remain, or
+nothing is left out and the gates refuse all.
 """
 
 from collections.abc import Mapping, Sequence
