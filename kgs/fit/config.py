@@ -37,6 +37,8 @@ _Share = Annotated[float, _Range(0, 1)]
 Backend = Literal["auto", "torch", "numba", "triton"]
 Background = Literal["black", "white"]
 
+DROP = 0.3  # final rate of dropping where few photos show each place
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -107,12 +109,14 @@ class FitConfig:
     """The settings of one fit. NumPy's numbers are accepted and become Python's.
 
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
-    last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0.
+    last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0, a
+    `drop` of None as 0.3.
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
             views, 1100 for more.
-        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out.
+        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3, or 0 if a place is shown
+            by more than 6.5 photos in the mean.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3
@@ -151,7 +155,7 @@ class FitConfig:
     """
 
     steps: Annotated[int | None, _Range(1, 10_000_000)] = None
-    drop: Annotated[float, _Range(0, 1, "[)")] = 0.3
+    drop: Annotated[float | None, _Range(0, 1, "[)")] = None
     drop_schedule: Literal["linear", "constant"] = "linear"
     undropped_steps: _Count = 50
     sh_degree: Annotated[int | None, _Range(0, 3)] = None

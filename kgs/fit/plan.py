@@ -44,8 +44,8 @@ class Plan:
     """What is settled before a fit begins; :func:`make_plan` makes it.
 
     Args:
-        config: the settings, with numbers for the scene where they were left open. A `sh_degree` of None counts as 0;
-            :func:`kgs.fit.view_dependence.decide` replaces it.
+        config: the settings, with numbers for the scene where they were left open. A `sh_degree` of None counts as 0, a
+            `drop` of None as 0.3; :func:`kgs.fit.run.decide` replaces both.
         device: of the fit.
         backend: "numba", "triton" or "torch".
         times: the steps at which things happen.
@@ -65,7 +65,7 @@ class Plan:
 
 
 def make_plan(scene: Scene, config: FitConfig) -> Plan:
-    """Settle what the configuration leaves open, but for the degree of the harmonics.
+    """Settle what the configuration leaves open, but for the degree of the harmonics and the rate of dropping.
 
     Args:
         scene: the scene to fit.

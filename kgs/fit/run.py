@@ -11,6 +11,7 @@ from kgs.progress import Stage, silent
 from .config import FitConfig
 from .exposure import decide_exposure
 from .fit import Fit
+from .overlap import decide_drop
 from .plan import Plan, make_plan
 from .prune import prune
 from .trainer import Trainer
@@ -37,8 +38,8 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = s
 
 
 def decide(plan: Plan, points: InitialPoints) -> Plan:
-    """Decide what the photos tell before a fit: the degree of harmonics, and whether exposures differ."""
-    return decide_exposure(decide_degree(plan, points), points)
+    """Decide what the photos tell before a fit: the degree of harmonics, whether to drop, whether exposures differ."""
+    return decide_exposure(decide_drop(decide_degree(plan, points), points), points)
 
 
 def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:

@@ -20,7 +20,7 @@ from kgs.json_files import is_number
 from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam
-from .config import FitConfig
+from .config import DROP, FitConfig
 from .plan import Plan, most_gaussians
 from .poses import MovingPoses
 
@@ -109,8 +109,9 @@ class TrainState:
         ]
         optimizer = Adam(groups, eps=recipe.adam_eps)
         drop = None
-        if config.drop:
-            drop = DropGaussian(config.drop, config.drop_schedule, seed=seed + 1, device=plan.device)
+        rate = DROP if config.drop is None else config.drop
+        if rate:
+            drop = DropGaussian(rate, config.drop_schedule, seed=seed + 1, device=plan.device)
         densifier = Densifier(
             model,
             optimizer,

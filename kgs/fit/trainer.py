@@ -247,8 +247,9 @@ class Trainer:
         """
         values, damage = newest_checkpoint(Path(path))
         try:
-            if config.sh_degree is None:
-                config = replace(config, sh_degree=values["config"]["sh_degree"])
+            for name in ("sh_degree", "drop"):
+                if getattr(config, name) is None:
+                    config = replace(config, **{name: values["config"][name]})
             if config.recipe.opacity_decay is None:  # more steps may have another
                 decay = values["config"]["recipe"]["opacity_decay"]
                 config = replace(config, recipe=replace(config.recipe, opacity_decay=decay))

@@ -21,7 +21,7 @@ import kgs.app.cli.run
 from kgs.app import cli
 from kgs.app.files.outputs import FILMS
 from kgs.app.files.results_folder import RESULTS
-from kgs.fit.config import DETAILS, PAPER, FitConfig
+from kgs.fit.config import DETAILS, DROP, PAPER, FitConfig
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
@@ -64,7 +64,7 @@ def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitte
     assert metrics["test"]["lpips_vgg"] is None
     assert set(metrics["curve"][-1]) == {"step", "seconds", "test_psnr", "train_psnr"}
     assert metrics["curve"][-1]["test_psnr"] == pytest.approx(metrics["test"]["psnr"], abs=1e-2)  # before pruning
-    assert (metrics["steps"], metrics["drop"]) == (STEPS, FitConfig().drop)
+    assert (metrics["steps"], metrics["drop"]) == (STEPS, DROP)
     assert metrics["init"] == {"kind": "random", "points": 10_000}
     model = kgs.load_ply(fitted / "splat.ply")
     assert len(model) == metrics["gaussians"]
@@ -187,7 +187,7 @@ def test_demo_compares_at_equal_starts(tmp_path, capsys):
     assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40, "--compare") == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
     assert set(runs) == {"without", "with"}
-    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, FitConfig().drop)
+    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, DROP)
     assert runs["without"]["init"] == runs["with"]["init"]
     gain = runs["with"]["test"]["psnr"] - runs["without"]["test"]["psnr"]
     assert f"{gain:+.2f} dB" in capsys.readouterr().out

@@ -63,7 +63,7 @@ def test_plain_is_paper_without_dropping():
 
 WRONG = {
     "steps": (0, True, 2.0, "3", 10**8, 10**400, np.bool_(True)),
-    "drop": (1.0, -0.1, math.nan, None, "0.2", True),
+    "drop": (1.0, -0.1, math.nan, "0.2", True),
     "sh_degree": (4, -1),
     "evaluations": (0,),
     "coarse": (1.5, -0.1, math.nan),

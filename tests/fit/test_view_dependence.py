@@ -19,7 +19,7 @@ from kgs.harmonics import harmonics_basis
 from kgs.init_points.patches import PatchColors
 
 VIEWS = 8
-OPEN = FitConfig(steps=400)
+OPEN = FitConfig(steps=400, drop=0.3)
 
 
 def generator(seed=0):

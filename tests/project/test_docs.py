@@ -16,7 +16,7 @@ import pytest
 import torch
 from tiny_scenes import narrow_lpips
 
-from kgs.fit.config import DETAILS, PRESETS, FitConfig
+from kgs.fit.config import DETAILS, DROP, PRESETS, FitConfig
 from kgs.fit.plan import with_pace
 from kgs.init_points.dense import FEWEST, MOST, MOST_OF_FEW_VIEWS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
@@ -93,9 +93,9 @@ STEPS_OF_BOTH = [FEW.steps, MANY.steps]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [
     ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
-    ("README.md", "whose rate grows to #.", [AUTO.drop]),
+    ("README.md", "whose rate grows to #.", [DROP]),
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
-    ("docs/layer.md", "is p = #, with nothing dropped in the last #", [AUTO.drop, AUTO.undropped_steps]),
+    ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.undropped_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
     ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MOST_OF_FEW_VIEWS]),
     ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
@@ -121,10 +121,10 @@ NUMBERS = [
     ("docs/recipe.md", "(AbsGS) exceeds # |", [AUTO.recipe.grad_threshold]),
     ("docs/recipe.md", "opacities below # | opacities", [PAPER.recipe.prune_opacity]),
     ("docs/recipe.md", "| opacities below # | they fade", [AUTO.recipe.prune_opacity]),
-    ("docs/recipe.md", "| # t/T to the end | # t/T, none", [PAPER.drop, AUTO.drop]),
+    ("docs/recipe.md", "| # t/T to the end | # t/T, none", [PAPER.drop, DROP]),
     ("docs/recipe.md", "none in the last # steps", [AUTO.undropped_steps]),
     ("notebooks/03_three_views.ipynb", "`kgs fit` takes # steps on larger photos", [FEW.steps]),
-    ("notebooks/03_three_views.ipynb", "with a drop rate that grows to #", [AUTO.drop]),
+    ("notebooks/03_three_views.ipynb", "with a drop rate that grows to #", [DROP]),
     ("docs/departures.md", "| # x the 1st percentile", [PAPER.recipe.near_plane]),
 ]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.errors import DataError, printable
-from kgs.fit.config import DEMO, DEMO_STEPS, Backend, FitConfig
+from kgs.fit.config import DEMO, DEMO_STEPS, DROP, Backend, FitConfig
 
 from .options import Out
 
@@ -51,7 +51,7 @@ def demo(
     check_tools(device, backend, "jinja2")
     check_folder(out, _files())
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
-    runs = run_demo(scene, config, out, {"without": 0.0, "with": config.drop} if compare else {"with": config.drop})
+    runs = run_demo(scene, config, out, {"without": 0.0, "with": DROP} if compare else {"with": DROP})
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
     level = {name: [_level(run[part]) for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():
