@@ -134,9 +134,11 @@ def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
     assert len({photo.lens for photo in photos}) == 4  # 240x120 is there upright and lying
     width, height = photos[0].size
     scale = height / 120
-    grey = cv2.cvtColor(cv2.imread(str(paths[4])), cv2.COLOR_BGR2GRAY)
-    middle = cv2.resize(grey[:, 40:200], (width, height), interpolation=cv2.INTER_AREA)
-    assert np.abs(photos[4].grey().astype(int) - middle).max() <= 2
+    for i, rows, columns in ((4, slice(0, 120), slice(40, 200)), (3, slice(22, 157), slice(0, 180))):
+        grey = cv2.cvtColor(cv2.imread(str(paths[i])), cv2.COLOR_BGR2GRAY)[rows, columns]
+        middle = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        difference = np.abs(photos[i].grey().astype(int) - middle)
+        assert difference.mean() <= (0.5 if i == 4 else 6)  # half a pixel for the square one
     assert np.abs(photos[5].pixels.astype(int) - np.rot90(photos[5].upright().pixels, -1)).max() == 0
     assert (photos[4].mask[:, : width // 2] == 255).all()
     assert (photos[4].mask[:, width // 2 + 1 :] == 0).all()

@@ -62,8 +62,8 @@ def pose_photos(
 
     Args:
         folder: at least 3 photos of one scene. Of those of a rarer shape the middle is taken if their Exif says a focal
-            length, else they are left out. Folders in it are not looked into. Or a video, or a folder
-            with one and without photos.
+            length, else they are left out. Folders in it are not looked into. Or a video, or a folder with one and
+            without photos.
         out: the folder for the results, created if it does not exist.
         masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one. What
             is black is not matched, and `out` gets the masks in `masks`.

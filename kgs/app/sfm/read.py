@@ -203,10 +203,10 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     Raises:
         DataError: a photo cannot be decoded.
     """
-    lying = [photo.size[0] > photo.size[1] for photo in opened]
-    most_lie = 2 * sum(lying) >= len(opened)
+    most_lie = 2 * sum(photo.size[0] > photo.size[1] for photo in opened) >= len(opened)
     usual = max(by_shape(opened).values(), key=len)[0].size
-    parts = {photo.name: _middle(photo.size, usual) for photo in opened}
+    lies = {photo.name: _lies(photo.size, most_lie) for photo in opened}
+    parts = {photo.name: _middle(photo.size, usual, lies[photo.name]) for photo in opened}
     width, height = min(sorted(part, reverse=most_lie) for part in parts.values())
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -214,8 +214,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     photos = []
     for photo in stage(opened, "photos", "photo"):
         pixels = photo.image.read()
-        lies = photo.size[0] > photo.size[1]
-        is_turned = lies != most_lie and photo.size[0] != photo.size[1] and width != height
+        is_turned = lies[photo.name] != most_lie and width != height
         part = size[::-1] if is_turned else size
         whole = _larger(part, photo.size, parts[photo.name])
         stored = whole[::-1] if photo.exif.is_sideways else whole
@@ -238,13 +237,18 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     return photos
 
 
-def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of the largest part of an image that has this shape, or its upright or lying counterpart."""
+def _lies(size: tuple[int, int], most_lie: bool) -> bool:
+    """Whether an image is wider than high; a square one counts as most do."""
+    width, height = size
+    return width > height or (width == height and most_lie)
+
+
+def _middle(size: tuple[int, int], shape: tuple[int, int], lies: bool) -> tuple[int, int]:
+    """Width and height of the largest lying, or else upright, part of an image that has this shape."""
     if _same_shape(size, shape):
         return size
     width, height = size
-    long, short = max(shape), min(shape)
-    ratio = long / short if width > height else short / long
+    ratio = max(shape) / min(shape) if lies else min(shape) / max(shape)
     return min(width, round(height * ratio)), min(height, round(width / ratio))
 
 
@@ -277,9 +281,13 @@ def _mask(photo: OpenPhoto, size: tuple[int, int]) -> NDArray[np.uint8] | None:
 
 
 def blurred(photos: list[Photo]) -> list[Photo]:
-    """Photos that have far less fine detail than the others."""
-    values = np.array([sharpness(photo.grey()) for photo in photos])
-    return [photo for photo, value in zip(photos, values, strict=True) if value < _BLURRED * np.median(values)]
+    """Photos that have far less fine detail than the others of the same lens."""
+    values = [sharpness(photo.grey()) for photo in photos]
+    of_lens = defaultdict[int, list[float]](list)
+    for photo, value in zip(photos, values, strict=True):
+        of_lens[photo.lens].append(value)
+    usual = {lens: np.median(sharp) for lens, sharp in of_lens.items()}
+    return [photo for photo, value in zip(photos, values, strict=True) if value < _BLURRED * usual[photo.lens]]
 
 
 def sharpness(grey: NDArray[np.uint8]) -> float:
