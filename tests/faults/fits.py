@@ -27,9 +27,9 @@ _PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.app.fit_folder", "torch.
 def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
     """Densification, resets, harmonics and dropping all happen; a checkpoint is written every third step."""
     recipe = Recipe(grad_threshold=1e-5, prune_opacity=0.005, reset_interval=3000, reset_recovery=5)
-    config = FitConfig(steps=steps, evaluations=steps // 3, max_gaussians=1500, sh_degree=3, recipe=recipe)
+    config = FitConfig(steps=steps, drop=0.3, evaluations=steps // 3, max_gaussians=1500, sh_degree=3, recipe=recipe)
     times = timetable(config)
-    if not (times.densify and times.reset and len(times.sh) == 3 and config.drop):
+    if not (times.densify and times.reset and len(times.sh) == 3):
         raise RuntimeError(f"steps: expected room for all that a fit can do, got {steps}: {times}")
     return replace(config, init="file", init_file=points, **changes)
 
