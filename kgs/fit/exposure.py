@@ -21,13 +21,12 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints
-from kgs.init_points.patches import PatchColors
+from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .plan import Plan
 
 LEAST_RATIO = 1.3  # between the gains of two photos in a channel, for gains to be used
 MOST_LEFT = 0.6  # of the median difference of a patch's colours, after the gains, for gains to be used
-MIN_PATCHES = 200
 USABLE = 0.03, 0.97  # colours beyond are black or saturated
 ROUNDS = 8  # of the weights
 PRIOR = 1e-3  # patches that speak for a gain of 1: where no other does

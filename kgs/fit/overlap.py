@@ -7,12 +7,12 @@ say how many these are: see :class:`kgs.init_points.patches.PatchColors`.
 from dataclasses import replace
 
 from kgs.init_points import InitialPoints
+from kgs.init_points.patches import MIN_PATCHES
 
 from .config import DROP
 from .plan import Plan
 
 MOST_PHOTOS = 6.5  # that show a patch, in the mean over the patches, for dropping to be used
-MIN_PATCHES = 200
 
 
 def decide_drop(plan: Plan, points: InitialPoints) -> Plan:

@@ -17,13 +17,12 @@ from torch import Tensor
 
 from kgs.datasets.splits import select_evenly
 from kgs.init_points import InitialPoints
-from kgs.init_points.patches import PatchColors
+from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .plan import Plan
 
 DEGREE = 3  # of the harmonics that are chosen
 MIN_VIEWS = 4  # training views: three do not determine harmonics
-MIN_PATCHES = 200
 MOST_PATCHES = 6000  # that are used, to bound the time
 TYPICAL = 25.0  # dB
 MIN_GAIN = 0.2  # dB

@@ -17,6 +17,7 @@ PIXELS = 16_000  # of one view that are looked up: one in four, or fewer of a la
 SIDE = 4  # of a patch, in these pixels
 LEAST = 4  # of its 16 pixels, which a view has to agree on
 VIEWS = 3  # that a patch needs: without one of them there is a mean of two
+MIN_PATCHES = 200  # fewer say nothing about a scene
 
 
 @dataclass(frozen=True, eq=False)

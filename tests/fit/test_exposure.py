@@ -8,13 +8,13 @@ import torch
 
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import PRESETS, FitConfig
-from kgs.fit.exposure import LEAST_RATIO, MIN_PATCHES, decide_exposure, estimate_gains, with_exposure
+from kgs.fit.exposure import LEAST_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points, decide, fit_scene
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
-from kgs.init_points.patches import PatchColors
+from kgs.init_points.patches import MIN_PATCHES, PatchColors
 from kgs.metrics.evaluate import evaluate, recolored
 
 GAINS = torch.tensor([[0.5, 0.5, 0.5], [0.8, 0.8, 0.8], [1.25, 1.25, 1.25], [1.1, 1.0, 0.8]])

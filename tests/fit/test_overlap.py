@@ -9,13 +9,13 @@ import torch
 from kgs.datasets import synthetic_scene
 from kgs.drop import DropGaussian
 from kgs.fit.config import DROP, FitConfig
-from kgs.fit.overlap import MIN_PATCHES, MOST_PHOTOS, decide_drop
+from kgs.fit.overlap import MOST_PHOTOS, decide_drop
 from kgs.fit.plan import make_plan
 from kgs.fit.prune import left_out
 from kgs.fit.run import fit_scene
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
-from kgs.init_points.patches import PatchColors
+from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 CONFIG = FitConfig(steps=4, evaluations=1)
 

@@ -13,10 +13,10 @@ from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit import FitConfig, InitialPoints, view_dependence
 from kgs.fit.plan import make_plan, with_pace
 from kgs.fit.run import choose_points, decide
-from kgs.fit.view_dependence import MIN_GAIN, MIN_PATCHES, harmonics_kernel, possible_gain, without_exposure
+from kgs.fit.view_dependence import MIN_GAIN, harmonics_kernel, possible_gain, without_exposure
 from kgs.geometry import ViewGeometry
 from kgs.harmonics import harmonics_basis
-from kgs.init_points.patches import PatchColors
+from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 VIEWS = 8
 OPEN = FitConfig(steps=400, drop=0.3)
