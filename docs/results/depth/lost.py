@@ -6,19 +6,17 @@ from pathlib import Path
 import torch
 import tyro
 from kornia.geometry.camera import PinholeCamera
-from measure import CONFIRMED
+from measure import confirmed_depths, depth_range
 from torch import Tensor
 
 from kgs.bench.output import Row, markdown_table, write_results
 from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene
-from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig
 from kgs.fit.run import fit_scene
 from kgs.geometry import ViewGeometry, nearest_pixels
-from kgs.init_points.agreement import agreed_pixels, confirming_views
+from kgs.init_points.agreement import agreed_pixels
 from kgs.init_points.dense import agreed_depths
-from kgs.init_points.depth_limits import certain_points, sweep_range
 
 SCENES = ("llff/fern", "llff/flower", "colmap/trex", "colmap/fortress")
 VIEWS = 3
@@ -57,12 +55,12 @@ def _rows(data: Path, name: str, seed: int) -> list[Row]:
     scene = load_scene(data / name, VIEWS, DOWNSCALE)
     everything = load_scene(data / name, None, DOWNSCALE, hold_out=0).train
     geometry = ViewGeometry.of(scene.train.cameras)
-    near, far = sweep_range(certain_points(scene.train, geometry), geometry)
+    near, far = depth_range(scene.train)
     maps, certain = agreed_depths(scene.train, near, far)
     of_points = [
         torch.where(agreed_pixels(geometry, maps, certain, view), maps[view].depths, 0.0) for view in range(VIEWS)
     ]
-    true = _true_depths(everything, near, far)
+    true = confirmed_depths(everything, near, far, list(range(len(everything))))
     of_name = dict(zip(everything.names, true, strict=True))
     of_photos = [of_name[photo] for photo in scene.train.names]
     kinds = torch.stack(
@@ -82,14 +80,6 @@ def _rows(data: Path, name: str, seed: int) -> list[Row]:
         error = 100 * float(chosen.sum() / errors.sum())
         rows.append({"scene": name, "kind": kind, "pixels, %": share, "squared error, %": error, "PSNR": psnr})
     return rows
-
-
-def _true_depths(views: Views, near: float, far: float) -> list[Tensor]:
-    """The depths of all views that two others confirm, else 0."""
-    geometry = ViewGeometry.of(views.cameras)
-    maps, certain = agreed_depths(views, near, far)
-    confirmed = [confirming_views(geometry, maps, certain, view) >= CONFIRMED for view in range(len(maps))]
-    return [torch.where(mask, depth_map.depths, 0.0) for depth_map, mask in zip(maps, confirmed, strict=True)]
 
 
 def _kinds(

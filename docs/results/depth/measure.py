@@ -77,7 +77,7 @@ def depth(*, out: Path, truth: Path | None = None, quick: bool = False) -> None:
 def _room(downscale: float) -> Truth:
     height, width = (round(length / downscale) for length in ROOM_SIZE)
     views = synthetic_scene(train_views=ROOM_VIEWS, size=(height, width)).train
-    near, far = _range(views)
+    near, far = depth_range(views)
     return Truth(views, near, far, synthetic_depths(views.cameras)[:, 0])
 
 
@@ -86,25 +86,26 @@ def _known(data: Path, name: str, size: str, folder: Path | None) -> Truth:
     count, larger = REAL[name]
     downscale = SIZES[size] * larger
     scene, everything = (load_scene(data / name, views, downscale).train for views in (count, None))
-    near, far = _range(scene)
+    near, far = depth_range(scene)
     views = small_enough(scene, near, far)
     path = None if folder is None else folder / f"{name.replace('/', '-')}-{size}.pt"
     if path is not None and path.is_file():
         return Truth(views, near, far, torch.load(path))
     while everything.images.shape[-1] > views.images.shape[-1]:
         everything = everything.halved()
-    depths = _confirmed_depths(everything, near, far, [everything.names.index(name) for name in views.names])
+    depths = confirmed_depths(everything, near, far, [everything.names.index(name) for name in views.names])
     if path is not None:
         torch.save(depths, path)
     return Truth(views, near, far, depths)
 
 
-def _range(views: Views) -> tuple[float, float]:
+def depth_range(views: Views) -> tuple[float, float]:
+    """The depths between which views are swept, by points that are certain."""
     geometry = ViewGeometry.of(views.cameras)
     return sweep_range(certain_points(views, geometry), geometry)
 
 
-def _confirmed_depths(views: Views, near: float, far: float, chosen: list[int]) -> Tensor:
+def confirmed_depths(views: Views, near: float, far: float, chosen: list[int]) -> Tensor:
     """Depths `(V, H, W)` of the chosen views where enough other views confirm them, else 0."""
     geometry = ViewGeometry.of(views.cameras)
     maps, certain = agreed_depths(views, near, far)

@@ -223,6 +223,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
         upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
         mask = _mask(photo, whole)
         quarters = -1 if is_turned else 0  # clockwise
+        turned = whole[::-1] if is_turned else whole
         photos.append(
             Photo(
                 photo.path,
@@ -231,7 +232,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
                 None if mask is None else np.ascontiguousarray(np.rot90(_cut(mask, part), quarters)),
                 is_turned,
                 lenses[photo.name],
-                None if whole == part else whole[::-1] if is_turned else whole,
+                turned if whole != part else None,
             )
         )
     return photos
