@@ -93,13 +93,13 @@ STEPS_OF_BOTH = [FEW.steps, MANY.steps]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [
     ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
-    ("README.md", "whose rate grows to #.", [DROP]),
+    ("README.md", "whose rate grows to #:", [DROP]),
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.undropped_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
     ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MOST_OF_FEW_VIEWS]),
     ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
-    ("docs/measured.md", "the default from # to #, then", [FEWEST, MOST]),
+    ("docs/measured.md", "three seeds): # steps from # of the same", [PAPER.steps, PAPER.init_points]),
     ("docs/measured.md", "default, for # steps with three views and # with more", STEPS_OF_BOTH),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
     ("docs/command.md", "# to #, one for every # pixels", [FEWEST, MOST, PIXELS_OF_A_POINT]),
