@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 import tyro
+from kornia.metrics import psnr
 from torch import Tensor
 
 from kgs.bench.output import Row, markdown_table, write_results
@@ -66,7 +67,7 @@ def parts(images: Tensor, photos: Tensor) -> dict[str, float]:
 
 
 def _psnr(images: Tensor, photos: Tensor) -> float:
-    return float(-10 * (images - photos).square().mean((1, 2, 3)).log10().mean())
+    return statistics.fmean(float(psnr(image, photo, 1.0)) for image, photo in zip(images, photos, strict=True))
 
 
 def _test_images(scene: Scene, config: FitConfig) -> Tensor:
