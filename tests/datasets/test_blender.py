@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +64,15 @@ def test_reducing_mixes_colours_in_proportion_to_alpha(tmp_path: Path) -> None:
     torch.testing.assert_close(scene.train.images[1, :, 3, 3], torch.tensor([1.0, 0.5, 0.5]))
 
 
-def test_the_published_eight_frames(tmp_path: Path) -> None:
-    write(tmp_path, train=100, test=2)
-    scene = load_scene(tmp_path, 8)
-    assert scene.train.names == tuple(f"train/r_{i}.png" for i in (2, 16, 26, 55, 73, 76, 86, 93))
-    assert load_scene(tmp_path, 3).train.names == ("train/r_0.png", "train/r_50.png", "train/r_99.png")
-    with pytest.raises(ValueError, match="1 to 100"):
-        load_scene(tmp_path, 101)
-
-
-def test_eight_of_fewer_frames_are_spread_evenly(tmp_path: Path) -> None:
-    write(tmp_path, train=15)
-    assert load_scene(tmp_path, 8).train.names == tuple(f"train/r_{i}.png" for i in range(0, 15, 2))
+@pytest.mark.parametrize(
+    ("count", "views", "expected"),
+    [(100, 8, (2, 16, 26, 55, 73, 76, 86, 93)), (100, 3, (0, 50, 99)), (15, 8, range(0, 15, 2))],
+)
+def test_eight_of_many_frames_are_the_published_ones(
+    tmp_path: Path, count: int, views: int, expected: Sequence[int]
+) -> None:
+    write(tmp_path, train=count, test=2)
+    assert load_scene(tmp_path, views).train.names == tuple(f"train/r_{i}.png" for i in expected)
 
 
 def test_first_points_are_random_in_the_cube_and_the_same_each_time(tmp_path: Path) -> None:
@@ -103,6 +101,7 @@ def test_first_points_are_random_in_the_cube_and_the_same_each_time(tmp_path: Pa
         ({"transform_matrix": [[1, 0], [0, 1]]}, "4x4"),
         ({"transform_matrix": None}, "4x4"),
         ({"transform_matrix": np.diag([1, 1, 1, 2]).tolist()}, "last row"),
+        ({"transform_matrix": np.diag([1.01, 1.01, 1.01, 1]).tolist()}, r"r_2\.png.*rotation"),
         ({"transform_matrix": [[10**400, 0, 0, 0], *np.eye(4).tolist()[1:]]}, "4x4 matrix of finite"),
     ],
 )
@@ -124,26 +123,15 @@ def test_the_last_row_of_an_inverse_is_that_of_a_pose(tmp_path: Path) -> None:
     assert torch.equal(load_scene(tmp_path).train.cameras.extrinsics, exact)
 
 
-OVERFLOW = '{"camera_angle_x": 1e400}'
-TEXTS = [
-    "",
-    "{",
-    "[]",
-    "{}",
-    '{"frames": []}',
-    '{"frames": [3]}',
-    '{"camera_angle_x": NaN}',
-    "[" * 100_000,
-    "\xff",
-    OVERFLOW,
-]
+NO_OBJECTS = ["", "{", "[]", "{}", '{"frames": []}', '{"frames": [3]}', "[" * 100_000, "\xff"]
+NO_NUMBERS = ['{"camera_angle_x": NaN}', '{"camera_angle_x": 1e400}']
 
 
-@pytest.mark.parametrize("text", TEXTS)
+@pytest.mark.parametrize("text", NO_OBJECTS + NO_NUMBERS)
 def test_files_that_are_no_transforms(tmp_path: Path, text: str) -> None:
     write(tmp_path)
     (tmp_path / "transforms_train.json").write_text(text, encoding="latin-1")
-    with pytest.raises(DataError, match="transforms_train.*1e400" if text == OVERFLOW else "transforms_train"):
+    with pytest.raises(DataError, match="transforms_train"):
         load_scene(tmp_path)
 
 

@@ -149,3 +149,4 @@ def test_sizes_that_can_be_scaled_versions() -> None:
     full = Intrinsics(4032, 3024, 3000.0, 3000.0, 2016.0, 1512.0)
     assert all(full.same_aspect(*size) for size in ((504, 378), (501, 376), (1008, 756), (4032, 3024), (253, 190)))
     assert not any(full.same_aspect(*size) for size in ((3024, 4032), (504, 370), (500, 378)))
+    assert Intrinsics(200, 149, 40.0, 40.0, 100.0, 74.5).same_aspect(216, 162)  # a twelfth of 2400x1799 and 2592x1944

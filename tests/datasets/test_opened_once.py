@@ -56,32 +56,24 @@ def images(opened: Counter[str]) -> dict[str, int]:
     return {name: count for name, count in opened.items() if Path(name).suffix in IMAGES}
 
 
-WRITERS = pytest.mark.parametrize("write", [write_llff, write_colmap, write_blender, write_nerfstudio])
-
-
-@WRITERS
+@pytest.mark.parametrize("write", [write_llff, write_colmap, write_blender, write_nerfstudio])
 @pytest.mark.parametrize("downscale", [None, 2])  # 2: the training views in full size, too, for initial points
+@pytest.mark.parametrize("photos", [True, False])
 def test_a_scene(
-    tmp_path: Path, write: Callable[[Path], None], downscale: int | None, opened: Counter[str], decoded: list[int]
+    tmp_path: Path,
+    write: Callable[[Path], None],
+    downscale: int | None,
+    photos: bool,
+    opened: Counter[str],
+    decoded: list[int],
 ) -> None:
     write(tmp_path)
     opened.clear()
-    scene = load_scene(tmp_path, downscale=downscale)
+    scene = load_scene(tmp_path, downscale=downscale, photos=photos)
     count = len(scene.train) + len(scene.test)
-    assert (scene.finer is None) == (downscale is None)
-    assert len(images(opened)) == len(decoded) == count
-    assert set(images(opened).values()) == {1}
-
-
-@WRITERS
-def test_a_scene_without_its_photos(
-    tmp_path: Path, write: Callable[[Path], None], opened: Counter[str], decoded: list[int]
-) -> None:
-    write(tmp_path)
-    opened.clear()
-    load_scene(tmp_path, photos=False)
-    assert set(images(opened).values()) == {1}
-    assert decoded == []
+    assert (scene.finer is not None) == (photos and downscale is not None)
+    assert [*images(opened).values()] == [1] * count
+    assert len(decoded) == (count if photos else 0)
 
 
 def test_unposed_photos(

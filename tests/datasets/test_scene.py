@@ -1,10 +1,9 @@
 """Views: a data set of dicts; halved pictures keep showing the same rays; cameras without photos; float32."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
+from factories import other_defaults
 from kornia.geometry.camera import PinholeCamera
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 from torch.utils.data import DataLoader
@@ -115,26 +114,16 @@ def test_cameras_that_are_not_there(index):
 WRITERS = pytest.mark.parametrize("write", [write_llff, write_colmap, write_blender, write_nerfstudio])
 
 
-@pytest.fixture
-def odd_defaults() -> Iterator[None]:
-    """Torch's defaults as a program may have set them; "meta" stands for a GPU."""
-    torch.set_default_dtype(torch.float64)
-    torch.set_default_device("meta")
-    yield
-    torch.set_default_dtype(torch.float32)
-    torch.set_default_device(None)
-
-
 @WRITERS
-def test_scenes_are_float32_on_the_cpu_whatever_the_defaults(tmp_path, odd_defaults, write):
-    with torch.device("cpu"):  # which the writers need
-        write(tmp_path)
-    check_float32(load_scene(tmp_path, downscale=2))
+def test_scenes_are_float32_on_the_cpu_whatever_the_defaults(tmp_path, write):
+    write(tmp_path)
+    with other_defaults():
+        check_float32(load_scene(tmp_path, downscale=2))
 
 
-@pytest.mark.usefixtures("odd_defaults")
 def test_synthetic_scenes_are_float32_on_the_cpu_whatever_the_defaults():
-    check_float32(synthetic_scene(train_views=1, test_views=1, size=(6, 8)))
+    with other_defaults():
+        check_float32(synthetic_scene(train_views=1, test_views=1, size=(6, 8)))
 
 
 def check_float32(scene):
