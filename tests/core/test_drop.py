@@ -52,22 +52,22 @@ def test_a_rate_of_zero_returns_the_same_object_and_draws_nothing(seed):
 
 
 @pytest.mark.parametrize("seed", [None, 3])
-def test_kept_values_are_scaled_once_dropped_ones_exactly_zero_and_nothing_is_clamped(seed):
-    x = torch.full((1000,), 0.9, dtype=torch.float64, requires_grad=True)
-    out = at(1.0, p=0.2, seed=seed)(x)
-    assert set(out.tolist()) == {0.0, 0.9 * (1 / 0.8)}
-    assert out.max() > 1
-    assert (x == 0.9).all(), "the input is not changed"
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_kept_values_are_scaled_once_dropped_ones_exactly_zero_and_nothing_is_clamped(dtype, seed):
+    x = torch.full((1000,), 0.75, dtype=dtype, requires_grad=True)
+    out = at(1.0, p=0.5, seed=seed)(x)
+    assert out.dtype == dtype
+    assert set(out.tolist()) == {0.0, 1.5}
+    assert (x == 0.75).all(), "the input is not changed"
     out.sum().backward()
-    assert set(x.grad.tolist()) == {0.0, 1 / (1 - 0.2)}
+    assert set(x.grad.tolist()) == {0.0, 2.0}
     assert torch.equal(x.grad == 0, out == 0)
 
 
 @pytest.mark.parametrize("seed", [None, 3])
 def test_every_camera_of_a_batch_has_a_mask_of_its_own(seed):
-    out = at(1.0, p=0.5, seed=seed)(torch.ones(2, 1000))
+    out = at(1.0, p=0.5, seed=seed)(torch.ones(1000).expand(2, 1000))
     assert 300 < (out[0] != out[1]).sum() < 700
-    assert at(1.0, p=0.5, seed=seed)(torch.ones(1000).expand(2, 1000)).unique(dim=0).shape[0] == 2
 
 
 def test_the_layer_adds_nothing_to_the_state_dict():
@@ -76,14 +76,6 @@ def test_the_layer_adds_nothing_to_the_state_dict():
     assert layer.state_dict() == {}
     assert list(layer.parameters()) == []
     nn.Sequential(nn.Linear(1, 1), layer).load_state_dict(nn.Sequential(nn.Linear(1, 1), nn.Identity()).state_dict())
-
-
-@pytest.mark.parametrize("seed", [None, 3])
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_stays_itself(dtype, seed):
-    out = at(1.0, p=0.5, seed=seed)(torch.full((1000,), 0.5, dtype=dtype))
-    assert out.dtype == dtype
-    assert set(out.tolist()) == {0.0, 1.0}
 
 
 @pytest.mark.parametrize("seed", [None, 3])
