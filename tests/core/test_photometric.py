@@ -165,7 +165,7 @@ def test_autocast_does_not_reach_the_ssim():
     torch.testing.assert_close(inside, photometric_loss(image, target), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("mask", [None, torch.ones(32, 32)])
+@pytest.mark.parametrize("mask", [None, torch.ones(32, 32).tril(8)], ids=["whole", "masked"])
 def test_default_device_and_default_dtype_do_not_reach_the_loss(mask):
     image, target = make_pair((1, 3, 32, 32))
     expected, expected_gradient = value_and_gradient(lambda x: photometric_loss(x, target, mask=mask), image)

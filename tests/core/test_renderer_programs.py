@@ -21,15 +21,16 @@ def test_tensors_decide_the_device_whatever_the_default_is(kind):
     given, inputs = leaves(gaussians)
     expected = GaussianRenderer()(given, camera, outputs=(*OUTPUTS, "normal"))
     expected.image.square().sum().backward()
+    values = [getattr(gaussians, name).clone() for name in FIELDS]
+    views = [random_camera(*SIZE, 0, torch.float32).extrinsics, torch.tensor([[[32.0, 0, 16], [0, 32, 12], [0, 0, 1]]])]
+    options = {"width": 32, "height": 24, "sh_degree": 3, "render_mode": "RGB+ED"}
+    expected_call = kgs.rasterization(*values, *views, **options)
     with other_defaults():
         other = Gaussians(*(getattr(gaussians, name).requires_grad_() for name in FIELDS))
         out = GaussianRenderer()(other, camera, outputs=(*OUTPUTS, "normal"))
         out.image.square().sum().backward()
-        pose = torch.eye(4, device="cpu", dtype=torch.float32)
-        drawn, _, _ = kgs.rasterization(
-            *(getattr(gaussians, name) for name in FIELDS), pose[None], pose[None, :3, :3], 32, 24, sh_degree=3
-        )
-    assert drawn.device.type == "cpu"
+        call = kgs.rasterization(*values, *views, **options)
+    assert all(torch.equal(a, b) for a, b in zip(call[:2], expected_call[:2], strict=True))
     for name in (*OUTPUTS, "normal"):
         assert torch.equal(getattr(out, name), getattr(expected, name))
     for name, value in zip(FIELDS, inputs, strict=True):

@@ -1,4 +1,8 @@
-"""Everything public under both default dtypes of torch: the same dtypes, and the same numbers."""
+"""Scenes, fits and the reference under both default dtypes of torch: the same dtypes, and the same numbers.
+
+Those of the model, the layer, the renderer, the densifier, the loss and PLY files are in their own tests, which set
+another default device too.
+"""
 
 import dataclasses
 import tempfile
@@ -16,7 +20,6 @@ import kgs
 import kgs.reference
 from kgs.datasets import Scene, synthetic
 from kgs.fit import FitConfig, Trainer, initial_points, make_plan
-from kgs.losses import photometric_loss, target_moments
 
 SIZE = (24, 32)
 
@@ -30,37 +33,6 @@ def model(degree: int = 1) -> kgs.GaussianModel:
 def camera() -> PinholeCamera:
     k = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
     return kgs.pinhole_cameras(torch.eye(4, dtype=torch.float32), k, SIZE[1], SIZE[0], "half")
-
-
-def rasterization() -> object:
-    values = [value.detach() for value in vars(model()()).values()]
-    poses = camera()
-    return kgs.rasterization(
-        *values, poses.extrinsics, poses.intrinsics[:, :3, :3], SIZE[1], SIZE[0], sh_degree=1, render_mode="RGB+ED"
-    )
-
-
-def projected_and_composited() -> object:
-    projected = kgs.project(model()(), camera())
-    return projected, kgs.composite(projected, projected.colors, median_depth=True)
-
-
-def densified() -> object:
-    gaussians = model()
-    adam = torch.optim.Adam(gaussians.parameters(), lr=0.01)
-    densifier = kgs.Densifier(gaussians, adam, 1.0, grad_threshold=0.0)
-    projected = kgs.GaussianRenderer(absgrad=True)(gaussians(), camera()).projected
-    projected.means2d.retain_grad()
-    projected.means2d.square().sum().backward()
-    densifier.observe(projected)
-    densifier.step()
-    return gaussians.state_dict(), densifier.state_dict()
-
-
-def losses() -> object:
-    image = kgs.GaussianRenderer()(model()(), camera()).image
-    moments = target_moments(torch.zeros_like(image))
-    return moments, photometric_loss(image, moments), photometric_loss(image, image, mask=torch.ones(SIZE) > 0)
 
 
 def made_scene(kind: str = "room", new: bool = False) -> Scene:
@@ -85,23 +57,10 @@ def trained() -> object:
     return trainer.model.state_dict()
 
 
-def drop() -> object:
-    layer = kgs.DropGaussian(0.3, "constant", seed=1)
-    return layer(torch.full((50,), 0.5, dtype=torch.float32))
-
-
 FACTORIES: dict[str, Callable[[], object]] = {
     "pinhole_cameras": lambda: [camera().intrinsics, camera().extrinsics],
-    "GaussianModel": lambda: model().state_dict(),
-    "Gaussians": lambda: model()(),
-    "DropGaussian": drop,
-    "GaussianRenderer": lambda: kgs.GaussianRenderer()(model()(), camera(), outputs=("image", "depth", "normal")),
-    "project and composite": projected_and_composited,
-    "rasterization": rasterization,
     "reference": lambda: kgs.reference.render(model()(), camera()),
-    "Densifier": densified,
     "camera_extent": lambda: torch.tensor(kgs.camera_extent(camera().extrinsics), dtype=torch.float64),
-    "losses": losses,
     "initial_points random": lambda: initial_points(made_scene().train, "random", count=50),
     "initial_points sift": lambda: initial_points(made_scene().train, "sift", count=50),
     "initial_points file": points_of_a_file,
