@@ -1,7 +1,6 @@
 """The rules of compositing: thresholds, the clamp of alpha, many layers."""
 
 import dataclasses
-import itertools
 
 import pytest
 import torch
@@ -23,17 +22,6 @@ def test_stop_is_inclusive():
         assert (out.features[0, :2, 0, 0].double() - torch.tensor([0.99, 0.0099])).abs().max() <= 1e-6
         white[dtype] = (out.features[:, :2].sum(1) + out.transmittance[:, 0]).double()
     assert (white[torch.float32] - white[torch.float64]).abs().max() <= STOP + 1e-6
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_nothing_counts_behind_the_stop(dtype):
-    opacities = [0.9, 0.9, 0.9, 0.9, 0.9]  # T: 1, .1, .01, .001, 1e-4 (just above or below), ...
-    out = composite(
-        footprints(opacities, dtype=dtype), torch.eye(5, dtype=dtype), options=RasterOptions(transmittance_stop=0.005)
-    )
-    expected = torch.tensor([0.9, 0.09, 0.009, 0.0, 0.0], dtype=dtype)
-    assert (out.features[0, :, 0, 0] - expected).abs().max() <= 1e-7
-    assert not out.transmittance.any()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -73,24 +61,6 @@ def test_error_of_the_threshold_is_at_most_layers_times_it(threshold):
     assert (error <= skipped + STOP + 1e-12).all()
     assert (skipped <= 200 * threshold).all()
     assert error.max() > threshold / 20  # the threshold acts
-
-
-def test_light_grows_with_the_threshold_and_falls_with_the_stop():
-    projected, colors, _ = scene_footprints(200, 4, torch.float64, image_size=30)
-
-    def light(threshold, stop):
-        return composite(
-            projected, colors, options=RasterOptions(alpha_threshold=threshold, transmittance_stop=stop)
-        ).transmittance
-
-    by_threshold = [light(threshold, 0.0) for threshold in (0.0, 1e-4, 1 / 1024, 1 / 255, 1 / 64, 0.3)]
-    by_stop = [light(0.0, stop) for stop in (0.0, 1e-6, 1e-4, 1e-2, 0.5)]
-    for less, more in itertools.pairwise(by_threshold):
-        assert (more - less).min() >= -1e-14
-    for more, less in itertools.pairwise(by_stop):
-        assert (more - less).min() >= -1e-14
-    assert (by_threshold[-1] - by_threshold[0]).max() > 0.01
-    assert (by_stop[0] - by_stop[-1]).max() > 0.01
 
 
 def test_a_layer_counts_from_the_threshold_on():

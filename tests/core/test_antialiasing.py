@@ -76,19 +76,6 @@ def test_flat_footprints_have_the_factor_zero_and_no_infinite_gradient():
     assert factors.grad.isfinite().all()
 
 
-def test_a_coarse_render_is_nearer_to_the_mean_of_a_fine_one():
-    """Small Gaussians drawn at an eighth of the size, against means over 8 x 8 pixels."""
-    gaussians = random_gaussians(400, 3, torch.float32, None, 256, (0.3, 0.9))
-    fine = pinhole(192, 256, 256.0, dtype=torch.float32)
-    coarse = pinhole(24, 32, 32.0, dtype=torch.float32)
-    target = torch.nn.functional.avg_pool2d(GaussianRenderer(eps2d=0.01)(gaussians, fine).image, 8)
-    errors = [
-        (GaussianRenderer(antialiased=antialiased)(gaussians, coarse).image - target).square().mean()
-        for antialiased in (False, True)
-    ]
-    assert errors[1] < 0.2 * errors[0]
-
-
 def test_without_a_low_pass_filter_there_is_nothing_to_correct():
     gaussians, camera = random_gaussians(30, 0, torch.float32, 0, 32), random_camera(24, 32, 0, torch.float32)
     plain, antialiased = (GaussianRenderer(eps2d=0.0, antialiased=x)(gaussians, camera).image for x in (False, True))

@@ -175,15 +175,6 @@ def test_extremes(tmp_path: Path) -> None:
     assert found["means"][:2, :2] == pytest.approx(np.array([[largest, -largest], [-largest, largest]]))
 
 
-def test_one_gaussian_keeps_what_has_a_range(tmp_path: Path) -> None:
-    model = random_model(1, 0)
-    save_compressed_ply(tmp_path / "a.ply", model)
-    found = decode(tmp_path / "a.ply")
-    for name in ("means", "log_scales"):
-        np.testing.assert_array_equal(found[name].astype("f4"), model.get_parameter(name).detach().numpy())
-    np.testing.assert_allclose(found["sh_dc"], model.sh_dc.detach().numpy(), rtol=1e-6, atol=1e-6)
-
-
 def test_harmonics_go_up_to_the_highest_active_band_that_is_used(tmp_path: Path) -> None:
     model = random_model(5, 3)
     model.sh_degree = 2

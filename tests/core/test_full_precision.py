@@ -38,10 +38,12 @@ def torch_alone(monkeypatch):
 @pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize("kind", ["pinhole", "sheared", *LENSES])
 def test_no_product_of_matrices_is_taken(kind):
-    gaussians = random_gaussians(200, 0, torch.float32, 3)
-    gaussians, inputs = leaves(gaussians)
+    gaussians, inputs = leaves(random_gaussians(200, 0, torch.float32, 3))
+    camera = camera_of(kind)
+    lens = camera.model.params if kind in LENSES else camera.intrinsics
+    inputs += [camera.extrinsics.requires_grad_(), lens.requires_grad_()]
     with Operators() as operators:
-        out = GaussianRenderer()(gaussians, camera_of(kind), outputs=OUTPUTS)
+        out = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
         (out.image.square().sum() + out.depth.mean() + out.normal.sum()).backward()
     assert {"exp", "exp_"} & set(operators.names)
     assert not PRODUCTS & set(operators.names)

@@ -141,11 +141,7 @@ def test_a_scene_at_map_coordinates_comes_back_where_it_was(tmp_path, dtype):
     again = load_ply(tmp_path / "a.ply", origin=UTM)
     # 1e-9 is what float64 leaves of a metre at 5e6 metres
     torch.testing.assert_close(again.means.double(), model.means.double(), rtol=1e-7, atol=2e-9)
-    render, camera = GaussianRenderer(), pinhole(40, 48, 50.0, dtype=torch.float32)
-    with torch.no_grad():
-        before, after = (render(m.float()(), camera).image for m in (model, again))
-    assert before.amax() > 0.5
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
+    assert all(torch.equal(a, b.float()) for a, b in list(pairs(again, model))[1:])
 
 
 def test_others_read_the_doubles(tmp_path):

@@ -1,7 +1,6 @@
-"""The dense reference against 50 digits and scipy, by hand where a limit or a sum is known."""
+"""The dense reference against 50 digits, by hand where a limit or a sum is known."""
 
 import itertools
-import math
 
 import pytest
 import torch
@@ -111,17 +110,6 @@ def harmonics_at(direction: Tensor, degree: int = 3) -> Tensor:
     )
     rgb = layers(gaussians, pinhole(3, 3, 5, extrinsics=extrinsics)).colors
     return (rgb[:, 0] - 0.5) / 0.3
-
-
-def test_harmonics_against_scipy():
-    special = pytest.importorskip("scipy.special")
-    x, y, z = (tensor(-0.4, 0.5, 0.77) / tensor(-0.4, 0.5, 0.77).norm()).tolist()
-    basis = harmonics_at(tensor(x, y, z))
-    for degree in range(4):
-        for m in range(-degree, degree + 1):
-            value = special.sph_harm_y(degree, abs(m), math.acos(z), math.atan2(y, x))
-            expected = value.real if m == 0 else math.sqrt(2) * (value.real if m > 0 else value.imag)
-            assert float(basis[degree * degree + degree + m]) == pytest.approx(float(expected), abs=1e-14)
 
 
 def test_harmonics_have_the_order_and_signs_of_ply_files():

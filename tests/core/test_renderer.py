@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from factories import FIELDS, OUTPUTS, batch, leaves, pinhole, random_camera, random_gaussians
+from factories import OUTPUTS, batch, leaves, pinhole, random_camera, random_gaussians
 
 import kgs.reference
 from kgs import DropGaussian, GaussianRenderer, Gaussians, RasterOptions, composite, project
@@ -155,29 +155,6 @@ def test_rgb_is_taken_as_it_is_and_harmonics_are_shifted_by_a_half():
 
 
 # -- modes and options --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("backward_inside", [False, True])
-@pytest.mark.parametrize("setting", ["autocast", "medium"])
-def test_lower_precision_around_it_changes_nothing(setting, backward_inside, matmul_precision):
-    """Nor the gradients of Gaussians, intrinsics and pose; "medium" rounds where the processor has units for it."""
-    camera = random_camera(24, 32, 0, torch.float32)
-    gaussians, inputs = leaves(random_gaussians(3000, 0, torch.float32, 3))
-    inputs += [camera.intrinsics.requires_grad_(), camera.extrinsics.requires_grad_()]
-
-    def lowered(on):
-        matmul_precision("medium" if on and setting == "medium" else "highest")
-        return torch.autocast("cpu", torch.bfloat16, enabled=on and setting == "autocast")
-
-    results = []
-    for on in (False, True):
-        with lowered(on):
-            image = GaussianRenderer()(gaussians, camera).image
-            loss = image.square().sum()
-        with lowered(on and backward_inside):
-            results.append([image, *torch.autograd.grad(loss, inputs)])
-    for name, b, a in zip(("image", *FIELDS, "intrinsics", "extrinsics"), *results, strict=True):
-        assert largest(a, b) <= 1e-6 * b.abs().max(), name
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -65,8 +65,8 @@ def test_gradients_of_gaussians_pose_and_intrinsics(device, there, dtype):
         return [x.cpu() for x in torch.autograd.grad(values, [*inputs, *matrices], cotangents(*values))]
 
     expected = gradients(lambda x: x, torch.float64)
-    for name, got, want in zip((*FIELDS, "pose", "intrinsics"), gradients(there, dtype), expected, strict=True):
-        assert_near(got, want, 3e-3 if dtype == torch.float32 else 1e-9), name
+    for got, want in zip(gradients(there, dtype), expected, strict=True):
+        assert_near(got, want, 3e-3 if dtype == torch.float32 else 1e-9)
 
 
 @pytest.mark.parametrize("kind", list(LENS_PARAMS), ids=lambda kind: kind.name)
