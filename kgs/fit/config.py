@@ -258,11 +258,11 @@ class Detail(NamedTuple):
 
 
 # low: fewer steps, a third of them on a quarter of the pixels, and fewer points. high: more pixels and points; half of
-# the steps use a quarter of the pixels. docs/recipe.md says what each gains and costs.
+# the steps use a quarter of the pixels.
 DETAILS = {
     "low": Detail(378, {"steps": 700, "coarse": 0.3, "init_points": 12_000}),
     "normal": Detail(800, {}),
-    "high": Detail(1000, {"coarse": 0.5, "init_points": 80_000}),
+    "high": Detail(1000, {"coarse": 0.5, "init_points": 90_000}),
 }
 COARSE = 0.5  # of unposed photos at the size of normal detail
 # A fit, its page and its film within a minute on two cores.

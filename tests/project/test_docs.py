@@ -93,7 +93,7 @@ STEPS_OF_BOTH = [FEW.steps, MANY.steps]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [
     ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
-    ("README.md", "whose rate grows to #:", [DROP]),
+    ("README.md", "whose rate grows to #, it gains", [DROP]),
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.undropped_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
@@ -107,7 +107,8 @@ NUMBERS = [
     ("docs/command.md", "| normal | # for unposed", [DETAILS["normal"].size]),
     ("docs/how-to-photograph.md", "and fitted at # on a CPU", [DETAILS["normal"].size]),
     ("docs/photos.md", "takes them at # pixels on a CPU", [DETAILS["normal"].size]),
-    ("docs/command.md", "| high | # | # |", [HIGH.size, HIGH.entries["init_points"]]),
+    ("docs/command.md", "| high | #, also of photos with poses", [HIGH.size]),
+    ("docs/command.md", "`normal` leaves at their own size | # |", [HIGH.entries["init_points"]]),
     ("docs/recipe.md", "times # (up to three", [FEW.recipe.opacity_decay]),
     ("docs/recipe.md", "or # after every step, from # % of", [MANY.recipe.opacity_decay, 100 * AUTO.recipe.decay_from]),
     ("docs/recipe.md", "| steps | #, here # | # for up", [PAPER.recipe.steps, PAPER.steps, FEW.steps]),
