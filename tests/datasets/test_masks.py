@@ -106,33 +106,15 @@ def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:
     assert [int((~view["counted"]).sum()) for view in again] == [0, 1, 0]
 
 
-def without_a_photo(root: Path) -> Path:
-    return write_mask(root / "masks" / "9.png")
-
-
-def of_another_shape(root: Path) -> Path:
-    return write_mask(root / "masks" / "0.png", LEFT[:, :10])
-
-
-def all_black(root: Path) -> Path:
-    return write_mask(root / "masks" / "0.png", 0 * LEFT)
-
-
-def no_masks(root: Path) -> Path:
-    (root / "masks").mkdir()
-    return root / "masks"
-
-
-def broken(root: Path) -> Path:
-    path = write_mask(root / "masks" / "0.png")
-    path.write_bytes(path.read_bytes()[:40])
-    return path
-
-
-@pytest.mark.parametrize("write", [without_a_photo, of_another_shape, all_black, no_masks, broken])
-def test_a_wrong_mask_is_an_error_that_names_it(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+@pytest.mark.parametrize(
+    ("name", "mask", "kept"),
+    [("9.png", LEFT, None), ("0.png", LEFT[:, :10], None), ("0.png", 0 * LEFT, None), ("0.png", LEFT, 40)],
+    ids=["without a photo", "of another shape", "all black", "broken"],
+)
+def test_a_wrong_mask_is_an_error_that_names_it(tmp_path: Path, name: str, mask: np.ndarray, kept: int | None) -> None:
     write_llff(tmp_path)
-    path = write(tmp_path)
+    path = write_mask(tmp_path / "masks" / name, mask)
+    path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(DataError) as caught:
         load_scene(tmp_path, hold_out=0)
     assert str(path) in str(caught.value)
@@ -144,8 +126,11 @@ def test_masks_that_cannot_be_found(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="mask_path"):
         load_scene(tmp_path)
     write_mask(tmp_path / "elsewhere" / "a.png")
-    with pytest.raises(DataError, match="expected a folder of masks"):
+    with pytest.raises(DataError, match="nowhere: "):
         load_scene(tmp_path, masks=tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="empty: "):
+        load_scene(tmp_path, masks=tmp_path / "empty")
     with pytest.raises(ValueError, match="mask_means"):
         load_scene(tmp_path, mask_means="gone")
 

@@ -4,8 +4,6 @@ import pytest
 
 from kgs.app import cli
 
-__all__ = ["one_line", "run"]
-
 
 def run(*arguments: object) -> int:
     """The exit code of `kgs` with these words."""

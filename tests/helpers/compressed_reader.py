@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from kgs import GaussianModel
 
-__all__ = ["as_model", "decode", "header"]
-
 _SIZES = {"float": 4, "uint": 4, "uchar": 1}
 
 

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from kgs import Densifier, GaussianModel, ProjectedGaussians
 
-__all__ = ["LARGE", "SMALL", "densifier", "seen", "snapshot", "train"]
-
 SMALL, LARGE = 0.5, 3.0  # scales: cloned up to 1 (0.01 x an extent of 100), split above
 
 

@@ -16,29 +16,6 @@ from torch import Tensor
 from kgs import DropGaussian, GaussianModel, Gaussians, PosedCamera, ProjectedGaussians, RasterOptions
 from kgs.datasets import Views
 
-__all__ = ["FIELDS", "LENS_PARAMS", "OUTPUTS", "batch", "drop_layer", "footprints", "join", "leaves", "one_gaussian"]
-__all__ += [
-    "as_model",
-    "other_defaults",
-    "pinhole",
-    "posed",
-    "random_camera",
-    "random_cloud",
-    "random_gaussians",
-    "random_model",
-    "random_opacities",
-]
-__all__ += [
-    "random_scene",
-    "random_views",
-    "replace",
-    "select",
-    "splat_columns",
-    "staged",
-    "whole_matrices",
-    "with_camera",
-]
-
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "alpha", "depth", "median_depth")
 LENS_PARAMS = {  # of a picture of 48 x 64 pixels, off centre
@@ -235,12 +212,7 @@ def join(*parts: Gaussians) -> Gaussians:
 
 
 def footprints(
-    means2d: Tensor,
-    factors: Tensor,
-    opacities: Tensor,
-    size: tuple[int, int],
-    eps2d: float = 0.3,
-    **changes: Any,
+    means2d: Tensor, factors: Tensor, opacities: Tensor, size: tuple[int, int], eps2d: float = 0.3, **changes: Any
 ) -> ProjectedGaussians:
     """Hand-made footprints of one camera, front to back: what `project` would have returned.
 

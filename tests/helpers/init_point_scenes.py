@@ -75,14 +75,9 @@ def painted_planes(posed: PinholeCamera | None = None) -> Views:
         for i in range(3):
             rotation, shift = posed.extrinsics[i, :3, :3].numpy(), posed.extrinsics[i, :3, 3].numpy()
             to_world_shifted = rotation @ to_world + shift[:, None] * np.array([[0, 0, 1]])
-            homography = posed.intrinsics[i, :3, :3].numpy() @ to_world_shifted
+            homography = (posed.intrinsics[i, :3, :3].numpy() @ to_world_shifted).astype(np.float64)
             cv2.warpPerspective(
-                painting,
-                homography.astype(np.float64),
-                (WIDTH, HEIGHT),
-                dst=images[i],
-                flags=cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_TRANSPARENT,
+                painting, homography, (WIDTH, HEIGHT), images[i], cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
             )
     return as_views(posed, torch.from_numpy(images).permute(0, 3, 1, 2).contiguous())
 

@@ -15,8 +15,6 @@ from torch import Tensor
 from kgs import Gaussians
 from kgs.reference import layers
 
-__all__ = ["enumerate_drops", "mpmath_pixels", "near_threshold", "quaternion_product", "real_harmonic", "theta_mass"]
-
 
 def near_threshold(
     gaussians: Gaussians,

@@ -25,17 +25,11 @@ def assert_same(first, second):
 def covariances(gaussians):
     """R S S R^T in float64 with R v = q v q* / |q|^2."""
     w, x, y, z = gaussians.quats.double().unbind(1)
-    turn = (
-        torch.stack(
-            [
-                *(w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
-                *(2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
-                *(2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
-            ],
-            1,
-        ).reshape(-1, 3, 3)
-        / (w * w + x * x + y * y + z * z)[:, None, None]
-    )
+    first = (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y))
+    second = (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x))
+    third = (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)
+    turn = torch.stack([*first, *second, *third], 1).reshape(-1, 3, 3)
+    turn = turn / (w * w + x * x + y * y + z * z)[:, None, None]
     return turn @ torch.diag_embed(gaussians.scales.double() ** 2) @ turn.mT
 
 

@@ -1,7 +1,7 @@
 """What tests of the reference have in common."""
 
 import torch
-from factories import FIELDS, pinhole
+from factories import FIELDS, one_gaussian, pinhole
 from torch import Tensor
 
 from kgs import Gaussians
@@ -29,7 +29,7 @@ def stack(opacities: list[float], colors: list[list[float]], scale: float = 1e6)
 def one(
     mean: list[float], scale: list[float], opacity: float = 0.8, quat: tuple[float, ...] = (1, 0, 0, 0)
 ) -> Gaussians:
-    return Gaussians(tensor(mean), tensor(quat), tensor(scale), tensor(opacity), tensor([1.0, 0.5, 0.25]))
+    return one_gaussian(scale, quat, mean, opacity, (1.0, 0.5, 0.25))
 
 
 def grid(height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -16,8 +16,6 @@ import pytest
 
 from kgs.bench.output import markdown_table, write_results
 
-__all__ = ["pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
-
 Row = dict[str, Any]
 
 

@@ -25,9 +25,6 @@ from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel
 from kgs.ply import save_ply
 
-__all__ = ["narrow_lpips", "plain_png", "png_chunk", "png_of", "write_blender", "write_colmap", "write_config"]
-__all__ += ["write_image", "write_llff", "write_lpips", "write_nerfstudio", "write_photos", "write_ply"]
-
 _SIZE = (16, 12)
 _NAMES = ("0.png", "1.png", "2.png")
 _TURN = (0.998, 0.02, -0.05, 0.03)  # of the second photo, w x y z, not of unit length
@@ -105,15 +102,8 @@ def write_blender(root: Path) -> None:
 
 def write_nerfstudio(root: Path) -> None:
     write_photos(root / "images")
-    lens: dict[str, Any] = {
-        "camera_model": "OPENCV",
-        "fl_x": 14.0,
-        "fl_y": 14.5,
-        "cx": 8.2,
-        "cy": 6.1,
-        "w": 16,
-        "h": 12,
-    }
+    lens: dict[str, Any] = {"camera_model": "OPENCV", "fl_x": 14.0, "fl_y": 14.5, "cx": 8.2, "cy": 6.1}
+    lens |= {"w": 16, "h": 12}
     frames: list[dict[str, Any]] = [{"file_path": f"images/{i}.png", "transform_matrix": _matrix(i)} for i in range(3)]
     frames[1] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
     (root / "transforms.json").write_text(json.dumps({**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001, "frames": frames}))

@@ -27,7 +27,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs.app.console import each
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry, typical_depths
+from kgs.geometry import typical_depths
 from kgs.init_points import InitialPoints, initial_points
 
 
@@ -196,19 +196,6 @@ def test_typical_depths_are_the_first_percentile_and_the_median() -> None:
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -1.0]])])
 def test_typical_depths_without_points_before_a_camera(points: torch.Tensor) -> None:
     assert typical_depths(points, flat().cameras) == (1.0, 1.0)
-
-
-def test_cameras_are_converted_once(planes: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    converted: list[PinholeCamera] = []
-    convert = ViewGeometry.of
-
-    def counted(posed: PinholeCamera) -> ViewGeometry:
-        converted.append(posed)
-        return convert(posed)
-
-    monkeypatch.setattr(ViewGeometry, "of", counted)
-    initial_points(planes.halved(), "sift")
-    assert len(converted) == 1
 
 
 def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,15 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from init_point_scenes import (
-    HEIGHT,
-    WIDTH,
-    as_views,
-    cameras,
-    exact_tracks,
-    focal_length,
-    texture,
-)
+from init_point_scenes import HEIGHT, WIDTH, as_views, cameras, exact_tracks, focal_length, texture
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
