@@ -120,6 +120,7 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("render taken/splat.ply --cameras photos -o out --backend numba", "numba is missing", "numba"),
     ("fit photos -o out", 'pycolmap is missing: run pip install -e ".[sfm]"', "pycolmap"),
     ("fit photos -o out", 'jinja2 is missing: run pip install -e ".[app]"', "jinja2"),
+    ("fit photos -o out", 'tyro is missing: run pip install -e ".[app]"', "tyro"),
     ("fit photos -o out", "safetensors is missing", "safetensors"),
     ("demo -o out --size 11 40", "--size: expected", ""),
     ("demo -o taken", "taken/splat.ply: was not written by kgs", ""),

@@ -48,26 +48,19 @@ def test_an_origin_makes_map_coordinates_small(tmp_path: Path) -> None:
 def test_mistakes_are_a_line_and_change_nothing(splat: Path, tmp_path: Path, capsys: Any) -> None:
     (tmp_path / "mine.ply").write_bytes(b"mine")
     kgs.save_ply(tmp_path / "none.ply", random_model(0))
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    assert run("export", splat, "-o", tmp_path / "a.sog") == 2
-    assert "--out: " in one_line(capsys)
-    assert run("export", splat, "-o", tmp_path / "mine.ply") == 2
-    assert "mine.ply: was not written by kgs" in one_line(capsys)
-    assert run("export", splat, "-o", tmp_path / "nowhere" / "a.ply") == 2
-    assert "a.ply: " in one_line(capsys)
-    assert run("export", tmp_path / "none.ply", "-o", tmp_path / "a.ply") == 2
-    assert "none.ply: vertex: " in one_line(capsys)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_the_plain_file_is_not_replaced_by_the_rounded_one(splat: Path, tmp_path: Path, capsys: Any) -> None:
     assert run("export", splat, "-o", tmp_path / "own.ply") == 0
-    own = tmp_path / "own.ply"
     capsys.readouterr()
-    content = own.read_bytes()
-    assert run("export", own, "-o", own) == 2
-    assert "--out: " in one_line(capsys)
-    assert own.read_bytes() == content
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for given, out, said in (
+        ("splat.ply", "a.sog", "--out: "),
+        ("splat.ply", "mine.ply", "mine.ply: was not written by kgs"),
+        ("splat.ply", "nowhere/a.ply", "a.ply: "),
+        ("none.ply", "a.ply", "none.ply: vertex: "),
+        ("own.ply", "own.ply", "--out: "),  # the rounded file would take the place of the plain one
+    ):
+        assert run("export", tmp_path / given, "-o", tmp_path / out) == 2
+        assert said in one_line(capsys)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("far", [False, True])

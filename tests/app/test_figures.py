@@ -15,7 +15,7 @@ from factories import random_views
 from kgs.app.files.figures import DEFAULT, WITHOUT, write_curve, write_sheet
 from kgs.app.files.plot import psnr_plot
 from kgs.datasets.scene import Views
-from kgs.machine import check_device, peak_rss_mb, revision, versions
+from kgs.machine import check_device, peak_rss_mb, revision
 from kgs.study.plots import STYLES
 from kgs.study.presets import AUTO, OFF
 
@@ -65,7 +65,7 @@ def test_a_sheet_shows_the_photo_and_each_render(tmp_path):
 
 
 @pytest.mark.slow
-def test_memory_and_versions():
+def test_the_peak_of_memory():
     before = peak_rss_mb()
     room = 0
     if (statm := Path("/proc/self/statm")).exists():  # the peak of earlier tests may lie far above
@@ -73,8 +73,6 @@ def test_memory_and_versions():
     block = np.ones((room + 256) * 2**20, np.uint8)
     assert 200 <= peak_rss_mb() - before <= 320
     assert block[-1]
-    assert {"kgs", "torch", "kornia", "opencv", "python", "machine"} <= versions().keys()
-    assert versions()["torch"] == torch.__version__
 
 
 @pytest.mark.parametrize("name", ["foo", "", "cuda:x", "meta", "cuda:99", "privateuseone"])

@@ -73,6 +73,7 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert text.count('<img alt="" src="data:image/jpeg') == 11
     assert "--detail high" not in text  # the photos have the size of the fit
     assert "6 of 8 test photos." in text
+    assert "No photo was held out" not in text
     assert text.count('class="render"') == 6
     assert spread(25, 6) == [0, 5, 10, 14, 19, 24]
     assert f"{json.loads((out / 'metrics.json').read_text(encoding='utf-8'))['test']['psnr']:.2f}" in text

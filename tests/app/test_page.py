@@ -152,17 +152,6 @@ def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
     assert cited[0].endswith(f"version = {{{kgs.__version__}}}")
 
 
-def test_a_stray_gaussian_is_named(tmp_path: Path) -> None:
-    means = GAUSSIANS.means.clone()
-    means[3, 0] = 1e12
-    path = tmp_path / "index.html"
-    page = content()
-    words = write_page(path, replace(page, splat=replace(page.splat, gaussians=replace(GAUSSIANS, means=means))))
-    assert words == "all but 1 stray Gaussian"
-    text = path.read_text(encoding="utf-8")
-    assert "This page shows all but 1 stray Gaussian" in text
-
-
 def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
     cameras = batch(*(random_camera(*SIZE, 0, torch.float32) for _ in range(6)))  # at one place: all are in the middle
     names = list("abcdef")
@@ -171,13 +160,6 @@ def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
     path = tmp_path / "index.html"
     write_page(path, replace(content(runs=runs), photos=PagePhotos(cameras, names, ["training"] * 6)))
     assert '"first":1,' in path.read_text(encoding="utf-8")
-
-
-def test_a_page_says_where_no_photo_was_held_out(tmp_path: Path) -> None:
-    text = write(tmp_path / "index.html", runs={"": {"train": views(30.0, 31.0), "test": None}})
-    assert "No photo was held out" in text
-    text = write(tmp_path / "index.html", runs={"": {"train": views(30.0, 31.0), "test": views(20.0)}})
-    assert "No photo was held out" not in text
 
 
 def test_measures_have_their_spread(tmp_path: Path) -> None:

@@ -69,7 +69,6 @@ VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
 FOLDERS = {  # what is in them, and what is said of it
     "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
     "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, found 1", "Take 3 to 12")),
-    "two": (lambda at: save(at, planes()[:2]), ("at least 3 photos, found 2", "Take 3 to 12")),
     "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it do: DCIM",)),
     "too deep, with cameras": (
         lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
@@ -205,10 +204,18 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
             pose_photos(folder, out)
 
 
-@pytest.mark.parametrize("name", ["images", "finished-photos", "unfinished-photos", "finished", "unfinished", "sparse"])
-def test_a_users_own_folders_stay(folder, tmp_path, refused, name):
-    """Also such as hold what kgs does not read: HEIC photos, notes."""
-    mine = tmp_path / "project" / name / "deeper" / "IMG_1.HEIC"
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"{name}/deeper/IMG_1.HEIC" for name in ("images", "sparse", "finished", "unfinished")),
+        *(f"{name}/notes.txt" for name in ("finished-photos", "unfinished-photos")),
+        "checkpoint.safetensors",
+        "checkpoint.previous.safetensors",
+    ],
+)
+def test_a_users_own_files_stay(folder, tmp_path, refused, name):
+    """Also such as kgs does not read: HEIC photos, notes, checkpoints of another program."""
+    mine = tmp_path / "project" / name
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b"mine")
     refused(write_planes(folder), "choose another folder", out=tmp_path / "project", kept=True)
@@ -225,16 +232,6 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     with pytest.raises(DataError, match="holds the photos themselves"):
         pose_photos(images, tmp_path)
     assert len(list(images.glob("*.png"))) == 3
-
-
-def test_checkpoints_of_another_program_stay(folder, tmp_path, refused):
-    out = tmp_path / "project"
-    out.mkdir()
-    for name in ("checkpoint.safetensors", "checkpoint.previous.safetensors"):
-        (out / name).write_bytes(b"mine")
-        refused(write_planes(folder), f"{name}: was not written by kgs", out=out)
-        assert (out / name).read_bytes() == b"mine"
-        (out / name).unlink()
 
 
 def test_a_move_that_was_stopped_is_ended(tmp_path):
@@ -328,7 +325,7 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [250_000, pytest.param(600_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [250_000, 600_000])
 def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
     """The first of two, in this process; and the second, in another one that it aborts."""
     with limited(size):

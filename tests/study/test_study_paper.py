@@ -29,19 +29,9 @@ def data(tmp_path):
         (1, "llff/fern", {3, 6, 9}, {"off", "progressive 0.2"}),
         (2, "colmap/kitchen", {12, 24}, {"off", "progressive 0.2"}),
         (3, "blender/lego", {8}, {"off", "progressive 0.2"}),
-        (
-            4,
-            "llff/fern",
-            {3},
-            {"off", *RATES},
-        ),
+        (4, "llff/fern", {3}, {"off", *RATES}),
         (5, "llff/fern", {3}, {"progressive 0.2", "high gradient", "low gradient", "near", "far"}),
-        (
-            6,
-            "llff/fern",
-            {3},
-            {"progressive 0.2", *PENALTIES},
-        ),
+        (6, "llff/fern", {3}, {"progressive 0.2", *PENALTIES}),
     ],
 )
 def test_a_table_has_the_cells_that_the_paper_prints(data, table, scene, views, methods):
@@ -63,10 +53,7 @@ def test_the_tables_are_all_that_are_printed():
 def test_a_table_joins_the_other_choices(data, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("KGS_DATA", str(data))
     assert study(out=tmp_path / "out", preset="paper", table=4, seeds=(0,), methods=("off",), list_cells=True) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        "to do: llff/fern, 3 views, dense, off, seed 0",
-        "0 of 1 are done",
-    ]
+    assert capsys.readouterr().out.splitlines() == ["to do: llff/fern, 3 views, dense, off, seed 0", "0 of 1 are done"]
     with pytest.raises(ValueError, match=r"^methods: .*'far'"):
         study(out=tmp_path / "out", preset="paper", table=4, methods=("far",), list_cells=True)
 

@@ -10,16 +10,7 @@ from study_rows import MAIN, made_up, psnrs, student
 
 from kgs.bench.output import mean_sd
 from kgs.study.findings import findings, headline, regret
-from kgs.study.pairs import (
-    Difference,
-    Noise,
-    cells_frame,
-    difference,
-    main_cells,
-    noise_floor,
-    paired_difference,
-    wide,
-)
+from kgs.study.pairs import Difference, Noise, cells_frame, difference, main_cells, noise_floor, paired_difference, wide
 from kgs.study.published import PUBLISHED, benchmark_of, priors, published, published_difference
 from kgs.study.tables import BEST_OF_5, sparse_tables
 
