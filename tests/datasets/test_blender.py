@@ -158,16 +158,3 @@ def test_test_poses_without_a_picture_are_left_out(tmp_path: Path) -> None:
     assert scene.test.names == ("test/r_0.png", "test/r_2.png")
     (note,) = scene.notes
     assert "1 of 3 poses" in note
-
-
-def test_no_opaque_pixel_of_lego_looks_past_its_cube(kgs_data: Path) -> None:
-    scene = load_scene(kgs_data / "blender" / "lego", 8)
-    corners = torch.tensor([[x, y, z] for x in (-1.3, 1.3) for y in (-1.3, 1.3) for z in (-1.3, 1.3)])
-    assert scene.train.masks is not None
-    for i in range(8):
-        pixels = scene.train.camera(i).project((corners - scene.offset.float())[None])[0]
-        rows, columns = torch.nonzero(scene.train.masks[i, 0] > 0.5).T
-        assert columns.min() >= pixels[:, 0].min()
-        assert columns.max() <= pixels[:, 0].max()
-        assert rows.min() >= pixels[:, 1].min()
-        assert rows.max() <= pixels[:, 1].max()

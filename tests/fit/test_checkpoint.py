@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import pickle
 import stat
 
 import pytest
@@ -63,16 +62,6 @@ def test_every_flipped_byte_and_every_cut_is_found(path):
             load_checkpoint(path)
     path.write_bytes(content + b"1")
     with pytest.raises(DataError, match="checkpoint"):
-        load_checkpoint(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 something else", pickle.dumps({"x": 1}), bytes(100)])
-def test_other_files_are_refused(path, content):
-    path.write_bytes(content)
-    with pytest.raises(DataError, match="not a whole checkpoint"):
-        load_checkpoint(path)
-    path.unlink()
-    with pytest.raises(DataError, match=r"checkpoint\.safetensors.*No such file"):
         load_checkpoint(path)
 
 

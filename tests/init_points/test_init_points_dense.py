@@ -34,11 +34,6 @@ def views(garden: tuple[Views, torch.Tensor]) -> Views:
 
 
 @pytest.fixture(scope="module")
-def truth(garden: tuple[Views, torch.Tensor]) -> torch.Tensor:
-    return garden[1]
-
-
-@pytest.fixture(scope="module")
 def large() -> tuple[Views, torch.Tensor]:
     """The garden in as many pixels as the bounds of depth errors are for."""
     return garden_from_above((96, 128))
@@ -49,8 +44,8 @@ def span_of(truth: torch.Tensor) -> tuple[float, float]:
 
 
 @pytest.fixture(scope="module")
-def span(truth: torch.Tensor) -> tuple[float, float]:
-    return span_of(truth)
+def span(garden: tuple[Views, torch.Tensor]) -> tuple[float, float]:
+    return span_of(garden[1])
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -110,19 +105,15 @@ def test_two_views_and_many(count: int) -> None:
     assert points.isfinite().all()
 
 
-def test_where_nothing_can_be_compared_others_take_over(views: Views) -> None:
-    with pytest.warns(UserWarning, match=r"agree on 0 points only"), pytest.warns(UserWarning, match="random points"):
-        assert initial_points(views.select([0]), "dense", count=200).kind == "random"
-    grey = Views(views.cameras, torch.full_like(views.images, 0.5), views.names)
-    with pytest.warns(UserWarning, match="agree on 0"), pytest.warns(UserWarning, match="random points"):
-        assert initial_points(grey, "dense", count=200).kind == "random"
-
-
-def test_pictures_that_contradict_each_other_have_no_dense_points(views: Views) -> None:
-    """As mirrors do: each photo shows something else."""
-    noise = torch.rand(views.images.shape, generator=generator(3))
+@pytest.mark.parametrize(("shown", "count"), [("one view", 200), ("grey", 200), ("mirrors", 2000)])
+def test_where_photos_agree_nowhere_random_points_take_over(views: Views, shown: str, count: int) -> None:
+    given = {
+        "one view": views.select([0]),
+        "grey": replace(views, images=torch.full_like(views.images, 0.5)),
+        "mirrors": replace(views, images=torch.rand(views.images.shape, generator=generator(3))),  # each another thing
+    }[shown]
     with pytest.warns(UserWarning, match="points only; SIFT points"), pytest.warns(UserWarning, match="random points"):
-        assert initial_points(Views(views.cameras, noise, views.names), "dense", count=2000).kind == "random"
+        assert initial_points(given, "dense", count=count).kind == "random"
 
 
 def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:

@@ -71,14 +71,7 @@ def test_triangulation_agrees_with_opencv_for_two_views() -> None:
     np.testing.assert_allclose(points, expected, rtol=0.02, atol=0.02)
 
 
-def test_exact_tracks_give_exact_points() -> None:
-    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 3.0])
-    certain = triangulate_certain(exact_tracks(points), ViewGeometry.of(cameras()))
-    assert bool(certain.tracks.visible.all())
-    torch.testing.assert_close(certain.points.float(), points, rtol=1e-4, atol=1e-4)
-
-
-def test_a_moved_and_scaled_world_moves_and_scales_the_points() -> None:
+def test_exact_tracks_give_exact_points_also_of_a_moved_and_scaled_world() -> None:
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 3.0])
     posed, shift = cameras(), torch.tensor([3.0, -2.0, 5.0])
     extrinsics = posed.extrinsics.double()
@@ -86,6 +79,7 @@ def test_a_moved_and_scaled_world_moves_and_scales_the_points() -> None:
     moved = PinholeCamera(posed.intrinsics.double(), extrinsics, posed.height, posed.width)
     tracks = exact_tracks(points)
     expected = triangulate_certain(tracks, ViewGeometry.of(posed))
+    torch.testing.assert_close(expected.points.float(), points, rtol=1e-4, atol=1e-4)
     certain = triangulate_certain(tracks, ViewGeometry.of(moved))
     assert bool(certain.tracks.visible.all())
     torch.testing.assert_close(certain.points / 100 - shift, expected.points, rtol=1e-9, atol=1e-9)
