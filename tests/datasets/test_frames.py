@@ -35,9 +35,9 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
     (elsewhere / "secret.png").write_bytes(b"x")
     (root / "file.png").symlink_to(elsewhere / "secret.png")
     (root / "folder").symlink_to(elsewhere)
-    for name in ("file.png", "folder/secret.png"):
+    for find, name in ((path_inside, "file.png"), (path_inside, "folder/secret.png"), (find_file, "FILE.png")):
         with pytest.raises(DataError, match="link that leads out"):
-            path_inside(SOURCE, root, name)
+            find(SOURCE, root, name)
     (root / "a.png").write_bytes(b"x")
     (root / "b.png").symlink_to(root / "a.png")  # inside
     assert path_inside(SOURCE, root, "b.png") == root / "b.png"
@@ -73,15 +73,6 @@ def test_a_name_that_fits_two_files_is_none_of_them(tmp_path: Path) -> None:
     (tmp_path / "a.PNG").write_bytes(b"x")
     assert find_file(SOURCE, tmp_path, "a.png") == tmp_path / "a.png"
     assert find_file(SOURCE, tmp_path, "a.PNG") == tmp_path / "a.PNG"
-
-
-def test_a_link_in_another_case_that_leads_out_is_refused(tmp_path: Path) -> None:
-    root = tmp_path / "scene"
-    root.mkdir()
-    (tmp_path / "secret.png").write_bytes(b"x")
-    (root / "A.png").symlink_to(tmp_path / "secret.png")
-    with pytest.raises(DataError, match="link that leads out"):
-        find_file(SOURCE, root, "a.png")
 
 
 @pytest.mark.parametrize("name", ["fx", "fy"])

@@ -19,15 +19,6 @@ def rows() -> np.ndarray:
     return llff_rows(poses())
 
 
-def test_images_is_preferred_then_the_largest_reduced_ones(tmp_path: Path) -> None:
-    write_rows(tmp_path, rows(), "images_4")
-    (tmp_path / "images_8").mkdir()
-    assert len(load_scene(tmp_path).train) == 8
-    (tmp_path / "images").mkdir()
-    with pytest.raises(DataError, match="10 poses, but images/ has 0 images"):
-        load_scene(tmp_path)
-
-
 def test_offset_is_the_mean_of_the_training_centres_and_nothing_else(tmp_path: Path) -> None:
     array = rows()
     write_rows(tmp_path / "a", array)

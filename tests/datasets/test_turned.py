@@ -13,7 +13,6 @@ from kornia.geometry.camera import PinholeCamera
 from kgs.app.files.cameras import as_taken, shown
 from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
-from kgs.errors import DataError
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 BACK = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # a picture turned counterclockwise
@@ -87,11 +86,3 @@ def test_a_turned_photo_is_shown_as_it_was_taken(tmp_path: Path):
     again = shown(views, 90.0)
     assert [tuple(part.images.shape[-2:]) for part in again] == [(240, 180), (180, 240), (240, 180)]
     assert shown(Views(views.cameras, views.images, views.names)) != []
-
-
-def test_sizes_that_are_no_turn_are_still_an_error(tmp_path: Path):
-    root = write(tmp_path, ())
-    image = cv2.imread(str(root / "images" / "2.png"))
-    cv2.imwrite(str(root / "images" / "2.png"), cv2.resize(image, (480, 360)))
-    with pytest.raises(DataError, match="pixels as the other images"):
-        load_scene(root, hold_out=0)
