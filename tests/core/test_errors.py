@@ -109,8 +109,9 @@ def camera_of_another_dtype():
     return posed(CameraModelType.PINHOLE, [9.0, 9.0, 6.0, 4.0], (24, 32), extrinsics=torch.eye(4)[None])
 
 
-def with_two_rows_of_opacities():
-    return dataclasses.replace(random_gaussians(3, 0, torch.float32), opacities=torch.full((2, 3), 0.5))
+def drawn_with_rows_of_opacities(rows, cameras):
+    gaussians = dataclasses.replace(random_gaussians(3, 0, torch.float32), opacities=torch.full((rows, 3), 0.5))
+    kgs.GaussianRenderer()(gaussians, batch(*[camera()] * cameras))
 
 
 def drop_at(factor):
@@ -181,7 +182,10 @@ CASES = [
     ("cameras", TypeError, lambda: kgs.project(random_gaussians(3, 0, torch.float32).to("meta"), camera())),
     bad_argument("gaussians", TypeError, None),
     ("gaussians", TypeError, lambda: kgs.project([random_gaussians(3, 0)], camera())),
-    ("opacities", ValueError, lambda: kgs.GaussianRenderer()(with_two_rows_of_opacities(), camera())),
+    *[
+        ("opacities", ValueError, lambda shape=shape: drawn_with_rows_of_opacities(*shape))
+        for shape in ((2, 1), (1, 3), (2, 3))
+    ],
     # cameras
     *[("cameras", TypeError, lambda wrong=wrong: image_size(wrong)) for wrong in (None, torch.eye(4))],
     ("cameras", TypeError, lambda: image_size(camera_of_another_dtype().model)),

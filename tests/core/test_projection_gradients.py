@@ -1,4 +1,4 @@
-"""Opacities of each camera, nothing to project, and gradients of `project`."""
+"""Nothing to project, and gradients of `project`."""
 
 import pytest
 import torch
@@ -8,16 +8,6 @@ from kornia.sensors.camera import CameraModelType
 from projection_checks import PACKED, scene, values_and_gradients
 
 from kgs import Gaussians, project
-
-
-def test_opacities_of_each_camera():
-    gaussians, cameras = scene(cameras=3)
-    opacities = torch.stack([gaussians.opacities, gaussians.opacities / 2, gaussians.opacities * 1.2])
-    together = project(replace(gaussians, opacities=opacities), cameras)
-    assert torch.equal(together.opacities, opacities[together.camera_ids, together.gaussian_ids])
-    for wrong in (opacities[:2], opacities[:1]):
-        with pytest.raises(ValueError, match="^opacities:"):
-            project(replace(gaussians, opacities=wrong), cameras)
 
 
 @pytest.mark.parametrize("kind", list(CameraModelType))

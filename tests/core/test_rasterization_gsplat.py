@@ -93,8 +93,21 @@ def test_modes_with_backgrounds(mode, packed):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics(degree):
-    compare(scene(sh_degree=degree), sh_degree=degree)
+def test_harmonics_up_to_a_degree(degree):
+    compare(scene(sh_degree=3), sh_degree=degree)
+
+
+@pytest.mark.parametrize("width", [1, 2, 7])
+@pytest.mark.parametrize("own", [False, True], ids=["for all cameras", "for each camera"])
+def test_features_of_any_width(width, own):
+    features, backgrounds = torch.randn(2, 50, width).double(), torch.randn(2, width).double()
+    compare(scene() | {"colors": features if own else features[0]}, backgrounds=backgrounds)
+
+
+def test_opacities_of_each_camera():
+    values = scene(sh_degree=1)
+    own = torch.stack([values["opacities"], values["opacities"].flip(0)])
+    compare(values | {"opacities": own}, sh_degree=1)
 
 
 @pytest.mark.parametrize("camera_model", ["fisheye", "ortho"])
