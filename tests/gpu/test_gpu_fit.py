@@ -71,28 +71,6 @@ def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     assert 1 <= waited <= MOST_WAITS
 
 
-@pytest.mark.slow
-def test_gradients_of_two_steps_are_numbas(scene, few):
-    pytest.importorskip("numba")
-    fits = [trainer(scene, few, backend) for backend in ("triton", "numba")]
-    with torch.no_grad():
-        fits[1].model.log_scales += 0.5 * torch.randn(20, 3)  # a sphere has no turn
-    for _ in range(2):
-        fits[0].model.load_state_dict(fits[1].model.state_dict())  # equal parameters
-        found = []
-        for fit in fits:
-            caught = []
-            for parameter in fit.model.parameters():
-                parameter.register_post_accumulate_grad_hook(lambda p, caught=caught: caught.append(p.grad.clone()))
-            fit.train_step()
-            found.append(caught)
-        assert len(found[0]) == 5  # the first steps have no harmonics but the constant
-        for a, b in zip(*found, strict=True):
-            assert (a - b).abs().max() <= 5e-5 * b.abs().max()
-    images = [fit.render(scene.test.camera(0)) for fit in fits]
-    assert (images[0] - images[1]).abs().max() <= 1e-3
-
-
 def test_a_resumed_fit_on_another_kind_of_device_draws_anew_and_says_so(scene, few):
     fit = trainer(scene, few, "torch")
     fit.train_step()
